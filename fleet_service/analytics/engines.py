@@ -42,7 +42,7 @@ class QueryEngine:
 
     Args:
         name: one of ENGINES.
-        root: folder of the archive; only compacted files are read.
+        root: folder of the archive; only compacted (sorted) files are read.
         part: selected times and box.
         progress: True to let the engine draw its own progress bar.
 

@@ -1,4 +1,4 @@
-"""Map of an archive at a past moment, or now, with the polygons of its cells."""
+"""Map computed from an archive, for a past moment or for now, with the polygons of its cells."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ LATENESS_S = 120.0  # ServiceConfig.lateness_s
 
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
-    """Return a table of the visited cells that touch a box [deg], with their beliefs at the time
-    `at` [ns].
+    """Return a table of the visited cells that touch a box [deg], with their beliefs (probabilities
+    of each friction) at the time `at` [ns].
     """
     slots = np.flatnonzero(
         fusion.live.vehicles[: fusion.size] > 0
@@ -40,8 +40,8 @@ def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Tabl
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
-    """Return the table of cells with their beliefs in the GeoParquet form of a map snapshot; `at`
-    [ns] is the time of the beliefs.
+    """Return the table of cells with their beliefs (probabilities of each friction) in the
+    GeoParquet form of a map snapshot; `at` [ns] is the time of the beliefs.
     """
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(

@@ -37,7 +37,8 @@ _MARK = "#d0006f"
 
 def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
     """Draw the answer to a question as a plot, and write it in the format of the path's ending
-    (png, svg, pdf).
+    (png, svg, pdf). The plot's title consists of `name` and `about`, the question's name and
+    description.
     """
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
     if table.num_rows:

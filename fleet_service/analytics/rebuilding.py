@@ -36,8 +36,8 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """Task of a rebuild: archive, output folder, time of the map [ns], and allowed lateness of the
-    service [s].
+    """Task of a rebuild: archive, output folder, time of the map [ns], and how late a report may
+    arrive and still be used in order of time [s].
     """
 
     root: Path
@@ -58,7 +58,7 @@ class RebuildResult(NamedTuple):
 
 def require_empty(out: Path) -> None:
     """Raise an error unless a folder is empty or does not exist yet. Otherwise statistics of
-    another archive in it would be mixed with the new ones.
+    another archive in this folder would be mixed with the new statistics.
 
     Raises:
         InputError: the folder has content, or cannot be created.
@@ -81,8 +81,8 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
     order.
 
     Raises:
-        InputError: there are no compacted observations, a file has a newer version, or the engine
-            is unknown or not installed.
+        InputError: there are no compacted (sorted) observations, a file has a newer version, or the
+            engine is unknown or not installed.
         OSError: a file cannot be read or written.
     """
     if engine not in ENGINES:
@@ -98,15 +98,17 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
 
 def zones_of(root: Path) -> list[int]:
-    """Return the zones (map squares of zoom 7) for which an archive has compacted observations."""
+    """Return the zones (map squares of zoom 7) for which an archive has compacted (sorted)
+    observations.
+    """
     return sorted(
         {layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)}
     )
 
 
 def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
-    """Rebuild one zone (map square of zoom 7) of an archive. Repeated or concurrent calls write the
-    same files, so the result is the same as after one call.
+    """Rebuild one zone (map square of zoom 7) of an archive. Repeated or concurrent calls are
+    harmless, because they write the same files.
 
     Raises:
         InputError: a file has a newer version.

@@ -1,8 +1,8 @@
 """Synthetic archive for examples, tests and benchmarks: roads, trips, ice at night, biased
 vehicles.
 
-Its rows resemble those of the real estimator: two of three visits give only a lower bound of mu,
-the third gives a value of mu.
+Its rows resemble those of the real estimator: two of three visits (passages of cells) give only a
+lower bound of mu, the third gives a value of mu.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class SyntheticFleet:
 
 
 def write_archive(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
-    """Write the inbox of an archive in order of time, one segment (file of new rows) after another.
+    """Write observations to the inbox (folder of new rows) of an archive in order of time, one
+    segment (file of new rows) after another.
 
     Raises:
         OSError: the disk is full.

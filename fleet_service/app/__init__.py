@@ -1,4 +1,6 @@
-"""The running service: engine, Zenoh sessions, background jobs, metrics."""
+"""The running service: engine (service without its network), Zenoh sessions, background jobs,
+metrics.
+"""
 
 from typing import Final
 

@@ -48,7 +48,7 @@ class Engine:
 
     Attributes:
         alerts: active alerts.
-        copy: bucket copy of the archive; None without one.
+        copy: copy of the archive in a bucket (object store); None if there is no copy.
         counts: counters of events in all parts.
         holding: ownership of the archive.
         intake: admission and fusion of messages.
@@ -92,7 +92,9 @@ class Engine:
 
     @property
     def state(self) -> ServiceState:
-        """Return the current state of the service: map, alerts and admitted batches."""
+        """Return the current state of the service: map, alerts and admitted batches (messages with
+        records).
+        """
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:

@@ -1,5 +1,6 @@
 """Erasure of data in a running service. The thread of the background jobs handles the requests of
-`archive.identity.erasure_requests`:
+`archive.identity.erasure_requests`. (A segment is a file of new rows, a checkpoint a saved state of
+the service.)
 
     1. after a segment:               the service's state is on disk up to this segment
     2. in a separate process:         the vehicle's rows are removed from the files; all other rows

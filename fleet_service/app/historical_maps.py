@@ -75,7 +75,8 @@ class HistoricalMaps:
     def ask(
         self, question: PastQuery, wanted: Callable[[int], bool]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield the tile number and the payload of every reply to a query.
+        """Yield the tile number and the payload of every reply to a query. `wanted` returns True
+        for the numbers of the tiles that are part of the answer.
 
         Raises:
             InputError: too many rows would have to be read, or the archive cannot be read.

@@ -137,9 +137,10 @@ class Intake:
         return raised
 
     def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
-        """Return a mask of rows that are archived but do not reach the map: the vehicle cannot have
-        reached the reported position, or it reports too many new cells. Enrolled publishers (data
-        sources that are no vehicles) have no path and are not checked.
+        """Return a mask of rows, True for rows that are archived but do not reach the map. The
+        reason is that the vehicle cannot have reached the reported position, or that it reports too
+        many new cells. Enrolled publishers (data sources that are no vehicles) have no path and are
+        not checked.
         """
         witness = rows["witness"]
         beyond = np.zeros(len(witness), bool)

@@ -35,8 +35,8 @@ class Queries:
         self._past = HistoricalMaps(root)
 
     def tile(self, tile: int, now: int) -> bytes:
-        """Return the cells of a tile that readers may see, as an Arrow stream (bytes); empty bytes
-        if there are none.
+        """Return those cells of a tile that readers may see, as an Arrow stream (bytes); empty
+        bytes if there are none.
         """
         shown = self._shared.tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
@@ -68,8 +68,8 @@ class Queries:
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield the tile number and the payload of every reply to a query, computed on demand; see
-        `serve.query.answer_query`.
+        """Yield the tile number and the payload of every reply to a query, computed on demand.
+        `serve.query.answer_query` explains the parameters.
 
         Raises:
             InputError: the route is too long, the time is in the future, or the archive cannot be
@@ -88,8 +88,9 @@ class Queries:
     def measure_answer(
         self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
     ) -> AnswerSize:
-        """Return an upper bound of an answer's size, as number of cells and number of tiles. `only`
-        is the only possible tile if the query's key names one.
+        """Return an upper bound of an answer's size, as number of cells and number of tiles.
+        `wanted` returns True for tiles that match the query's key, and `only` is the tile if the
+        key names exactly one.
         """
         return size_asked(self._shared.tiles, query, wanted, only)
 

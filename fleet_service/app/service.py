@@ -50,7 +50,8 @@ BEHIND: Final = 1000  # messages that wait; a worker that is so far behind puts 
 
 
 class Service:
-    """One running service.
+    """One running fleet service: it receives reports over Zenoh, updates the map, archives the
+    reports, and answers queries.
 
     Args:
         config: settings.

@@ -1,5 +1,5 @@
-"""Settlement of admitted batches: their rows are first written to disk as segments (files of new
-rows), and to the bucket; then acknowledgements are sent.
+"""Settlement of admitted batches (messages with records): their rows are first written to disk as
+segments (files of new rows), and to the bucket; then acknowledgements are sent.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Settlement:
 
     @property
     def is_full(self) -> bool:
-        """Return True if too many rows wait for the disk, or too many batches for the archive's
-        copy in the bucket.
+        """Return True if too many rows wait for the disk, or too many batches (messages with
+        records) for the archive's copy in the bucket.
         """
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 

@@ -32,7 +32,8 @@ class Costs(NamedTuple):
         process_bytes: memory of a service without data.
         vehicle_bytes, cell_bytes, pair_bytes: memory per vehicle; per cell and sector; per pair of
             a vehicle and a cell that it visited lately.
-        waiting_bytes: memory per observation that waits in the lateness window.
+        waiting_bytes: memory per observation in the lateness window, the last minutes in which late
+            reports are still used in order of time.
         window_bytes: memory per cell and sector with such observations, in addition.
         service_s: processor time of a service per observation [s].
         router_s: processor time of a router per message [s].
@@ -71,7 +72,8 @@ COSTS: Final = Costs(
 
 class MemoryContent(NamedTuple):
     """Content of a service's memory: numbers of vehicles, of cells (with heading sector), of pairs
-    of a vehicle and a cell that it visited lately, and of observations in the lateness window.
+    of a vehicle and a cell that it visited lately, and of observations in the lateness window (the
+    last minutes, in which late reports are still used in order of time).
     """
 
     vehicles: float
@@ -138,8 +140,8 @@ def estimate_size(fleet: PlannedFleet, costs: Costs = COSTS) -> DeploymentSize:
 
 
 def remembered_pairs(rate: float, values: float) -> float:
-    """Return the number of pairs of a vehicle and a cell that the fusion remembers, if no vehicle
-    visits a cell twice.
+    """Return the number of pairs of a vehicle and a cell that the fusion (beliefs about all cells)
+    remembers, if no vehicle visits a cell twice.
 
     Args:
         rate: observations per second.

@@ -1,5 +1,6 @@
 """Segment log: queue of admitted rows that a thread writes to disk as segments (Parquet files). A
-batch is acknowledged only after its rows are in a segment that is synced to disk.
+batch (message with records) is acknowledged only after its rows are in a segment that is synced to
+disk.
 
 Messages can be processed while a segment is written. Only batches that `end` returns may be
 acknowledged.
@@ -70,8 +71,8 @@ class SegmentLog(Generic[Batch]):
     Args:
         root: folder of the archive.
         shard: name of the service.
-        upload: function that makes segments durable in a second place; if given, a batch is durable
-            only when it is in both places.
+        upload: function that makes segments durable in a second place; if given, a batch (message
+            with records) is durable only when it is in both places.
         epoch: smallest number that may be used as the epoch (number of the start) in segment names;
             the lease determines it.
 
@@ -116,13 +117,15 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def unsettled(self) -> int:
-        """Return the number of accepted batches that are not yet durable on disk."""
+        """Return the number of accepted batches (messages with records) that are not yet durable on
+        disk.
+        """
         return len(self._next.batches) + len(self._load.batches)
 
     @property
     def can_begin(self) -> bool:
-        """Return True if batches wait to be written to disk, and no earlier write still has to be
-        collected with `end`.
+        """Return True if batches (messages with records) wait to be written to disk, and no earlier
+        write still has to be collected with `end`.
         """
         return self._written is None and bool(self._next.batches)
 
@@ -132,7 +135,9 @@ class SegmentLog(Generic[Batch]):
         return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
-        """Add rows, and the batches to which they belong, to the queue for the next write."""
+        """Add rows, and the batches (messages with records) to which they belong, to the queue for
+        the next write.
+        """
         self._next.waiting[kind].append(rows)
         self._next.batches += batches
 
@@ -174,8 +179,8 @@ class SegmentLog(Generic[Batch]):
         return durable
 
     def flush(self) -> list[Batch]:
-        """Write all waiting rows to disk and wait until this is done; return the batches that
-        became durable. Each batch is returned once.
+        """Write all waiting rows to disk and wait until this is done; return the batches (messages
+        with records) that became durable. Each batch is returned once.
 
         Raises:
             OSError: the disk is full or broken; rows that are not durable wait for the next write.

@@ -2,7 +2,8 @@
 other programs.
 
 `export datex` queries the running services instead, and writes the slippery stretches for road
-authorities. `export iceberg` writes no file: it registers the compacted files in Iceberg tables.
+authorities. `export iceberg` writes no file: it registers the compacted (sorted) files in Iceberg
+tables.
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ def _force_exit_when_stuck(
     log_line: Callable[[str], None],
 ) -> None:
     """End the process if the shutdown of the service hangs, for example because of a frozen router
-    or a long compaction.
+    or a long compaction (move of new rows into sorted files).
 
     Every running operation may be interrupted, because vehicles keep each report until it is
     acknowledged. The exit code is that of a normal end. The lease is released, because a standby

@@ -244,8 +244,8 @@ def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
 
 
 def _end_record(record: ET.Element, now: int) -> ET.Element | None:
-    """Return a DATEX II record with `now` [ns] as its end time, unless it has one; None if its end
-    was published long ago and need not be repeated.
+    """Return a DATEX II record with `now` [ns] as its end time; a record that already has an end
+    time keeps it. Return None if the end was published long ago and need not be repeated.
     """
     period = _find_element(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)

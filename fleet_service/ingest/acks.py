@@ -1,5 +1,5 @@
-"""Acknowledgements: sequence numbers of durable or rejected batches, collected per vehicle and
-stream, and sent as messages.
+"""Acknowledgements: sequence numbers of durable or rejected batches (messages with records),
+collected per vehicle and stream, and sent as messages.
 """
 
 from __future__ import annotations
@@ -32,21 +32,24 @@ class Acks:
         )
 
     def record_durable(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches are durable on disk, so that their senders get an acknowledgement."""
+        """Record that batches (messages with records) are durable on disk, so that their senders
+        get an acknowledgement.
+        """
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches arrived too late for the map to use them in order of time. The
-        acknowledgement that the batches are durable tells their sender about this.
+        """Record that batches (messages with records) arrived too late for the map to use them in
+        order of time. The acknowledgement that the batches are durable tells their sender about
+        this.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)
 
     def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
-        """Record that a batch was rejected because of the row `row`, and the reason that is sent to
-        its sender.
+        """Record that a batch (message with records) was rejected because of the row `row`, and the
+        reason that is sent to its sender.
         """
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append(
             (batch.seq, row, reason)

@@ -1,5 +1,5 @@
-"""Limits per vehicle in addition to the byte rate: number of new cells and number of streams. Pure
-except for the counts.
+"""Limits per vehicle in addition to the byte rate: number of new cells and number of streams
+(batches of one vehicle, start, kind and region). Pure except for the counts.
 
 A row beyond its vehicle's limit is archived and acknowledged like any other, but does not reach the
 map. So no data are lost and nothing is sent again, but a single car cannot fill the service's
@@ -63,8 +63,8 @@ class NewCells:
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
         """Return a mask of the rows (n,) of reports: True if the row is beyond its vehicle's limit
-        on new cells. All given rows must be in cells without earlier visits. Rows within the limit
-        reduce what remains of it. `now` is the time [s].
+        on new cells. All given rows must be in cells that no vehicle has visited before. Rows
+        within the limit reduce the vehicle's remaining allowance. `now` is the time [s].
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

@@ -1,7 +1,7 @@
-"""Record of accepted batches, which detects duplicates. Each stream (batches of one vehicle, start,
-kind and region) has a watermark and a set of numbers. No batch with a sequence number up to the
-watermark is expected any more. The set contains the accepted sequence numbers above it. Pure (no
-I/O).
+"""Record of accepted batches (messages with records), which detects duplicates. Each stream
+(batches of one vehicle, start, kind and region) has a watermark and a set of numbers. No batch with
+a sequence number up to the watermark is expected any more. The set contains the accepted sequence
+numbers above it. Pure (no I/O).
 
 The record's size is bounded by accepted data. Every number above a watermark is a batch in the
 archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record
@@ -31,14 +31,14 @@ StreamKey = tuple[
 
 
 class SequenceTracker:
-    """Accepted batches of one stream (vehicle, start, kind, region).
+    """Accepted batches (messages with records) of one stream (vehicle, start, kind, region).
 
     Attributes:
         key: name of the stream.
         vehicle: enrolled name of the sender; empty until it sends.
         boot: identifier of the vehicle's start, as sent; 0 until it sends.
         witness: permanent number that identifies the vehicle in the map; 0 until the vehicle sends.
-        low: watermark: every sequence number up to here is accepted, or will never arrive.
+        low: watermark: each sequence number up to this one is accepted, or will never arrive.
         seen: accepted sequence numbers above the watermark.
         newest: newest time of an accepted record [ns]; it decides when the stream is dropped.
     """
@@ -55,8 +55,8 @@ class SequenceTracker:
         self.seen: set[int] | frozenset[int] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if the batch of this stream (vehicle, start, kind, region) with this sequence
-        number was accepted before.
+        """Return True if the batch (message with records) of this stream (vehicle, start, kind,
+        region) with this sequence number was accepted before.
         """
         return seq <= self.low or seq in self.seen
 
@@ -78,8 +78,8 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Record sequence numbers of accepted batches of this stream (vehicle, start, kind,
-        region), given in ascending order.
+        """Record sequence numbers of accepted batches (messages with records) of this stream
+        (vehicle, start, kind, region), given in ascending order.
         """
         if (
             seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
@@ -115,8 +115,8 @@ BatchId = tuple[SequenceTracker, int]  # and seq
 
 
 class ArchivedRows(NamedTuple):
-    """Columns (n,) of archived rows that identify their batches; `time` [ns] is the time of each
-    record.
+    """Columns (n,) of archived rows that identify their batches (messages with records); `time`
+    [ns] is the time of each record.
     """
 
     vehicle: IntArray
@@ -128,7 +128,9 @@ class ArchivedRows(NamedTuple):
 
 
 class SequenceTrackers:
-    """Accepted batches of all streams (vehicle, start, kind, region) of one service."""
+    """Accepted batches (messages with records) of all streams (vehicle, start, kind, region) of one
+    service.
+    """
 
     def __init__(self) -> None:
         self._streams: dict[StreamKey, SequenceTracker] = {}
@@ -150,12 +152,13 @@ class SequenceTrackers:
 
     @property
     def newest(self) -> int:
-        """Return the time of the newest accepted batch [ns], or 0."""
+        """Return the time of the newest accepted batch (message with records) [ns], or 0."""
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Return a mask (n,): True for batches that were accepted before. `names` is (n, 4):
-        numbers of the vehicle, of the vehicle's start and of the region, and sequence number.
+        """Return a mask (n,): True for batches (messages with records) that were accepted before.
+        `names` is (n, 4): numbers of the vehicle, of the vehicle's start and of the region, and
+        sequence number.
         """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
@@ -168,9 +171,10 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """Return two items: all streams as columns (n,), and the accepted sequence numbers above
-        the watermarks (numbers up to which no batch is expected any more) of all streams in one
-        array. The column `above` is the number of items of this array that belong to each stream.
+        """Return two items: all streams (batches of one vehicle, start, kind and region) as columns
+        (n,), and the accepted sequence numbers above the watermarks (numbers up to which no batch
+        is expected any more) of all streams in one array. The column `above` is the number of items
+        of this array that belong to each stream.
         """
         streams = list(self._streams.values())
         above = [sorted(stream.seen) for stream in streams]
@@ -190,8 +194,8 @@ class SequenceTrackers:
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
-        """Return the streams that are described by `columns` and `above`, the result of the method
-        `columns`.
+        """Return the streams (batches of one vehicle, start, kind and region) that are described by
+        `columns` and `above`, the result of the method `columns`.
         """
         out = SequenceTrackers()
         at = 0
@@ -221,8 +225,8 @@ class SequenceTrackers:
         kind: Kind,
         rows: ArchivedRows,
     ) -> None:
-        """Record the batches of archived rows of one kind, (n,), as accepted; rows may be in any
-        order.
+        """Record the batches (messages with records) of archived rows of one kind, (n,), as
+        accepted; rows may be in any order.
         """
         vehicle, boot, region, seq, first_held, time = rows
         if not len(seq):

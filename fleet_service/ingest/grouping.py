@@ -1,5 +1,5 @@
 """Grouping of rows by stream (vehicle, start, kind, region) in one pass. It must be fast, because a
-restart processes tens of millions of rows. Compiled, pure.
+restart processes tens of millions of rows. Compiled, pure (no I/O).
 """
 
 from __future__ import annotations

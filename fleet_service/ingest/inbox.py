@@ -146,8 +146,8 @@ class Inbox:
 
 
 class AcceptedBatches(NamedTuple):
-    """Accepted batches of one kind (observations or states), and their rows for the archive
-    (without the columns `late` and `weight`).
+    """Accepted batches (messages with records) of one kind (observations or states), and their rows
+    for the archive (without the columns `late` and `weight`).
     """
 
     batches: list[BatchId]
@@ -155,11 +155,12 @@ class AcceptedBatches(NamedTuple):
 
 
 class BatchIntake:
-    """Intake of batches: decodes and validates messages, detects duplicates, and refuses invalid
-    batches. Python code runs per message, not per row.
+    """Intake of batches (messages with records): decodes and validates messages, detects
+    duplicates, and refuses invalid batches. Python code runs per message, not per row.
 
     Args:
-        streams: accepted batches per stream; updated.
+        streams: accepted batches per stream (batches of one vehicle, start, kind and region);
+            updated.
         pseudonyms: pseudonyms of the vehicles.
         counts: counters of refusals, under `refused.RULE`, and of duplicates.
         acks: collects refusals, and acknowledgements of duplicates that are already durable.
@@ -184,8 +185,8 @@ class BatchIntake:
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Return the rows of valid, new batches, by kind (observations or states); all other
-        batches are refused or counted.
+        """Return the rows of valid, new batches (messages with records), by kind (observations or
+        states); all other batches are refused or counted.
         """
         self.times.clear()
         self._now = clock.now / NS
@@ -207,7 +208,8 @@ class BatchIntake:
         return self._witnesses.number_of(name)
 
     def sync(self) -> None:
-        """Write the numbers and pseudonyms of the vehicles of accepted batches durably to disk.
+        """Write the numbers and pseudonyms of the vehicles of accepted batches (messages with
+        records) durably to disk.
 
         Raises:
             OSError: the disk is full or broken.
@@ -215,7 +217,9 @@ class BatchIntake:
         self._witnesses.sync()
 
     def acknowledge(self, batches: Sequence[BatchId]) -> None:
-        """Record acknowledgements for batches whose rows are durable on disk."""
+        """Record acknowledgements for batches (messages with records) whose rows are durable on
+        disk.
+        """
         self._pending.difference_update(batches)
         self._acks.record_durable(batches)
 
@@ -402,8 +406,8 @@ class BatchIntake:
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
         """Refuse a batch whose records cannot be used. If its sender and sequence number can be
-        read, send a rejection, because otherwise the vehicle would send the batch for ever. If not,
-        only count the refusal.
+        read, send a rejection, because otherwise the vehicle would send the batch for ever. If they
+        cannot be read, only count the refusal.
         """
         head = head_of(kind, message.payload, message.encoding)
         named = (
@@ -438,8 +442,8 @@ def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
 
 
 def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
-    """Return rows, heads (other fields) and numbers of rows of the batches at the positions
-    `indices` (ascending).
+    """Return rows, heads (other fields) and numbers of rows of the batches (messages with records)
+    at the positions `indices` (ascending).
     """
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):

@@ -174,7 +174,7 @@ def _least_needed(anchors: IntArray) -> int:
 
 @compiled
 def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
-    """Return how far two places (2,) [deg] are apart beyond the distance that a vehicle covers at
+    """Return the distance between two places (2,) [deg] minus the distance that a vehicle covers at
     the speed FASTEST in the time `apart` [ns]. The result is in metres, at least 0.
     """
     return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)

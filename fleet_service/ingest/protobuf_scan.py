@@ -204,8 +204,8 @@ def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
 
 @refcount_free
 def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
-    """Record the position of one protobuf field of message `k` in `scan.out`; return the byte after
-    it, or -1 if the field does not have the form that our encoder writes.
+    """Record the position of one protobuf field of message `k` in `scan.out`; return the position
+    of the byte after it, or -1 if the field does not have the form that our encoder writes.
     """
     data = scan.data
     out = scan.out

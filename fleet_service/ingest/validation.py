@@ -89,8 +89,8 @@ class Clock(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Reason for refusing a batch: name of the broken rule (for counting), row number, and text for
-    the sender.
+    """Reason for refusing a batch (message with records): name of the broken rule (for counting),
+    row number, and text for the sender.
     """
 
     rule: str
@@ -228,8 +228,9 @@ TOO_LONG: Final = Refusal(
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Return a mask of batches (k,): True if the batch spans more than MAX_SPAN_NS. `time` (n,)
-    [ns] contains the times of all rows, `sizes` (k,) the number of rows of each batch.
+    """Return a mask of batches (k,): True if the batch (message with records) spans more than
+    MAX_SPAN_NS. `time` (n,) [ns] contains the times of all rows, `sizes` (k,) the number of rows of
+    each batch.
     """
     if not len(time):
         return np.zeros(len(sizes), bool)

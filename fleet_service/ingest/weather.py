@@ -251,7 +251,8 @@ def read_file(path: Path) -> list[tuple[int, Report]]:
     `time` (timestamp, or ns), and any of the weather columns. Null or NaN means unknown.
 
     Raises:
-        InputError: names the row, the column and the fix.
+        InputError: the file cannot be read, or a value is not valid; the error names the row, the
+            column and the fix.
     """
     try:
         rows = pq.read_table(path).to_pylist()

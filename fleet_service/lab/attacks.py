@@ -4,11 +4,11 @@ alone.
 The attackers of `claim_random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were
 honest, and are therefore trusted, until the attack begins. `add_newcomers` uses new names.
 `replay_messages` sends messages through the service's admission: old messages again, other
-vehicles' messages under the attacker's key, and old visits under the attacker's name. A cell is
-counted if, at any minute, it has an alert with the attack but none without it, or the reverse.
-Raised alerts are counted in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in icy cells (μ <
-CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest vehicles used enough grip to
-measure the friction.
+vehicles' messages under the attacker's key, and old visits (passages of cells) under the attacker's
+name. A cell is counted if, at any minute, it has an alert with the attack but none without it, or
+the reverse. Raised alerts are counted in dry or wet cells (μ > CLEARLY_DRY), suppressed alerts in
+icy cells (μ < CLEARLY_ICY). Only cells are considered in which at least ENOUGH honest vehicles used
+enough grip to measure the friction.
 """
 
 from __future__ import annotations

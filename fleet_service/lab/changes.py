@@ -1,5 +1,6 @@
-"""Ice that forms and melts on one road of a town. The module measures how many passes with enough
-grip used the map needs to show the change. Pure (no I/O).
+"""Ice that forms and melts on one road of a town. The module counts the passes until the map shows
+the change. Only passes count in which the vehicle used enough grip to measure the friction. Pure
+(no I/O).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Processing of simulated visits by the service's own code: archive rows → `observations_of` →
-`Fusion.update` → alerts.
+"""Processing of simulated visits (passages of cells) by the service's own code: archive rows →
+`observations_of` → `Fusion.update` → alerts.
 
 Deliveries are realistic: a few rows come late (some too late), and some twice; `SequenceTrackers`
 drops the duplicates, as in the service.
@@ -34,7 +34,7 @@ CELL: Final = cell_numbers()
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     """Return simulated visits (passages of cells) as the archive columns from which a map is
-    computed; every row is a separate batch.
+    computed; every row is a separate batch (message with records).
 
     `cells` contains the grid number of each place of the town.
     """
@@ -73,9 +73,9 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """Draw at random how the reports of the visits are delivered: some come late, some twice.
-    Return two arrays with one item per delivery: the arrival time [s], in ascending order, and the
-    index of the visit.
+    """Draw at random how the reports of the visits (passages of cells) are delivered: some come
+    late, some twice. Return two arrays with one item per delivery: the arrival time [s], in
+    ascending order, and the index of the visit.
     """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(
@@ -123,7 +123,9 @@ class AlertWatch:
     late: int = 0
 
     def snapshot(self, minute: int) -> None:
-        """Read the map's beliefs and alerts at a minute of the drive, and store them."""
+        """Read the map's beliefs (probabilities of each friction) and alerts at a minute of the
+        drive, and store them.
+        """
         now = START + minute * 60 * NS
         slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
         known = slots >= 0

@@ -179,7 +179,9 @@ def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
 
 
 def read_observations(path: Path) -> dict[str, Any]:
-    """Read the columns of a file of observations, in the form in which the archive returns them."""
+    """Return the columns of a file of observations, in the form in which the archive returns
+    them.
+    """
     table = pq.read_table(path)
     out = {}
     for name, dtype in wire.column_types(wire.Kind.OBSERVATION).items():
@@ -193,8 +195,8 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Read the files of a simulated drive from a folder; return the vehicles' reports together with
-    the true values.
+    """Return the reports of the vehicles of a simulated drive together with the true values, read
+    from the files in a folder.
     """
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
@@ -204,8 +206,8 @@ def driven_in(folder: Path) -> DrivenVisits:
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:
-    """Return columns of a drive as observations that a `Fusion` accepts; each row is given as a
-    separate batch.
+    """Return columns of a drive as observations that a `Fusion` (the map's beliefs) accepts; each
+    row is given as a separate batch (message with records).
     """
     n = len(columns["cell"])
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
@@ -240,8 +242,8 @@ def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatA
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return a mask of slots (cell and heading sector), (slots,): True if all visits to the slot
-    truly had the same friction.
+    """Return a mask of slots (cell and heading sector), (slots,): True if all visits (passages of
+    cells) to the slot truly had the same friction.
     """
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()

@@ -51,8 +51,8 @@ TITLES: Final = {
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Return the lower end of the interval, averaged over the seeds, by weather and minutes since
-    the last pass.
+    """Return the lower end of the map's friction interval, averaged over the seeds, by weather and
+    minutes since the last pass.
     """
     return {
         f"{PREFIX}.{name}.min{minutes}": float(lower)

@@ -1,5 +1,5 @@
-"""Fleets with and without misbehaving vehicles: coverage, error and alerts of the map, compared
-with the simple rules in `rules`.
+"""Simulated fleets with and without misbehaving vehicles: coverage, error and alerts of the map,
+compared with the simple rules of the module `rules`.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Fleet(NamedTuple):
     reports the value `claim`.
 
     The service judges vehicles by their earlier reports. Coverage and error are therefore measured
-    from minute `begin` on, when every vehicle has about 200 visits, as many as a car makes in a
-    day. The rates of alerts are measured as soon as each vehicle has made EARLIER visits, about two
-    minutes after the start. The figures `…_settled` are measured from `begin` on.
+    from minute `begin` on, when every vehicle has about 200 visits (passages of cells), as many as
+    a car makes in a day. The rates of alerts are measured as soon as each vehicle has made EARLIER
+    visits, about two minutes after the start. The figures `…_settled` are measured from `begin` on.
     """
 
     name: str

@@ -1,5 +1,5 @@
-"""Errors of the real estimator: its reports on simulated drives, resampled for the visits of a
-town. Pure (no I/O).
+"""Errors of the real estimator: its reports on simulated drives, resampled for the visits (passages
+of cells) of a town. Pure (no I/O).
 
 The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
@@ -128,8 +128,8 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
     """Return one element of `rows` (m,) for each friction in `mu` (n,), drawn at random from the
-    NEAREST rows with the most similar friction. `rows` must be sorted by friction; the result is -1
-    if there are no rows.
+    NEAREST rows with the most similar friction. `of` contains the friction of all rows, and `rows`
+    must be sorted by it. The result is -1 if there are no rows.
     """
     if not len(rows):
         return np.full(len(mu), -1)

@@ -56,8 +56,9 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """Return the posterior (mean m, variance P) that the vehicle's own filter sends at each visit,
-    (n, 2). Before each visit the filter's variance grows, at most to that of the prior.
+    """Return the posterior (mean m, variance P) that the vehicle's own filter sends at each visit
+    (passage of a cell), (n, 2). Before each visit the filter's variance grows, at most to that of
+    the prior (belief before any measurement).
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -87,9 +88,9 @@ def fuse_by_rules(
     """Return mean and variance of μ by the first five of the simple rules in each cell at each time
     in `asked` [s], (times, 5, cells, 2).
 
-    A visit k is in the cell `place[k]` at the time `seconds[k]`. The filter of the vehicle has the
-    mean and variance `sent[k]`; the reading of the visit is `readings[0][k]` with standard
-    deviation `readings[1][k]`.
+    A visit k (passage of a cell) is in the cell `place[k]` at the time `seconds[k]`. The filter of
+    the vehicle has the mean and variance `sent[k]`; the reading of the visit is `readings[0][k]`
+    with standard deviation `readings[1][k]`.
     """
     reading, std = readings
     mean = np.full((5, cells), PRIOR_MEAN)

@@ -84,7 +84,9 @@ def bound_excess(used: float, path: str) -> float:
 
 
 def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
-    """Encode a batch as bytes, and return the observations that the service decodes from them."""
+    """Encode a batch (message with records) as bytes, and return the observations that the service
+    decodes from them.
+    """
     payload = wire.encode(batch)
     encoding = wire.ENCODING[Kind.OBSERVATION]
     if as_json:
@@ -129,8 +131,8 @@ def backlog_fused(rng: Generator) -> float:
 
 
 def safe_excess(rng: Generator) -> float:
-    """Return the safe deceleration according to the map minus the truly safe one [m/s²], 30 minutes
-    after black ice has formed.
+    """Return the safe deceleration according to the map minus the truly safe deceleration [m/s²],
+    30 minutes after black ice has formed.
 
     The road was dry for an hour before. On the ice the drivers use a fifth of the grip. The weather
     report states FREEZING_C and no precipitation.

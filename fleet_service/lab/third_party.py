@@ -101,8 +101,8 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the visits of a drive as observations that a `Fusion` accepts; their optional columns
-    are absent.
+    """Return the visits (passages of cells) of a drive as observations that a `Fusion` (the map's
+    beliefs) accepts; their optional columns are absent.
     """
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
@@ -146,8 +146,8 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
     """Return three items at the end of a drive of an honest fleet: the scores of the map, a mask of
-    cells with an alert, and the number of visits to each cell in which the vehicle used enough grip
-    to measure the friction.
+    cells with an alert, and the number of visits (passages of cells) to each cell in which the
+    vehicle used enough grip to measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -287,8 +287,8 @@ def measure_change(seeds: range) -> dict[str, float]:
 
 
 def count_cold(rng: Generator) -> int:
-    """Return the number of passes over ice until a service that knows no vehicle yet raises an
-    alert.
+    """Return the number of passes over ice until an alert is raised by a new service, which does
+    not know the vehicles from earlier reports.
 
     The vehicles follow the error model of `agent`; each makes one pass.
     """

@@ -188,8 +188,8 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """Return the visits with false reports: the vehicles that the mask `liars` (V,) selects report
-    the friction `claim` with high confidence, instead of their own values.
+    """Return the visits (passages of cells) with false reports: the vehicles that the mask `liars`
+    (V,) selects report the friction `claim` with high confidence, instead of their own values.
     """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)

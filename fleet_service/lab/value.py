@@ -10,9 +10,10 @@ half of the roads changes once.
     s      share of the grip used, min(d/μ, 1); a slip controller intervenes if s = 1
     known  share of cells and times with a 90 % interval narrower than NARROW
 
-The alerts are compared with two simple rules on the visits of the last hour. The first warns after
-two visits in which a slip controller intervened while less grip than the slippery limit was used.
-The second warns if there are at least two values and their median is slippery.
+The alerts are compared with two simple rules on the visits (passages of cells) of the last hour.
+The first warns after two visits in which a slip controller intervened while less grip than the
+slippery limit was used. The second warns if there are at least two values and their median is
+slippery.
 """
 
 from __future__ import annotations
@@ -106,8 +107,8 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
 
 
 def make_observations(traffic: TownTraffic) -> Observations:
-    """Return the visits (passages of cells) as observations that a `Fusion` accepts, with the flags
-    of the slip controllers.
+    """Return the visits (passages of cells) as observations that a `Fusion` (the map's beliefs)
+    accepts, with the flags of the slip controllers.
     """
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
@@ -115,8 +116,8 @@ def make_observations(traffic: TownTraffic) -> Observations:
 
 
 def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
-    """Return a mask of cells, (CELLS,): True if slip controllers intervened twice at little grip
-    within the last hour.
+    """Return a mask of cells, (CELLS,): True if, within the last hour, slip controllers intervened
+    twice while less grip than the slippery limit was used.
     """
     v = traffic.visits
     recent = (v.seconds > seconds - HOUR_S) & (v.seconds <= seconds)
@@ -125,8 +126,8 @@ def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
 
 
 def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
-    """Return a mask of cells, (CELLS,): True if there are at least two values within the last hour
-    and their median is slippery.
+    """Return a mask of cells, (CELLS,): True if vehicles reported at least two friction values
+    within the last hour, and their median is slippery.
     """
     v = traffic.visits
     rows = np.flatnonzero((v.seconds > seconds - HOUR_S) & (v.seconds <= seconds) & v.excited)
@@ -166,9 +167,9 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
 
 
 def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
-    """Return, for each cell that became slippery, the minutes until the first warning;
-    UNNOTICED_MOST if there was none until then. `warned` is the mask of warned cells each time the
-    map is read.
+    """Return, for each cell that became slippery, the minutes until the first warning; at most
+    UNNOTICED_MOST, which also stands for no warning. `warned` is the mask of warned cells each time
+    the map is read.
     """
     moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
     out = []

@@ -1,5 +1,5 @@
 """Colours of cells. Less certain cells have fewer possible colours, and a cell with only a lower
-bound has none.
+bound has none (it is hollow).
 
 Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu if its interval
 is narrow, two classes if it is of medium width, one grey if it is wide. There are two exceptions. A

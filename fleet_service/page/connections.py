@@ -78,8 +78,8 @@ class BoundedProtocol(H11Protocol):
         self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
 
     def _close_silent(self, before: object) -> None:
-        """Close the browser's connection if no request has come since the request `before`, which
-        was the last one when the time limit began.
+        """Close the browser's connection if no request has come since the time limit began;
+        `before` is the last request at that time.
         """
         if not self.is_silent:
             return
@@ -100,8 +100,8 @@ class RareMessages(logging.Filter):
         self._more: Counter[str] = Counter()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a log message may be logged now, because no equal one was logged within
-        LOG_S.
+        """Return True if a log message may be logged now, because no equal message was logged
+        within LOG_S.
         """
         text = str(record.msg)
         if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:

@@ -73,7 +73,7 @@ class MapMirror:
 
     @property
     def heard(self) -> float:
-        """Return when any service sent anything [s since 1970]; 0 if none has."""
+        """Return the time at which any service last sent anything [s since 1970]; 0 if none has."""
         return max(self._heard, self.alerts.heard)
 
     def remember(self, now: float) -> None:

@@ -89,7 +89,7 @@ class MapRoutes:
         return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
     async def overlay(self, _: Request) -> Response:
-        """Return the cells of the additional map that is drawn over the live one, such as the true
+        """Return the cells of the additional map that is drawn over the live map, such as the true
         friction of a simulation; null if there is none.
         """
         return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))

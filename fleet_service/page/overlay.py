@@ -1,5 +1,5 @@
-"""Additional map drawn over the live one, such as the true friction of a simulation: a Parquet file
-of cell, sector and mu.
+"""Additional map drawn over the live map, such as the true friction of a simulation: a Parquet file
+of cell, heading sector and mu.
 
 The file is read on each request, because it may appear while the page is running.
 """

@@ -181,8 +181,8 @@ class Reader:
                 self._world.touch(tile, now)
 
     def _sees_services(self) -> bool:
-        """Return True if a service answers for any place. A service's token shows this; if tokens
-        are hidden, its answers show it.
+        """Return True if a service answers for any place. The Zenoh liveliness token of a service
+        shows this; if tokens are hidden, the service's answers show it.
 
         A router matches only services that answer for all of a key expression. Therefore a service
         of the whole world is found by any tile, and a service of a region by a region already

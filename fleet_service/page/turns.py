@@ -36,8 +36,8 @@ class RequestTurns:
 
     @asynccontextmanager
     async def take(self, client: str) -> AsyncIterator[None]:
-        """Wait until another request of the client, a browser, may be computed, and count this
-        request while the block runs.
+        """Wait until one more request of this client (a browser) may be computed, and count the
+        request as running while the block runs.
         """
         self._counts[client] += 1
         try:

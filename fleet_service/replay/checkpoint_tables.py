@@ -55,7 +55,7 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
     """Return the fusion (beliefs about all cells) that tables describe; it continues exactly like
-    the one passed to `tables_of`.
+    the fusion that was passed to `tables_of`.
 
     Raises:
         InputError: the tables are of another version, or incomplete.

@@ -1,5 +1,5 @@
-"""Replay of an archive: it restores the record of accepted batches, and the beliefs about the
-friction of all cells, for now or for a past moment.
+"""Replay of an archive: it restores the record of accepted batches (messages with records), and the
+beliefs about the friction of all cells, for now or for a past moment.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def restore_streams(
     begin: Begin = Begin(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
 ) -> None:
-    """Record every archived batch as accepted, so that duplicates are detected after a restart.
+    """Record every archived batch (message with records) as accepted, so that duplicates are
+    detected after a restart.
 
     Args:
         root: folder of the archive.
@@ -124,13 +125,13 @@ class Since(NamedTuple):
     """Selection of rows for a replay.
 
     Once the vehicles' weights are known, a cell does not depend on distant cells. Therefore cells
-    inside a box get the same belief as in a complete replay, if the rows of a margin around the box
-    are read too.
+    inside a box get the same belief (probabilities of each friction) as in a complete replay, if
+    the rows of a margin around the box are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of the batches before the start; they are left out, because a compacted file
-            may also contain older batches.
+        known: record of the batches before the start; they are left out, because a compacted
+            (sorted) file may also contain older batches.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
         most: maximum number of rows; if there are more, an error is raised.
@@ -226,8 +227,8 @@ def first_day(root: Path) -> int | None:
     """Return the first day that matters to a service (days since 1970): layout.MAP_DAYS before the
     last day with rows; None for an empty archive.
 
-    Vehicles do not send older batches again (ServiceConfig.oldest_s), and older batches no longer
-    affect the map.
+    Vehicles do not send older batches (messages with records) again (ServiceConfig.oldest_s), and
+    older batches no longer affect the map.
     """
     found = [
         layout.day_of(folder)
@@ -371,7 +372,9 @@ def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
 
 
 def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
-    """Yield the rows of the listed files in parts of about PART_ROWS."""
+    """Yield the rows of the archive files in `listing` in parts of about PART_ROWS. An error is
+    raised if there are more than `most` rows.
+    """
     name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]
     inbox = pa.concat_tables(fresh).sort_by(name) if fresh else None

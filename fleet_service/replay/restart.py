@@ -32,7 +32,8 @@ class Restart(NamedTuple):
 
     Attributes:
         fusion: fusion of the checkpoint, or a new one.
-        streams: record of the batches that were accepted when the checkpoint was taken.
+        streams: record of the batches (messages with records) that were accepted when the
+            checkpoint was taken.
         standing: alerts that were active when the checkpoint was taken.
         cut: position of the last segment (file of new rows) that is included; None without a
             checkpoint.
@@ -89,7 +90,8 @@ def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
     """Return the tables of a checkpoint (saved state) by name: the tables of the fusion, the active
-    alerts, and the record of accepted batches. `load_restart` restores the state from them.
+    alerts, and the record of accepted batches (messages with records). `load_restart` restores the
+    state from them.
     """
     columns, above = streams.columns()
     return tables_of(fusion) | {

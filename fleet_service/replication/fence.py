@@ -38,7 +38,7 @@ class Term(NamedTuple):
 
 class Fence(NamedTuple):
     """Fence of a bucket (object store): the list of valid objects. Objects are valid if they have
-    the epoch `epoch` or a later one, or if they are in `names`.
+    the epoch (number of the owner's term) `epoch` or a later one, or if they are in `names`.
     """
 
     epoch: int

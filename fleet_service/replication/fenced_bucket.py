@@ -1,4 +1,6 @@
-"""Bucket under the lease and the fence of its owner: who may write, and which objects are valid."""
+"""Bucket under the lease and the fence (list of valid objects) of its owner: who may write, and
+which objects are valid.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from fleet_service.replication.fence import Fence, Term, fence_of, put_fence
 
 
 class FencedBucket:
-    """Bucket of a replica, with the lease of its owner if there is one, and with the fence against
-    former owners.
+    """Bucket of a replica, with the lease of its owner if there is one, and with the fence (list of
+    valid objects) against former owners.
 
     Attributes:
         objects: the bucket.
@@ -73,7 +75,7 @@ class FencedBucket:
     def admit_objects(self, names: Iterable[str]) -> None:
         """Add uploaded objects to the fence (list of valid objects) if they would not be valid
         without it: such a file was compacted by a service that started earlier, so its name has an
-        older epoch.
+        older epoch (number of the owner's term).
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))

@@ -229,7 +229,8 @@ class Lease:
         Args:
             stop: event that ends the wait.
             say: called with a line of text when the reason for waiting changes.
-            epoch: function that returns the largest known epoch.
+            epoch: function that returns the largest known epoch (number in the names of an owner's
+                files).
             standby: functions of a standby service. None for a service that is no standby and does
                 not wait for a live holder.
 

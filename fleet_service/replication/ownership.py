@@ -32,7 +32,8 @@ class Ownership:
     Attributes:
         copy: bucket copy of the archive; None without one.
         lease: lease of the copy; None if no other service must be excluded.
-        to: name of the standby that takes over when this service stops; "" for none.
+        to: name of the standby (waiting service) that takes over when this service stops; "" for
+            none.
         leaves: True once everything is ready for this hand-over.
     """
 
@@ -232,8 +233,8 @@ def _sync_folder(
     say: Callable[[str], None],
 ) -> bool:
     """Synchronise the archive's folder with its copy in the bucket. Return False if `stop` is set,
-    or if another service has the lease (ownership). A standby service retries while the bucket
-    cannot be reached.
+    or if another service has the lease (ownership). A standby (waiting) service retries while the
+    bucket cannot be reached.
     """
     logged = ""
     while not stop.is_set():

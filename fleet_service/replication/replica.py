@@ -1,11 +1,11 @@
 """Bucket replica of an archive: the same files under the same names.
 
-Files on which an acknowledgement depends (segments, keys, vehicle identities) are uploaded before
-the acknowledgement (`upload_segments`). All other files follow later (`sync`). Uploads come first
-and deletions last, so that the copy contains every row at least once at any time. At start
-(`sync_without_lease`), files that only the bucket has are downloaded (all files, if the disk is
-empty), and files that only the folder has are uploaded. An object is deleted only if the upload
-journal (list of own uploads) contains it.
+Files on which an acknowledgement depends (segments (files of new rows), keys, vehicle identities)
+are uploaded before the acknowledgement (`upload_segments`). All other files follow later (`sync`).
+Uploads come first and deletions last, so that the copy contains every row at least once at any
+time. At start (`sync_without_lease`), files that only the bucket has are downloaded (all files, if
+the disk is empty), and files that only the folder has are uploaded. An object is deleted only if
+the upload journal (list of own uploads) contains it.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class BucketReplica:
 
     Raises:
         InputError: the URL or an option cannot be used, or obstore is not installed.
-        OSError: the journal cannot be read or written.
+        OSError: the journal (list of uploaded files) cannot be read or written.
 
     Attributes:
-        bucket: the bucket under the lease and the fence of its owner.
+        bucket: the bucket under the lease and the fence (list of valid objects) of its owner.
         backoff: failures of `upload_segments`, and the pauses after them.
     """
 
@@ -97,7 +97,8 @@ class BucketReplica:
         former holder of the lease uploads later are ignored.
 
         Args:
-            service: name of the service; None for a standby, which follows the owner of the bucket.
+            service: name of the service; None for a standby (waiting service), which follows the
+                owner of the bucket.
             term: lease number and epoch (number in file names); None without a lease.
             succeeds: True if another machine had the lease before. Data that only this folder has
                 were then never acknowledged and are removed.
@@ -127,8 +128,8 @@ class BucketReplica:
         return max(largest_epoch(self._slow.list_sizes()), largest_epoch(self._files.list_files()))
 
     def prefetch(self) -> None:
-        """Download files in advance, for a standby: those that a later `sync_under_lease` will
-        need. Another service still owns the bucket.
+        """Download files in advance, for a standby (waiting service): those that a later
+        `sync_under_lease` will need. Another service still owns the bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete, because the owner's compaction may
@@ -178,7 +179,7 @@ class BucketReplica:
 
         Raises:
             CopyError: the work is incomplete; the next call continues.
-            OSError: the journal cannot be written.
+            OSError: the journal (list of uploaded files) cannot be written.
         """
         return self._upload_changes(with_log=False)
 

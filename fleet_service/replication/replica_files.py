@@ -1,4 +1,4 @@
-"""Files of an archive that belong into its bucket replica, as they are on disk."""
+"""Names and paths of those files of an archive that belong into its bucket replica."""
 
 from __future__ import annotations
 

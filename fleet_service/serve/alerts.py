@@ -47,7 +47,7 @@ class Alerts:
     """Cells that have an active alert, and the rules by which alerts begin and end.
 
     Args:
-        fusion: owner of the cells.
+        fusion: owner of the cells, that is, the beliefs about the friction of all cells.
         idle_roads: limit on alerts on roads where no vehicle drives except those that report the
             ice; None for no limit, in simulations.
         is_private: True if times and numbers of vehicles are rounded for privacy.
@@ -83,8 +83,8 @@ class Alerts:
 
     def renumber(self, place: IntArray) -> None:
         """Update the slot numbers of active alerts after the slots (storage of cells with heading
-        sectors) were renumbered; `place` contains the new number of each slot. No slot must have
-        been removed that has an active alert.
+        sectors) were renumbered; `place` contains the new number of each slot. A slot with an
+        active alert must not have been removed.
         """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 

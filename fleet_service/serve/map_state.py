@@ -61,7 +61,7 @@ class MapState:
 
     def slots(self, tile: int) -> IntArray:
         """Return the slots (row numbers of cells with heading sectors), (n,), of a tile, in the
-        order of their first visit.
+        order of their first visit (passage of a cell).
         """
         self._index()
         if tile not in self._slots:

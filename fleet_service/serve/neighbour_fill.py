@@ -2,10 +2,11 @@
 such. Pure (no I/O).
 
 A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
-estimated belief is the prior. Along a route the order of cells is known. There a cell borrows from
-the nearest visited cells before and behind it, up to REACH cells away, and the share of the prior
-grows with the distance. If both sides are visited, each side has its share. Two different surfaces
-therefore give a wide belief, and not a belief about a surface in the middle.
+estimated belief is the prior (belief before any measurement). Along a route the order of cells is
+known. There a cell borrows from the nearest visited cells before and behind it, up to REACH cells
+away, and the share of the prior grows with the distance. If both sides are visited, each side has
+its share. Two different surfaces therefore give a wide belief, and not a belief about a surface in
+the middle.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ KEPT: Final = 0.8
 def impute_cells(
     source: Readable, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
-    """Return a view of unvisited cells of a tile with beliefs estimated from visited neighbours.
-    These are the cells next to the visited cells in `known`, in the same heading sector; if a
-    `route` is given, the cells along it.
+    """Return a view (copy of the state) of unvisited cells of a tile, with beliefs about their
+    friction estimated from visited neighbours. These are the cells next to the visited cells in
+    `known`, in the same heading sector; if a `route` is given, the cells along it.
 
-    A belief is half the prior and half the mean of the visited neighbours; at greater distance, the
-    share of the neighbours is smaller. `vehicles` is the minimum over these neighbours, so that an
-    estimated value is never more public than its sources. `first` and `last` are the oldest and the
-    newest time of the neighbours.
+    A belief is half the prior (belief before any measurement) and half the mean of the visited
+    neighbours; at greater distance, the share of the neighbours is smaller. `vehicles` is the
+    minimum over these neighbours, so that an estimated value is never more public than its sources.
+    `first` and `last` are the oldest and the newest time of the neighbours.
     """
     live = source.live
     slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]

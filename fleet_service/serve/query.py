@@ -1,5 +1,5 @@
-"""Answers to map queries, one tile at a time: select cells, compute beliefs, estimate unvisited
-cells, encode. Pure (no I/O).
+"""Answers to map queries, one tile at a time: select cells, compute beliefs (probabilities of each
+friction), estimate unvisited cells, encode. Pure (no I/O).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def answer_query(
         cache: the tiles of the map.
         query: parameters of the query.
         wanted: function that returns True if a tile's key matches the query's key.
-        now: time [ns] for which beliefs and ages are computed.
+        now: time [ns] for which beliefs (probabilities of each friction) and ages are computed.
         only: the only matching tile, if the query's key names it.
 
     Raises:
@@ -63,7 +63,7 @@ def size_asked(
 ) -> AnswerSize:
     """Return an upper bound of the size of a query's answer: that of all tiles that must be read.
     `cache` contains the tiles, `wanted` returns True for tiles that match the query's key, and
-    `only` is the only such tile if there is one.
+    `only` is that tile if the key names exactly one.
     """
     route = keys_along(query.route) if query.route else None
     tiles = [

@@ -54,8 +54,8 @@ class CellView(NamedTuple):
 
 
 class Readable(Protocol):
-    """Interface to the cells of a map and their beliefs: implemented by a `Fusion` and by its
-    public copy.
+    """Interface to the cells of a map and their beliefs (probabilities of each friction):
+    implemented by a `Fusion` and by its public copy.
     """
 
     @property
@@ -76,8 +76,9 @@ class Readable(Protocol):
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return a copy of the state of `slots` (cells with heading sectors), with beliefs for the time
-    `now` [ns]. The map may be updated afterwards without changing the copy.
+    """Return a copy of the state of `slots` (cells with heading sectors), with beliefs
+    (probabilities of each friction) for the time `now` [ns]. The map may be updated afterwards
+    without changing the copy.
     """
     live = source.live
     key = live.key[slots]

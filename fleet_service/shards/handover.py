@@ -1,9 +1,10 @@
-"""Live hand-over of a region: the active service stops regularly, and a named standby gets its
-lease.
+"""Live hand-over of a region: the active service stops regularly, and a named standby (a waiting
+service) gets its lease (ownership of the archive). A token is the Zenoh liveliness token by which a
+service announces itself.
 
     client                                   active service
     get gripmap/v1/shard/SERVICE?to=NAME ──► checks that NAME stands by for its regions, replies
-    watches the tokens                       writes and uploads a checkpoint
+    watches the tokens                       writes and uploads a checkpoint (saved state)
                                              stops: flush, acknowledge, undeclare its token
                                              releases the lease for NAME
                                              NAME acquires it, restores the map, declares its token

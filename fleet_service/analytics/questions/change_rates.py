@@ -96,7 +96,8 @@ def expression(t: Table) -> Table:
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return a table with one row per band of road temperature and one per part of the day: how
-    often the road changes per hour, its interval, and the data on which it is based.
+    often the road changes per hour, the 90 % interval of this rate, and the numbers of data on
+    which it is based.
 
     If `stations` is given, temperatures are those of the nearest station, else those that vehicles
     reported.
@@ -189,8 +190,9 @@ BEGINS: Final = tuple(
 
 def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
     """Return the maximum-likelihood estimates of λ, the rate at which roads change [1/s], and e,
-    the probability that two readings of the same road differ because of errors. Return NaN if no
-    pair differs, or if all values are on one side of the slippery limit.
+    the probability that two values of the same road are unlike because of errors. Two values are
+    unlike if one is slippery and the other is not. Return NaN if no pair is unlike, or if all
+    values are on one side of the slippery limit.
 
     Args:
         counts: (bins, 4): number of pairs, number of unlike pairs (one slippery, one not), number

@@ -1,5 +1,5 @@
 """`grip`: percentiles of mu per cell and day. It also reports the daily coverage: the shares of
-cells with values, with only lower bounds, and without visits.
+cells with values, with only lower bounds, and without visits (passages of cells).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 def expression(t: Table) -> Table:
     """Return a table with one row per day, map cell and heading sector. A row without a value of mu
-    has no percentiles. Then it is only known that mu is at least `utilised_max`, the largest grip
-    used.
+    has no percentiles. Then it is only known that mu is at least `utilised_max`, the largest
+    friction coefficient that a vehicle used.
     """
     reported = ibis.ifelse(has_value(t), t.mu.cast("float64"), ibis.null("float64"))
     t = t.select(
@@ -54,8 +54,9 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def coverage_lines(found: pa.Table) -> list[str]:
-    """Return one line of text per day: the shares of the network with a value, with only a lower
-    bound of friction, and without a visit of a vehicle.
+    """Return one line of text per day: the shares of the road network (all cells visited in the
+    selected time) with a friction value, with only a lower bound of friction, and without a visit
+    of a vehicle on this day.
     """
     key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
     network = len(np.unique(key))

@@ -10,8 +10,8 @@
 
 The date is that of the measurement (UTC). NAME is the name of the newest segment (SHARD-EPOCH-SEQ,
 see `segments`) from which the file contains rows. If several services own the archive in turn (by a
-lease), the epoch of the compacting service follows SHARD. Two services may compact at once, because
-one of them was frozen; the epoch ensures that they never write the same name.
+lease), the epoch of the compacting service follows SHARD. If a service was frozen during its
+compaction, two services may compact at once. The epoch ensures that they never write the same name.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 
 def require_archive(root: Path) -> None:
-    """Raise unless a folder is an archive. This check prevents compaction from writing into other
-    folders.
+    """Raise unless a folder is an archive. This check prevents compaction (move of new rows into
+    sorted files) from writing into other folders.
 
     Raises:
         InputError: it is not a folder, or no service created it.
@@ -124,8 +124,8 @@ def day_of(folder: Path) -> int:
 
 
 def partition_of(path: Path) -> Partition:
-    """Return the partition of a compacted file, that is, its day and its zone (map square of zoom
-    7), read from the names of the folders in which the file lies.
+    """Return the partition of a compacted (sorted) file, that is, its day and its zone (map square
+    of zoom 7), read from the names of the folders in which the file lies.
     """
     return Partition(
         day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
@@ -135,8 +135,8 @@ def partition_of(path: Path) -> Partition:
 def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
-    """Yield the compacted files of a kind (observations or states), sorted by date, zone (map
-    square of zoom 7) and age. Only days (since 1970) from `since_day` to `until_day`, both
+    """Yield the compacted (sorted) files of a kind (observations or states), sorted by date, zone
+    (map square of zoom 7) and age. Only days (since 1970) from `since_day` to `until_day`, both
     included, are read; None means no limit.
     """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
@@ -174,8 +174,9 @@ def with_term(name: str, term: int) -> str:
 
 
 def compacted_name(name: str, term: int) -> str:
-    """Return the name of a compacted file, made from the name of its newest segment and the term
-    (lease epoch) of the compacting service; the term is 0 without a lease.
+    """Return the name of a compacted (sorted) file, made from the name of its newest segment (file
+    of new rows) and the term (lease epoch) of the compacting service; the term is 0 without a
+    lease.
     """
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
@@ -185,8 +186,9 @@ def term_of(name: str) -> int | None:
     """Return the term (lease epoch) of the service that created an object of an archive's copy;
     None if its name contains none.
 
-    Segments (files of new rows), checkpoints, weather and vehicle identities have the epoch of
-    their service; compacted files and their roll-ups have the epoch of the compacting service.
+    Segments (files of new rows), checkpoints (saved states), weather and vehicle identities have
+    the epoch of their service. Compacted (sorted) files and their roll-ups (hourly statistics) have
+    the epoch of the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:
@@ -196,8 +198,9 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a sort key that orders the names of segments, or of compacted files, from old to new:
-    epoch (number of the writer's start), number of the segment, name of the service.
+    """Return a sort key that orders the names of segments (files of new rows), or of compacted
+    (sorted) files, from old to new: epoch (number of the writer's start), number of the segment,
+    name of the service.
     """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard

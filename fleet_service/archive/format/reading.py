@@ -1,5 +1,5 @@
 """Reading of an archive so that every row is read exactly once, from the inbox (segments, which are
-files of new rows) or from a compacted file, even during a compaction.
+files of new rows) or from a compacted (sorted) file, even during a compaction.
 
 The inbox is read first and completely. If a compaction deletes segments meanwhile, the reader
 starts again. Then the compacted files are listed once. Rows of a segment are skipped if a listed
@@ -40,8 +40,9 @@ class Wanted(NamedTuple):
         columns: columns to read; None for all.
         where: filter on rows.
         days: first and last day of measurement, both included.
-        after: read only files that were written after this position in the sequence of segments. A
-            compacted file is read as a whole, so it may contain older rows too.
+        after: read only files that were written after this position in the sequence of segments
+            (files of new rows). A compacted file is read as a whole, so it may contain older rows
+            too.
         until: read no segment of the inbox that was written after this position.
         box: read only compacted files of zones (map squares of zoom 7) that touch this box (west,
             south, east, north [deg]).
@@ -55,8 +56,9 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a file was written after the position `after` in the sequence of segments.
-        The file is a segment, or a compacted file, which is named after its newest segment.
+        """Return True if a file was written after the position `after` in the sequence of segments
+        (files of new rows). The file is a segment, or a compacted (sorted) file, which is named
+        after its newest segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 
@@ -147,7 +149,8 @@ class Listing:
 
     def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
         """Return the rows of one file of the archive that match the selection and the filter
-        `where`. Return None if the file is damaged, or its day has been removed.
+        `where`. Return None if the file is damaged, or was removed together with the other files of
+        its day.
         """
         both = [*(self._wanted.where or ()), *(where or ())]
         try:
@@ -209,7 +212,7 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
     """Return the rows of a table of new rows that do not belong to the partitions `done`, because
-    compacted files already contain the rows of these partitions (day and map square).
+    compacted (sorted) files already contain the rows of these partitions (day and map square).
     """
     if not done or not table.num_rows:
         return table

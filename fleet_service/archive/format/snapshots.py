@@ -50,8 +50,8 @@ def time_of(path: Path) -> int:
 
 
 def newest_snapshot(root: Path, until: int) -> Path | None:
-    """Return the path of the last snapshot taken at `until` [ns] or before; None if there is
-    none.
+    """Return the path of the last snapshot of the map taken at `until` [ns] or before; None if
+    there is none.
     """
     for folder in reversed(layout.day_folders(root, TABLE, until_day=until // layout.DAY_NS)):
         for path in sorted(folder.glob("*.parquet"), reverse=True):

@@ -1,9 +1,10 @@
 """Pseudonyms: keyed hashes of vehicle names, and of the identifiers of vehicle starts, with one key
 per month.
 
-Destroying a month's key makes its rows anonymous. The hash of a vehicle start differs per month
-too; otherwise a drive over the end of a month would link the pseudonyms of two months. The key is
-that of the month of a batch's first record, so that a repeated batch has the same pseudonym.
+Destroying a month's key makes the rows of this month anonymous. The hash of a vehicle start differs
+per month too; otherwise a drive over the end of a month would link the pseudonyms of two months.
+The month of the first record of a batch (message with records) selects the key, so that a repeated
+batch has the same pseudonym.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def _read_key(path: Path) -> bytes:
 
     Raises:
         OSError: the key is damaged. With a wrong key all pseudonyms would differ, and every batch
-            would be accepted again.
+            (message with records) would be accepted again.
     """
     data = path.read_bytes()
     key = data[:KEY_BYTES]

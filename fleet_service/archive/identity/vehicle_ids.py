@@ -10,7 +10,7 @@ A car must not count as two independent sources because a month has ended, or be
 be another car. Restarts and replays know only pseudonyms, so they read the files per month. If a
 line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A service
 therefore checks the lines at start, counts damaged lines and removes them. The vehicle's next batch
-writes its line again.
+(message with records) writes its line again.
 """
 
 from __future__ import annotations

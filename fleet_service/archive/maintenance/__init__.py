@@ -1,3 +1,3 @@
-"""Maintenance of an archive: compaction, retention, roll-up, Iceberg tables, reserved disk
-space.
+"""Maintenance of an archive: compaction (move of new rows into sorted files), retention, roll-up,
+Iceberg tables, reserved disk space.
 """

@@ -191,8 +191,8 @@ def _place_files(
 
 
 def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return runs of consecutive segment numbers, each as (SHARD-EPOCH, first number, last number),
-    found in the names of segment files in order of age.
+    """Return runs of consecutive numbers of segments (files of new rows), each as (SHARD-EPOCH,
+    first number, last number). `names` are the names of the files in order of age.
     """
     out: list[tuple[str, int, int]] = []
     for name in names:

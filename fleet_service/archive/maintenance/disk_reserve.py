@@ -1,5 +1,5 @@
 """Reserved space on the archive's disk. When the disk is full, the space is released, so that
-retention and compaction can run and make room.
+retention and compaction (move of new rows into sorted files) can run and make room.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Removal of data: raw rows after a number of days (their hourly statistics stay), and all rows of
 one vehicle.
 
-Only these two operations remove or rewrite a compacted file.
+Only these two operations remove or rewrite a compacted (sorted) file.
 """
 
 from __future__ import annotations
@@ -158,9 +158,9 @@ class ErasureResult(NamedTuple):
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
     """Remove the rows of one vehicle in one month, and all derived data that could reveal them.
 
-    Derived data are: lines with few vehicles in the month's snapshots, damaged files that were set
-    aside, and checkpoints. Hourly statistics are computed again. Measurements of the vehicle in
-    that month, up to the newest removed row, are not accepted again.
+    Derived data are: lines with few vehicles in the month's snapshots (copies of the map), damaged
+    files that were set aside, and checkpoints (saved states). Hourly statistics are computed again.
+    Measurements of the vehicle in that month, up to the newest removed row, are not accepted again.
 
     Raises:
         InputError: the month's key does not exist, or a service is running on the archive (it has
@@ -345,8 +345,8 @@ def key_of(root: Path, month: str) -> Path:
 
 def _days_of_month(month: str) -> tuple[int, int]:
     """Return two days between which all rows of a month lie: its first day, and the day after its
-    last day. The latter is included, because a batch has the pseudonym of its first record and may
-    end a day later.
+    last day. The latter is included, because a batch (message with records) has the pseudonym of
+    its first record and may end a day later.
     """
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

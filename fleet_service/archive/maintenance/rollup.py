@@ -3,9 +3,9 @@ which they were computed are removed.
 
     rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
 
-There is one file (a part) per compacted file, with the same name. An hour's statistics are the sum
-over all parts. Therefore a missing part can be computed at any time, and a part is computed again
-when its rows are rewritten.
+There is one file (a part) per compacted (sorted) file, with the same name. An hour's statistics are
+the sum over all parts. Therefore a missing part can be computed at any time, and a part is computed
+again when its rows are rewritten.
 
 How parts are merged (columns of `tables.CELL_HOUR`)
     sums, counts     add
@@ -46,8 +46,8 @@ _BITS: Final = 64
 
 
 def part_of(path: Path, below: Path | None = None) -> Path:
-    """Return the path of the hourly statistics (roll-up part) that belong to a compacted file of
-    observations. With `below`, the path is below that folder instead of the archive.
+    """Return the path of the hourly statistics (roll-up part) that belong to a compacted (sorted)
+    file of observations. With `below`, the path is below that folder instead of the archive.
     """
     root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
@@ -71,8 +71,8 @@ def complete_parts(root: Path, until_day: int | None = None) -> int:
 
 
 def make_part(root: Path, path: Path) -> None:
-    """Compute and write the hourly statistics (roll-up part) of one compacted file; existing
-    statistics are replaced.
+    """Compute and write the hourly statistics (roll-up part) of one compacted (sorted) file;
+    existing statistics are replaced.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -83,8 +83,8 @@ def make_part(root: Path, path: Path) -> None:
 
 
 def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
-    """Return the hourly statistics (roll-up part) of one compacted file as a table. If the file is
-    damaged, call `damaged` and return None.
+    """Return the hourly statistics (roll-up part) of one compacted (sorted) file as a table. If the
+    file is damaged, call `damaged` and return None.
 
     Raises:
         OSError: the file cannot be read.
