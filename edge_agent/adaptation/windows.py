@@ -2,10 +2,9 @@
 weight (paper 002, equations 24 and 25).
 
 Legend: e_j innovations (measurement minus prediction) of one measurement in the last N samples; c_j
-= |e_j| their weights, normalised (the
-paper's are not); P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P. The
-factor one half is not in the paper; it makes R correct, because for a normal variable E|e|^3 / E|e|
-= 2 var(e).
+= |e_j| their weights, normalised (the paper's are not); P variance of the predicted measurement; R
+= sum(c_j*e_j^2)/sum(c_j)/2 - P. The factor one half is not in the paper; it makes R correct,
+because for a normal variable E|e|^3 / E|e| = 2 var(e).
 """
 
 from __future__ import annotations

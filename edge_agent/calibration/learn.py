@@ -5,7 +5,7 @@ over the drives, and the standard deviation of that mean.
     radius_fl … rr    speed of each wheel against the mean of the four in calm moments, minus the
                       difference that yaw and slip explain
     ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
-    yaw_rate          intercept of the wheels' yaw rate over the gyroscope's
+    yaw_rate          intercept of the regression of the wheels' yaw rate on the gyroscope's
     steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three
                                             in one regression
     force_gain        torque over radius, divided by mass times acceleration: errors of torque gain

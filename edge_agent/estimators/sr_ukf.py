@@ -6,9 +6,9 @@ cited). Seven degrees of freedom with Dugoff tyres (section 2), unscented points
 measurement update (3.1), posterior factor by downdates (3.2).
 
 State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four rotational degrees of freedom of the
-wheels are torque balances, used as measurements: F_x = (T - J*omega')/R. With these rows the
-friction of each driven wheel is observable. With the paper's a_x, a_y, r alone, at most two of the
-four frictions are observable (errata).
+wheels are torque balances, used as measurements: F_x = (T - J*omega')/R. With these measurements
+the friction of each driven wheel is observable. With the paper's a_x, a_y, r alone, at most two of
+the four frictions are observable (errata).
 
 `literal.wheel_friction_ukf` is the filter as printed, with four states and given motion. The filter
 in this module is for a car, where v_x and v_y are not given: they are states, a_x and a_y are

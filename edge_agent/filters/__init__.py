@@ -1,1 +1,1 @@
-"""Sigma-point rules and square-root covariance operations, which the papers' estimators use."""
+"""Sigma-point rules and square-root covariance operations for the papers' estimators."""

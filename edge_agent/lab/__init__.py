@@ -1,1 +1,3 @@
-"""The laboratory: simulation, evaluation and tuning. The code under evaluation never imports it."""
+"""The laboratory: simulation, evaluation and tuning of the estimators. The code that is evaluated
+never imports it.
+"""

@@ -6,7 +6,7 @@ curve; F_z load; mu friction.
 
     proportional   F = mu*F_z*f(theta)*direction    theta = |(k_x*s_x, k_y*s_y)|
                    stiffness mu*k*F_z, as printed in the papers
-    similarity     the same with theta over mu      stiffness k*F_z
+    similarity     F = mu*F_z*f(theta/mu)*direction, stiffness k*F_z, as on a real tyre
 
 With the printed tyre the force is linear in friction, so the filter may use negative friction
 between two samples.

@@ -73,8 +73,8 @@ def mean(values: FloatArray | None) -> float:
 
 
 def false_per_hour(results: Results) -> float:
-    """Return the number of false changes per hour of the default estimator's friction estimate, in
-    scenarios whose friction is constant.
+    """Return how often per hour the default estimator falsely reports a change of friction (see
+    `measures.false_changes`), in scenarios whose friction is constant.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)

@@ -131,13 +131,15 @@ def lane_change_path(s: float) -> float:
 
 
 def double_lane_change(now: Moment) -> tuple[float, float]:
-    """Change to the other lane and back at constant speed."""
+    """Return the controls (road-wheel angle, acceleration) for a change to the other lane and back
+    at constant speed.
+    """
     ahead = now.x + preview(now)
     return steer_to(now, ahead, lane_change_path(ahead)), hold(now)
 
 
 def slalom(now: Moment) -> tuple[float, float]:
-    """Drive around cones 18 m apart."""
+    """Return the controls (road-wheel angle, acceleration) for a slalom around cones 18 m apart."""
     ahead = now.x + preview(now)
     return steer_to(
         now, ahead, 1.2 * math.sin(math.pi * ahead / 18.0) * smooth_step(ahead / 18.0)
@@ -145,41 +147,47 @@ def slalom(now: Moment) -> tuple[float, float]:
 
 
 def sine(now: Moment) -> tuple[float, float]:
-    """Steer sinusoidally at half a hertz, with the amplitude that gives 4 m/s^2 in a bicycle model
-    without slip.
+    """Return the controls (road-wheel angle, acceleration) for sinusoidal steering at half a hertz,
+    with the amplitude that gives 4 m/s^2 in a bicycle model without slip.
     """
     amplitude = min(WHEELBASE * 4.0 / now.speed**2, 0.15)
     return amplitude * math.sin(math.pi * max(now.t - 1.0, 0.0)), hold(now)
 
 
 def acceleration(now: Moment) -> tuple[float, float]:
-    """Apply full throttle after one second."""
+    """Return the controls (road-wheel angle, acceleration) for full throttle after one second."""
     return 0.0, 8.0 if now.t >= 1.0 else hold(now)
 
 
 def braking(now: Moment) -> tuple[float, float]:
-    """Brake with anti-lock control after one second, down to walking pace."""
+    """Return the controls (road-wheel angle, acceleration) for braking with anti-lock control after
+    one second, down to walking pace.
+    """
     return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
         now, now.speed if now.t < 1.0 else 1.5
     )
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
-    """Brake as in `braking`, on a road with different friction left and right, while the driver
-    steers to keep the car straight.
+    """Return the controls (road-wheel angle, acceleration) for braking as in `braking` on a road
+    with different friction left and right, while the driver steers to keep the car straight.
     """
     return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
 
 
 def gentle_braking(now: Moment) -> tuple[float, float]:
-    """Brake with 2 m/s^2 after one second, down to walking pace."""
+    """Return the controls (road-wheel angle, acceleration) for braking with 2 m/s^2 after one
+    second, down to walking pace.
+    """
     return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
         now, now.speed if now.t < 1.0 else 1.5
     )
 
 
 def constant_radius(now: Moment) -> tuple[float, float]:
-    """Drive a circle of 40 m radius to the left after a straight entry (ISO 4138)."""
+    """Return the controls (road-wheel angle, acceleration) for a circle of 40 m radius to the left
+    after a straight entry (ISO 4138).
+    """
     radius = 40.0
     look = preview(now)
     angle = math.atan2(now.x, radius - now.y) + look / radius
@@ -187,19 +195,23 @@ def constant_radius(now: Moment) -> tuple[float, float]:
 
 
 def straight(now: Moment) -> tuple[float, float]:
-    """Drive straight at constant speed. The tyres then use almost no grip, so the drive gives no
-    information about the road.
+    """Return the controls (road-wheel angle, acceleration) for straight driving at constant speed.
+    The tyres then use almost no grip, so the drive gives no information about the road.
     """
     return steer_to(now, now.x + preview(now), 0.0), hold(now)
 
 
 def j_turn(now: Moment) -> tuple[float, float]:
-    """Turn the steering to a constant angle after one second and hold it (ISO 7401)."""
+    """Return the controls (road-wheel angle, acceleration) for a J-turn: after one second the
+    steering turns to a constant angle and holds it (ISO 7401).
+    """
     return 0.06 * smooth_step((now.t - 1.0) / 0.3), hold(now)
 
 
 def two_lane_changes(now: Moment) -> tuple[float, float]:
-    """Drive a double lane change, and a second one from 110 m on."""
+    """Return the controls (road-wheel angle, acceleration) for two double lane changes; the second
+    begins at 110 m.
+    """
     ahead = now.x + preview(now)
     return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(
         now
@@ -207,49 +219,61 @@ def two_lane_changes(now: Moment) -> tuple[float, float]:
 
 
 def accelerating_sine(now: Moment) -> tuple[float, float]:
-    """Steer sinusoidally, and increase the speed by 5 m/s after six seconds."""
+    """Return the controls (road-wheel angle, acceleration) for sinusoidal steering, during which
+    the speed increases by 5 m/s after six seconds.
+    """
     return sine(now)[0], min(hold(now, now.speed + 5.0 * smooth_step((now.t - 6.0) / 4.0)), 2.0)
 
 
 def gaining_lane_changes(now: Moment) -> tuple[float, float]:
-    """Change lanes while gaining 10 m/s within fifteen seconds."""
+    """Return the controls (road-wheel angle, acceleration) for lane changes during which the car
+    gains 10 m/s within fifteen seconds.
+    """
     return two_lane_changes(now)[0], min(
         hold(now, now.speed + 10.0 * smooth_step(now.t / 15.0)), 2.0
     )
 
 
 def gaining_slalom(now: Moment) -> tuple[float, float]:
-    """Drive the slalom while gaining 7 m/s within fifteen seconds."""
+    """Return the controls (road-wheel angle, acceleration) for the slalom during which the car
+    gains 7 m/s within fifteen seconds.
+    """
     return slalom(now)[0], min(hold(now, now.speed + 7.0 * smooth_step(now.t / 15.0)), 2.0)
 
 
 def low_turn(now: Moment) -> tuple[float, float]:
-    """Turn the steering wheel by 60 degrees within .3 s and hold it. The road wheels turn by one
-    sixteenth of that angle.
+    """Return the controls (road-wheel angle, acceleration) for a turn: the steering wheel turns by
+    60 degrees within .3 s and holds. The road wheels turn by one sixteenth of that angle.
     """
     return math.radians(60.0) / 16.0 * smooth_step(now.t / 0.3), hold(now)
 
 
 def firm_acceleration(now: Moment) -> tuple[float, float]:
-    """Accelerate with 0.6 g after one second; the driver keeps the car straight."""
+    """Return the controls (road-wheel angle, acceleration) for 0.6 g after one second, while the
+    driver keeps the car straight.
+    """
     return steer_to(now, now.x + preview(now), 0.0), 0.6 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
 def brisk_acceleration(now: Moment) -> tuple[float, float]:
-    """Accelerate straight with 0.45 g after one second."""
+    """Return the controls (road-wheel angle, acceleration) for straight acceleration with 0.45 g
+    after one second.
+    """
     return steer_to(now, now.x + preview(now), 0.0), 0.45 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
 def moderate_braking(now: Moment) -> tuple[float, float]:
-    """Brake with 0.28 g after one second, down to walking pace."""
+    """Return the controls (road-wheel angle, acceleration) for braking with 0.28 g after one
+    second, down to walking pace.
+    """
     return steer_to(
         now, now.x + preview(now), 0.0
     ), -0.28 * GRAVITY if now.t >= 1.0 and now.vx > 2.0 else min(hold(now), 1.0)
 
 
 def pulses(now: Moment) -> tuple[float, float]:
-    """Alternate two seconds of acceleration and two seconds of braking while weaving slightly, as
-    in town traffic.
+    """Return the controls (road-wheel angle, acceleration) for two seconds of acceleration and two
+    seconds of braking in turn, while weaving slightly, as in town traffic.
     """
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(
@@ -258,21 +282,23 @@ def pulses(now: Moment) -> tuple[float, float]:
 
 
 def standing(_now: Moment) -> tuple[float, float]:
-    """Stand at rest with the brake applied."""
+    """Return the controls (road-wheel angle, acceleration) for a car at rest with the brake
+    applied.
+    """
     return 0.0, -3.0
 
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
-    """Repeat: drive straight for eight seconds, then stop with 2.5 m/s^2 and stand, six seconds in
-    total, as at traffic lights.
+    """Return the controls (road-wheel angle, acceleration) for stop-and-go traffic: drive straight
+    for eight seconds, then stop with 2.5 m/s^2 and stand for six seconds in total, and repeat.
     """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
 
 
 def throttle(_now: Moment) -> tuple[float, float]:
-    """Accelerate with 3 m/s^2 from the first sample on, with straight wheels: the "throttle opening
-    of 0.3" of paper 003.
+    """Return the controls (road-wheel angle, acceleration) for 3 m/s^2 from the first sample on,
+    with straight wheels: the "throttle opening of 0.3" of paper 003.
     """
     return 0.0, 3.0
 

@@ -1,8 +1,9 @@
 """The tuning of paper 004 as printed: sixteen lower vertices (feet of the fuzzy sets), three noise
 levels, and a choice of objectives.
 
-The drive is the double lane change at 80 km/h on the printed tyre, with P_0 = .2*I, Q = .1*T^2.
-Noise variance and R are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
+The drive is the double lane change at 80 km/h on the printed tyre, with initial covariance P_0 =
+.2*I and process noise Q = .1*T^2 for the sampling interval T. Noise variance and R are .1, .05 and
+.01 in turn (section IV.A). Objectives, larger is better:
 
     mismatch     1/(1 + |e|), e the mean difference between actual and theoretical innovation
                  variance (33)

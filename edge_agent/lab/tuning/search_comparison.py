@@ -1,9 +1,9 @@
 """Comparison of search methods that may each evaluate the objective equally often, on the filter of
 paper 004.
 
-    random       uniform over the graph's positions             (`random_search`)
-    uniform      uniform over the whole range
-    colony       ants over the graph's positions                (`colony`)
+    random       uniform over the graph's possible values       (`random_search`)
+    uniform      uniform over the whole range of each variable
+    colony       ants over the graph's possible values          (`colony`)
     aco_r        ants over continuous variables                 (`continuous_colony`)
     evolution    (1+1) evolution strategy                       (`evolution_strategy`)
 

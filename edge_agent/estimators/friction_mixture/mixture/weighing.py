@@ -54,8 +54,8 @@ LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 @compiled
 def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Recompute the weights of all nodes (friction hypotheses) from the likelihoods of the block
-    (0.05 s), and adapt the measurement noise R.
+    """Recompute the weights (probabilities) of all nodes (friction hypotheses) from the likelihoods
+    of the block (0.05 s), and adapt the measurement noise R.
     """
     temper_evidence(memory, design, scratch)
     count = active_nodes(memory)

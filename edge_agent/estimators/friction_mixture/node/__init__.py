@@ -1,1 +1,3 @@
-"""Filter of one node (friction hypothesis): prediction, residuals and update."""
+"""Filter of one node (friction hypothesis): prediction, residuals of the measurements, and
+update.
+"""

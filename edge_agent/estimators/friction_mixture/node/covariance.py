@@ -4,7 +4,7 @@ read and written; LANES is the number of nodes in a group.
 
 Legend
     m, P     means (n,) and covariances (n, n) of the states
-    h        covariance of the states with a measurement row, P*H' (n,)
+    h        covariance of the states with one measurement, P*H'                   (n,)
     a, nu    variance of the innovation (measurement minus prediction), and innovation
     z        share of a node's state that is replaced by that of the whole mixture [1]
 

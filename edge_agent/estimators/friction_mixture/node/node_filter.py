@@ -5,9 +5,9 @@ Legend
     m, P        mean (n,) and covariance (n, n)
     B           measurement deviations of the cubature points, in the axes of the first CURVED
                 columns of the factor of P                             (CURVED, 6)
-    D           derivative of the rows by a state that they depend on linearly
-    h           covariance of the states with a row (n,)
-    S           covariance of the rows without noise (6, 6)
+    D           derivatives of the measurements by the states that they depend on linearly
+    h           covariance of the states with one measurement           (n,)
+    S           covariance of the measurements without noise            (6, 6)
 
 The six measurements (four wheels, two axles) are nonlinear only in velocity and stiffness.
 Therefore the third-degree cubature rule is applied in these four dimensions. The measurements are

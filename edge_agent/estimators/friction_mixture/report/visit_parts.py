@@ -10,7 +10,7 @@ replaces the kept belief nor counts as a jump.
 
 Legend
     w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)
-    p          prior of the nodes (K,)
+    p          prior probabilities of the nodes                                    (K,)
     D          information, Σ w·ln(w/p) [nat]
 """
 

@@ -45,8 +45,8 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
 
 @dataclass(frozen=True)
 class FrictionCase:
-    """One experiment of paper 003: the printed errors of its filters SR-UKF and UKF, and the
-    printed time until convergence [s].
+    """One experiment of paper 003: the errors that the paper prints for its filters SR-UKF and UKF,
+    and the time until convergence that it prints [s].
     """
 
     name: str
