@@ -241,8 +241,8 @@ class ListeningTown:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line: drive every seed with and without listening cars, and write the
-    figures.
+    """Run the command line: simulate the drive of each seed with and without cars that receive the
+    map, and write the figures.
     """
     parser = argparse.ArgumentParser(
         prog="deploy.listening", description=(__doc__ or "").splitlines()[0]

@@ -84,8 +84,8 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return a number that grows along the route, for a cell and heading sector. It only serves
-        to compare positions; it is not a distance.
+        """Return the rank of a place (cell with heading sector): a number that grows along the
+        route. It only serves to compare positions; it is not a distance.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 

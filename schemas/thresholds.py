@@ -1,7 +1,7 @@
 """Numbers that several packages must agree on; each is defined only here.
 
-EXCITED_SHARE       share of μ that must be used for a reading of μ to be more than a lower bound
-                    (contract)
+EXCITED_SHARE       share of the available grip μ that a vehicle must use for its value of μ to
+                    count as measured, and not only as a lower bound (contract)
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
 SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka
                     2012, ch. 1)

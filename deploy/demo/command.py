@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo.
 
     Raises:
-        InputError: a package of the extras is missing, or a part did not start.
+        InputError: an optional package is missing, or a process of the demo did not start.
     """
     try:
         from deploy.demo import processes, story

@@ -242,8 +242,9 @@ def demo_figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Passes over new ice after the first alert of its patch, one per row: whether the driver was
-    warned, and whether a wheel lost its grip.
+    """Table of passes over new ice, one per row, with two values: True if the driver was warned,
+    and True if a wheel lost its grip. Only passes after the first alert for that patch of ice
+    count.
 
     `cell` is the cell in which grip was lost, or the first cell of the pass.
     """
@@ -283,8 +284,8 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return the passes of cars over new ice after the first alert of its patch. `share` is the
-    share of drivers that receive warnings.
+    """Return the passes of cars over new ice after the first alert for that patch of ice. `share`
+    is the share of drivers that receive warnings.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)

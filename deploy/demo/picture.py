@@ -1,5 +1,5 @@
-"""Image (PNG) of the demo's map next to the true road. Each heading sector of a cell is a quarter
-of the cell's square.
+"""Image (PNG) of the demo's map next to the true road. The square of each cell is divided into four
+parts, one per heading sector (quarter of the compass in which a vehicle drives).
 """
 
 from __future__ import annotations

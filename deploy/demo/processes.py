@@ -24,7 +24,9 @@ SHOWN = {
 
 
 class DemoError(RuntimeError):
-    """Error: a part of the demo did not start, or ended early; the message names its log file."""
+    """Error: a process of the demo did not start, or ended early. The message names its log
+    file.
+    """
 
 
 class ManagedProcess:

@@ -78,8 +78,8 @@ class MapPrior:
             own: (N, 32) log(posterior/uniform) of each filter.
             visit: (N, 32) log-likelihood of the measurements in the current visit (passage of one
                 place) so far.
-            map_beliefs: the map's belief for the vehicles in `entered_vehicles`; None where the map
-                knows nothing.
+            map_beliefs: by index of the vehicle, for those in `entered_vehicles`: the map's belief
+                about the vehicle's new place; None where the map knows nothing.
         """
         now = _normalise_rows(np.exp(own))
         out = now.copy()

@@ -2,7 +2,7 @@
 that contains one).
 
 XML is parsed as a stream of events. A document with a document type declaration is rejected before
-any of its entities is expanded.
+any of its entities is expanded, because a hostile file could expand them without limit.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class KuksaProvider:
 
     Attributes:
         written: number of values that the broker accepted.
-        refused: number of values that it rejected.
+        refused: number of values that the broker rejected.
 
     Args:
         text: HOST:PORT, with `?ca=FILE` for TLS and `&token=FILE` for a JSON web token.

@@ -30,8 +30,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the grip in use according to the accelerometers (T,) [1], smoothed over SMOOTHED_S; 0
     where a reading is missing.
 
-    The estimate `mu_utilised` is not used here: it is the maximum of the last second, so on a road
-    that has just become slippery it exceeds the available grip.
+    The estimate `mu_utilised` is not suitable here. It is the maximum of the last second, so that
+    just after the road has become slippery it may still exceed the available grip.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S

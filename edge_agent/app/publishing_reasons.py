@@ -23,7 +23,7 @@ _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class PublisherState(Protocol):
-    """Interface of a publisher with the values that show if its records arrive at the service."""
+    """Interface of a publisher: the values that show whether its records arrive at the service."""
 
     @property
     def links(self) -> int:
@@ -82,8 +82,9 @@ class SignalWatch:
         self._seen.update({name: now for name, here in present.items() if here})
 
     def is_missing(self, name: str) -> bool:
-        """Return True if the source has not delivered the signal called `name` ("position",
-        "wheels" or "turning") for longer than MISSING_S.
+        """Return True if the source has not delivered the signal `name` for longer than MISSING_S.
+        The name is "position", "wheels" (any wheel speed) or "turning" (a wheel speed above
+        standstill).
         """
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 

@@ -1,4 +1,6 @@
-"""Parts that several commands share: check of vehicle names, and check by the signal doctor."""
+"""Functions that several commands share: check of vehicle names, and check of signals by the signal
+doctor (search for faulty sensors).
+"""
 
 from __future__ import annotations
 

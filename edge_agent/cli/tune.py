@@ -2,8 +2,8 @@
 random search with equal budget; write the best result.
 
 With --study: tune the published filter on which the default estimator is based (paper 004: Xiong et
-al., 2019; see deploy/docs/reference/bibliography.md). Run several searches each with a correct and
-with a wrong measurement noise R; write figures, a table and a plot.
+al., 2019; see deploy/docs/reference/bibliography.md). Run several searches with a correct
+measurement noise R, and several with a wrong one; write figures, a table and a plot.
 """
 
 from __future__ import annotations

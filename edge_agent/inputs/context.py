@@ -93,8 +93,8 @@ def context_block(
     """Return the context signals (controller flags, temperature, wiper) of a block, (T, N,
     len(CONTEXT)), from the values that a source gives.
 
-    Signals without a value are NaN (unknown). For sources without a profile, for example a
-    simulation:
+    Signals without a value are NaN (unknown). The function is for sources without a profile
+    (assignment of recorded signals to channels), for example a simulation:
 
         values = {"abs_active": truth.abs, "air_temperature": -3.0}
         Block(t, time, signals, context_block(*t.shape, values))

@@ -73,13 +73,13 @@ def merge_recordings(
     steering_ratio: float | None = None,
     shifts: Mapping[str, float] | None = None,
 ) -> Merged:
-    """Merge all recordings into one signal log by a profile.
+    """Merge all recordings into one signal log by a profile (assignment of signals to channels).
 
     Args:
         recordings: recordings of the sources.
-        profile: maps signals to channels.
-        wheel_radius: radius of the vehicle file [m]; takes precedence over the profile's.
-        steering_ratio: ratio of the vehicle file; takes precedence over the profile's.
+        profile: profile to apply.
+        wheel_radius: radius of the vehicle file [m]; takes precedence over that of the profile.
+        steering_ratio: ratio of the vehicle file; takes precedence over that of the profile.
         shifts: source name -> seconds to add to its clock.
 
     Raises:
@@ -304,9 +304,9 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
     """Return smoothed times (n,) [s] of a periodic signal whose time stamps come in bursts, and the
     standard deviation of the stamps' error [s].
 
-    The time stamps vary around a straight line over the number of readings. A running mean over
-    SMOOTH readings to either side follows slow variations. Times that are not periodic (off by more
-    than a period), or that are already even, are returned unchanged.
+    Plotted over the number of the reading, the time stamps scatter around a straight line. A
+    running mean over SMOOTH readings to either side follows slow variations. Times that are not
+    periodic (off by more than a period), or that are already even, are returned unchanged.
     """
     if len(t) < FEWEST:
         return t, 0.0

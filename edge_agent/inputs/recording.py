@@ -1,5 +1,5 @@
-"""Result of a reader: named series with a common clock, and helpers for readers of
-foreign files.
+"""Result of a reader: series (recorded signals) by name with a common clock. The module also has
+helpers for readers of foreign files.
 """
 
 from __future__ import annotations

@@ -137,8 +137,8 @@ class BlockReadings(NamedTuple):
     """Signals of a block of samples, as far as they are known.
 
     Without `signals` (T, N, channels), observations do not contain the direction in which grip was
-    used. Without `context` (T, N, len(CONTEXT)), they contain no data of controllers and
-    surroundings.
+    used. Without `context` (T, N, len(CONTEXT)), they contain no controller flags, air temperature
+    and wiper.
     """
 
     signals: FloatArray | None = None
@@ -178,8 +178,8 @@ class SampleNotes(NamedTuple):
 
     `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
     -1. `told` (k, 32): evidence (log-likelihood of friction) from the part of the visit before that
-    change. `context` (T, N, len(CONTEXT)): controllers and surroundings; empty if unknown.
-    `position_std`: standard deviation of the position [m].
+    change. `context` (T, N, len(CONTEXT)): flags of controllers, air temperature and wiper; empty
+    if unknown. `position_std`: standard deviation of the position [m].
     """
 
     row: IntArray  # -1: nowhere
@@ -304,7 +304,9 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 @compiled
 def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
-    """Add one sample at `time` [ns UTC] to a visit (passage of a map cell)."""
+    """Add one sample at `time` [ns UTC] to a visit (passage of a map cell). `position_std` is the
+    standard deviation of the vehicle's position [m].
+    """
     _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
@@ -358,11 +360,12 @@ def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Column
 
 
 def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
-    """Return the grip used in longitudinal and lateral direction of the vehicle, (n,): the total,
-    divided in proportion to squared accelerations. NaN without acceleration.
+    """Return the grip used in longitudinal and in lateral direction of the vehicle, (n,). The
+    squared total is divided in proportion to the summed squared accelerations of the two
+    directions. The result is NaN without acceleration readings.
 
-    The sign is that of the stronger direction: a visit (passage of a map cell) with braking and
-    driving counts as one of them.
+    A visit (passage of a map cell) may contain both braking and driving, or left and right turns.
+    The sign is that of the stronger one.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -449,7 +452,8 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
     (n, 32); (n, 0) for an estimator without evidence (likelihood of friction).
 
     The likelihood is flat for a visit that the estimator did not process from its start. If
-    friction changed within the cell, either value may be right, so the larger likelihood counts.
+    friction changed within the cell, the friction before or after the change may apply, so that the
+    larger of both likelihoods counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)

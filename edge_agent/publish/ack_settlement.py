@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 @dataclass
 class Counts:
     """Numbers of records by kind and by result (published, acknowledged, rejected, dropped), and
-    numbers of late and of resent batches.
+    numbers of late batches (too late for the map to use in order of time) and of resent batches.
     """
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))

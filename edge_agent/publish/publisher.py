@@ -44,8 +44,8 @@ class Publisher:
     """Publisher of the records of the named vehicles; column `vehicle` of the records is an index
     into `names`.
 
-    `on_open(name, session)` is called when the session of a vehicle is open. Other parts use it to
-    publish and subscribe on the same session.
+    `on_open(name, session)` is called when the session of a vehicle is open. With it, other
+    components of the agent publish and subscribe on the same session.
     """
 
     def __init__(

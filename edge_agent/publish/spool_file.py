@@ -50,7 +50,8 @@ Row = tuple[object, ...]
 
 
 class SpoolFile:
-    """Table of batches in an outbox's file. The keys are the row numbers.
+    """Table of batches in the file of an outbox (store of unsettled batches). The key of a batch is
+    its row number.
 
     Attributes:
         was_damaged: True if the file was found damaged when it was opened.

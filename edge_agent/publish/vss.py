@@ -67,7 +67,7 @@ class RoadFrictionOutput:
         names: row k of the reported values is vehicle k.
         say: function that prints a line.
         rate_hz: reports per second.
-        provider: receives the same signals, if given.
+        provider: additional receiver of the same signals, if given.
     """
 
     def __init__(

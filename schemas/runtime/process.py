@@ -43,11 +43,11 @@ def limit_memory(*without: str) -> None:
     Args:
         without: modules that the libraries can do without; importing them is blocked.
 
-    Four causes are removed. Arrow imports pandas, if installed, to recognise data frames: half a
-    second and 30 MB. The linear algebra library of numpy starts one thread per core, and these
-    threads busy-wait; with our small matrices this doubles the processor time. The memory allocator
-    keeps large freed arrays with small objects between them: about 0.1 GB. Arrow's own allocator
-    keeps memory for each thread that ever used it.
+    Four causes of such use are removed. Arrow imports pandas, if installed, to recognise data
+    frames: half a second and 30 MB. The linear algebra library of numpy starts one thread per core,
+    and these threads busy-wait; with our small matrices this doubles the processor time. The memory
+    allocator keeps large freed arrays with small objects between them: about 0.1 GB. Arrow's own
+    allocator keeps memory for each thread that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")

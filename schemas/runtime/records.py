@@ -45,7 +45,9 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class EmptyRecord:
-    """Record for compiled functions that need no data of this kind; its only field is not used."""
+    """Record to pass to a compiled function whose record argument is not needed; its only field is
+    not used.
+    """
 
     unused: bool
 
@@ -131,7 +133,7 @@ def _round_up(value: int, step: int) -> int:
 
 def records(kind: type, *shape: int) -> RecordArray:
     """Return an array of records of the class `kind`, all zero; it begins at a cache line if the
-    records contain lanes.
+    records contain vectors ("lanes").
     """
     form = record_type(kind)
     if _alignment(kind) < LINE:

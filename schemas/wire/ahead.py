@@ -74,8 +74,8 @@ class Runs(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """The road ahead of one vehicle: the current warnings, and the horizon along its most probable
-    route.
+    """The road ahead of one vehicle: the current warnings, and the horizon (the map's values) along
+    the most probable route.
 
     `here` is the friction at the vehicle, from its own measurements and the map: median, 5 % and 95
     % quantile; NaN if unknown.

@@ -29,7 +29,7 @@ CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
     """Return 1 if the front channels meet bumps first, -1 if the rear channels do, 0 if the drive
-    does not show it.
+    does not show which.
 
     t are times (T,) [s], signals (T, 18).
     """

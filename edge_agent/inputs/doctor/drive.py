@@ -2,10 +2,11 @@
 the wheels alone.
 
 Legend
-    v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle
-         file
+    v    speed of the car from its wheels [m/s]: wheel radius of the vehicle file times the median
+         of the four wheel speeds [rad/s]
     r    yaw rate [rad/s]
-    r_w  yaw rate from the wheels [rad/s]: (right − left) / track, mean of both axles
+    r_w  yaw rate from the wheels [rad/s]: (right − left) / track width, of the rear axle, or of the
+         front axle where the rear has no value
     v_g  speed over ground from position fixes [m/s]
     course  direction of travel from position fixes, counter-clockwise from east [rad]
 """

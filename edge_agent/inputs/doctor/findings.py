@@ -267,9 +267,10 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if an identity (two quantities that are equal by physics) has the gain (ratio of
-    the quantities) that the fault predicts in all parts of the drive. A slide, during which the
-    gain is not constant, is thus not taken for a fault.
+    """Return True if a fault of `quantity` explains the signals in all parts of the drive. In each
+    part, the gain of an identity (ratio of two quantities that are equal by physics) must have the
+    value that the fault predicts. In a slide the gain is not constant, so that a slide is not taken
+    for a fault.
     """
     fault = verdict.faults[quantity]
     if (

@@ -8,9 +8,11 @@
     m (v̇_y + v r) = F_f + F_r,           I ṙ = a F_f − b F_r,
     F_f = C_f (δ − (v_y + a r)/v),       F_r = −C_r (v_y − b r)/v
 
-The lag is the shift with the largest correlation of both sides; a parabola through three samples
-refines the peak. A lateral force builds up a little later than its slip, so wheels and steering
-move slightly before the body turns. LEAD corrects for this.
+The model has mass m, yaw inertia I, cornering stiffnesses C_f and C_r of the axles, and distances a
+and b of the axles from the centre of gravity. δ is the steering angle, v the speed, v_y the lateral
+velocity and r the yaw rate. The lag is the shift with the largest correlation of both yaw rates; a
+parabola through three samples refines the peak. A lateral force builds up a little later than its
+slip, so wheels and steering move slightly before the body turns. LEAD corrects for this.
 """
 
 from __future__ import annotations
@@ -46,9 +48,9 @@ def find_lags(
 ) -> dict[str, float]:
     """Return the lags [s] of a drive by quantity, from times t (T,) [s] and signals (T, 18).
 
-    A lag whose correlation is below `least` is left out. Signals are smoothed less than in the
-    doctor's other checks: after smoothing over half a second, the peak of the correlation would be
-    too flat for a resolution of milliseconds.
+    A lag whose correlation is below `least` is left out. Signals are smoothed less than in other
+    checks of the signals, because after smoothing over half a second the peak of the correlation
+    would be too flat for a resolution of milliseconds.
     """
     at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
 

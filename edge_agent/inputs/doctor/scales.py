@@ -13,8 +13,9 @@ multiplies the recorded value by a factor, for example 57.3 for deg instead of r
 where the power is 1 for a quantity on the left side and -1 on the right side. Each fault costs
 FAULT_COST, twice its negative log probability, because faulty columns are rare (Occam's razor). An
 explanation is a set of faults; its cost is the sum of its faults' costs and of the squared
-normalised errors. Every set of at most two faulty quantities is tried. A quantity is settled if
-each explanation that gives it another fault costs at least SETTLED more than the best explanation.
+normalised errors. Every set of at most two faulty quantities is tried. A quantity is settled (its
+fault is certain) if each explanation that gives it another fault costs at least SETTLED more than
+the best explanation.
 
 Clocks are treated in the same way: the lag of an identity is the difference between the lags of two
 devices.
@@ -194,7 +195,7 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
 
 def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
     """Return True if two faults have the same effect on the signal. For example, a wheel speed in
-    km/h instead of rad/s looks like a wheel radius of .28 m; no drive can distinguish the two.
+    km/h instead of rad/s looks like a wheel radius of 0.28 m; no drive can distinguish the two.
     """
     if one is None or other is None:
         return one is other

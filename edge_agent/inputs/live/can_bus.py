@@ -1,5 +1,5 @@
-"""Live source for a CAN bus, by python-can; the interface filters for the identifiers of the needed
-messages.
+"""Live source for a CAN bus, by python-can. A filter of the CAN interface passes only frames with
+the identifiers of needed messages.
 """
 
 from __future__ import annotations

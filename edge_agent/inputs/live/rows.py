@@ -49,8 +49,8 @@ class LiveRows:
 
     Args:
         feeds: the live sources; the method `blocks` starts them.
-        profile: maps signals to channels.
-        vehicle: its wheel radius and steering ratio take precedence over the profile's.
+        profile: assignment of signals to channels.
+        vehicle: its wheel radius and steering ratio take precedence over those of the profile.
         clock: clock of the host; the feeds must have the same one.
         wait: function that sleeps for a number of seconds.
 

@@ -51,7 +51,7 @@ def open_sources(
     Args:
         sources: sources in the notation of the command line.
         profile_name: file or name of a shipped profile; for a databroker alone it is optional.
-        dbc: CAN database; by default the profile's.
+        dbc: CAN database; by default the one that the profile names.
 
     Raises:
         InputError: a source, its profile or its library is missing or invalid.

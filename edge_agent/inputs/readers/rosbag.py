@@ -2,8 +2,8 @@
 without a ROS installation.
 
 A signal is called `/topic.field.field`; elements of short arrays are `/topic.field[0]`, and joints
-`/topic.velocity[NAME]`. Its time is the message's own time stamp if there is one, else that of the
-recorder. Topics with the type can_msgs/Frame are read as a CAN log.
+`/topic.velocity[NAME]`. The time of a reading is the time stamp in the message if there is one,
+else the recorder's. Topics with the type can_msgs/Frame are read as a CAN log.
 """
 
 from __future__ import annotations

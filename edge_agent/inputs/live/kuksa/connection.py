@@ -26,7 +26,7 @@ class BrokerConnection:
         metadata: metadata sent with each call.
 
     Args:
-        option: command-line option or source that names the broker, for errors.
+        option: command-line option or source that names the broker, for error messages.
         address: host and port.
         files: `ca`, file of the certificate authority (without it the connection does not use TLS),
             and `token`, file with a JSON web token.
