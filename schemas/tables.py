@@ -19,8 +19,8 @@ class Field(NamedTuple):
     Attributes:
         name, type, unit, meaning: description of the column.
         step: the service rounds stored values to multiples of this step; None: no rounding. The
-            step is a power of two far below the value's uncertainty. Finer digits are noise and would
-            take a quarter more bytes.
+            step is a power of two far below the value's uncertainty. Finer digits are noise and
+            would take a quarter more bytes.
         range: smallest and largest value that a report may contain; NaN means 'absent'. None for
             columns that are not reported.
     """
