@@ -1,5 +1,5 @@
-"""Tests of both command lines, `edge-agent` and `fleet-service`: versions, examples, completion,
-Ctrl-C, negative numbers, and exit codes.
+"""Tests of both command lines, `edge-agent` and `fleet-service`: help, completion, Ctrl-C and exit
+codes work as documented, and no command replaces a file that it must not touch.
 """
 
 from __future__ import annotations

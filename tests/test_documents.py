@@ -1,4 +1,6 @@
-"""Tests that pages agree with the code: commands, options, folders, links and sizes."""
+"""Tests that the documentation agrees with the code: every option is documented, every command on a
+page is valid, links lead to their targets, and pages keep their size limits.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the whole system in one process: recorded drives, agent, router, service, and a client
-that uses only Zenoh.
+"""Tests of the whole system in one process (recorded drives, agent, router and service): slippery
+drives must become a slippery map for a client that uses only Zenoh.
 """
 
 from __future__ import annotations

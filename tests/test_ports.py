@@ -1,4 +1,6 @@
-"""Tests of the free ports for servers that are started later."""
+"""Tests of `free_ports`: the returned ports are unused, and lie below the range of outgoing
+connections.
+"""
 
 import socket
 from pathlib import Path

@@ -1,5 +1,6 @@
-"""Tests of the structure of the packages, read from the source: imports, sizes, entry points,
-docstrings.
+"""Tests of the structure of the packages, read from the source: imports follow the allowed
+directions, the core does no I/O, sizes stay below their limits, and everything public has a
+docstring.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that clients in other languages publish, receive acknowledgements and warnings, and receive
-a tile.
+"""Tests that clients in other languages can publish reports, receive acknowledgements and warnings,
+and read a map tile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of the command line: written files, published messages, and one line of text per error."""
+"""Tests of the agent's command line: written files, sent messages, one-line errors."""
 
 from __future__ import annotations
 
@@ -514,8 +514,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Estimates must be finite although the log lacks the wheel torques, the rear steering angles
-    and every second speed of one wheel.
+    """Estimates must be finite for a log without torques, rear steering and half of a wheel's
+    speeds.
     """
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]

@@ -1,5 +1,5 @@
-"""Tests of alerts per road section, with length, direction, id and life cycle, and of their
-delivery by webhook.
+"""Tests of alerts per road section: neighbouring cells form one alert, which keeps its id while it
+grows and ends, and webhooks deliver each alert in order or report its loss.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the commands of `fleet-service`, run as processes."""
+"""Tests of the commands of `fleet-service`, run as processes: output and exit codes are right, and
+each mistake gives one line that names it.
+"""
 
 from __future__ import annotations
 

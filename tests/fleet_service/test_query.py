@@ -1,4 +1,6 @@
-"""Tests of queries of an empty map and of a map without a service, and of answers as files."""
+"""Tests that a query distinguishes an empty map from a missing service, and that answers are
+written in the format that the file's name selects.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the contract (common definitions in `schemas`): keys, the friction grid, configuration,
-vehicle file and queries.
+"""Tests of the contract (common definitions in `schemas`): keys, friction grid, configuration,
+vehicle file and queries are read as defined, and an error names the wrong field.
 """
 
 from __future__ import annotations

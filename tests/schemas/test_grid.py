@@ -1,4 +1,6 @@
-"""Tests of cells, tiles and sectors: first the theorems of the grid, then its borders."""
+"""Tests of cells, tiles and sectors: the grid satisfies its theorems, and its borders are handled
+correctly.
+"""
 
 from __future__ import annotations
 

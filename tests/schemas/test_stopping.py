@@ -1,4 +1,6 @@
-"""Tests of the largest speed from which a vehicle can stop within the known distance."""
+"""Test that a vehicle which drives at the computed stopping speed can stop within the known
+distance.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tests of the understeer that follows from the axles of a vehicle file."""
+"""Tests of the understeer that follows from the axles of a vehicle file: it is unknown without axle
+stiffness, and a calibrated value replaces it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tests of the vehicle files of common classes."""
+"""Tests of the vehicle files of common classes: each class is a plausible car, and an unknown class
+is refused.
+"""
 
 from __future__ import annotations
 

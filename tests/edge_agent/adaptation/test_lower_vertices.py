@@ -1,4 +1,6 @@
-"""Tests of fuzzy sets whose lower vertices (corners of the set) are free parameters."""
+"""Tests of fuzzy sets whose lower vertices (corners of the set) are free parameters: a vertex
+changes the output only between its neighbours, and sets that leave a gap are refused.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Tests of the rule table of paper 001, and of the noise estimate of paper 002, which weights the
-last innovations (measurement minus prediction) by their size.
+"""Tests of two adaptation rules. The rule table of paper 001 must give its entries at the peaks of
+the sets. The noise estimate of paper 002 must find the variance of white noise; it weights the last
+innovations (measurement minus prediction) by their size.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the evaluation of warnings ahead (`tests.benchmarks.ahead`) in short runs."""
+"""Tests of the evaluation of warnings ahead (`tests.benchmarks.ahead`) in short runs: warned cars,
+bytes and delays are counted correctly.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of `edge-agent run --ahead` as a process: warnings as JSON lines, use of the route, and
-counts at the end.
+"""Tests of `edge-agent run --ahead` as a process: it prints its warnings as JSON lines, uses the
+route file, and refuses options that need `--ahead` without it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the horizon (friction of the road ahead of a car): conversion of metres to cells,
-unknown cells that stay unknown, ageing of the map's values, the cache, and the safe speed.
+"""Tests of the horizon (friction of the road ahead of a car): metres along the road become cells,
+unknown cells stay unknown, old values age, and the safe speed follows from them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the speed limit for a planner: safe entry onto ice, hysteresis, and bytes that a ROS
-decoder reads.
+"""Tests of the speed limit for a planner: a car can stop within sight on ice, the limit falls at
+once and rises after a while, and a ROS decoder reads the message.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the map as a prior: used at entry to a cell, dropped if it is wrong, and never part of a
-published report.
+"""Tests of the map as a prior of the friction estimate: it is used at entry to a cell, dropped if
+it is wrong, and never part of a published report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests with route files of common programs, and with files that are not routes."""
+"""Tests of route files: GPX and GeoJSON of common programs give the same route, and other files are
+refused with the reason.
+"""
 
 from __future__ import annotations
 

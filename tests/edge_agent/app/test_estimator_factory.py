@@ -1,5 +1,6 @@
-"""Tests of the function that creates an estimator bank (filters of N vehicles) by name, and of the
-memberships (parameters of fuzzy sets) that it uses.
+"""Tests of the function that creates an estimator bank (filters of N vehicles) by name: the tuned
+estimator uses the memberships (parameters of fuzzy sets) of its file, and an unknown name is
+refused.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the provider for a Kuksa databroker with a gRPC server: values, clearing of unknown
-values, refusals, an absent broker.
+"""Tests of the provider that writes friction to a Kuksa databroker, with a real gRPC server: all
+values arrive, unknown values are cleared, and a broker that starts late gets the latest values.
 """
 
 from __future__ import annotations

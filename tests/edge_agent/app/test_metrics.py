@@ -1,5 +1,5 @@
-"""Tests of an agent's metrics: number of reports sent, settled (finally answered) and waiting, and
-the delay behind real time.
+"""Tests of an agent's metrics and health: they show how many reports were sent, settled (finally
+answered) and wait, and report problems such as a lost router or delay behind real time.
 """
 
 from __future__ import annotations

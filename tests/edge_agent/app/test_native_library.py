@@ -1,5 +1,5 @@
-"""Tests of the agent's shared library of kernels (compiled functions), and tests of which modules
-an agent loads.
+"""Tests of the agent's shared library of kernels (compiled functions): it gives the results of
+Numba, and Numba takes its place if the library cannot be built or loaded.
 """
 
 from __future__ import annotations

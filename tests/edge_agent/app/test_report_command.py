@@ -1,5 +1,5 @@
-"""Test of the option of `edge-agent replay` that adds further estimators to a report for
-comparison.
+"""Tests of the option of `edge-agent replay` that adds further estimators to a report for
+comparison: they appear in the report, and the option is refused without a report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the validation of a calibration on drives that were not used for learning."""
+"""Tests of the validation of a calibration on drives that were not used for learning: a group of
+corrections that makes these drives worse is left out.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Tests of the dynamics of a car body on four tyres, of the brush tyre curve and of the electric
-drive wheel.
+drive wheel, by limits and balances that must hold exactly.
 """
 
 from __future__ import annotations

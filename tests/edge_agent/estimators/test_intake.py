@@ -1,5 +1,5 @@
-"""Tests of the preparation of samples for the papers' filters, which adds the grip used in the last
-second and the cosines of the steering angles.
+"""Tests of two inputs of the papers' filters that are prepared from samples: the largest grip used
+in the last second, and the cosines of the steering angles now and before.
 """
 
 from __future__ import annotations

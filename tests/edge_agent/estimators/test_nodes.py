@@ -1,5 +1,5 @@
-"""Tests of mathematical identities of the friction mixture (grid of friction hypotheses): prior,
-road change, quantiles, likelihoods.
+"""Tests of mathematical identities of the friction mixture (grid of friction hypotheses): uniform
+prior, conserved probability at a road change, and likelihoods that equal the evidence put in.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of novelty: the degree to which the force or the lateral slip in a block (some samples)
-differs from its usual value.
+"""Tests of novelty: the degree (0 to 1) to which the force or the lateral slip in a block (some
+samples) differs from its usual value.
 """
 
 from __future__ import annotations

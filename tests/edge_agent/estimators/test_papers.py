@@ -1,5 +1,5 @@
-"""Tests of the papers' estimators: interface, causality, no NaN, and the behaviour of each on a
-short drive.
+"""Tests of the papers' estimators on short drives: they find the motion, use no future samples,
+give no NaN, and each of their settings has an effect.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the reported interval of friction: its quantile levels, and the effect of ice patches on
-it.
+"""Tests of the reported interval of friction: its ends are the intended quantiles of the belief,
+and a possible ice patch lowers only the lower end.
 """
 
 from __future__ import annotations

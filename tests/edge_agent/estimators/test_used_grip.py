@@ -1,5 +1,6 @@
-"""Tests of the reported grip in use (share of the friction that the tyres use), also if torque is
-known on one axle only.
+"""Tests of the reported grip in use (share of the friction that the tyres use): it follows the
+acceleration and never exceeds the limit of a tyre. Torque known on one axle must not harm the speed
+estimate.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of federated filters by identities and linear filters: information sharing, fusion,
-covariance downdates, and sigma points from singular values.
+"""Tests of federated filters (sub-filters whose results are fused) by mathematical identities, and
+by comparison with the Kalman filter on linear systems.
 """
 
 from __future__ import annotations

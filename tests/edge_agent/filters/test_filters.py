@@ -1,4 +1,4 @@
-"""Tests of the sigma-point rules by theorems, and of the square-root filter by comparison with
+"""Tests that the sigma-point rules satisfy their theorems, and that the square-root filter equals
 textbook filters.
 """
 

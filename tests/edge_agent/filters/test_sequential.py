@@ -1,5 +1,5 @@
-"""Tests that compare the update of a Cholesky factor by a scalar with textbook and orthogonal
-algorithms.
+"""Tests that the update of a Cholesky factor by one scalar measurement after the other equals
+textbook and orthogonal algorithms.
 """
 
 from __future__ import annotations

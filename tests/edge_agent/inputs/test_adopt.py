@@ -1,5 +1,6 @@
-"""Tests of corrections that a replay of a log applies because the signal doctor (a check of
-recorded signals) measured the errors: delayed sensors, a locked rear axle, wheel radii per axle.
+"""Tests of corrections in the replay of a log. The signal doctor (a check of recorded signals)
+measures delayed sensors, a locked rear axle or wrong wheel radii, the replay corrects them, and an
+exact drive stays unchanged.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the detection of exchanged front and rear wheels from bumps of the road."""
+"""Test that bumps of the road reveal exchanged front and rear wheel signals, and that a smooth road
+does not.
+"""
 
 from __future__ import annotations
 

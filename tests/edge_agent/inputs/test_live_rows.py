@@ -1,5 +1,5 @@
-"""Tests of live rows (samples made from live signals): one clock for all sources, interpolated
-readings, late positions assigned to their time, and lost sources opened again.
+"""Tests of live rows (samples made from live signals): all sources share one clock, readings are
+interpolated, late positions are assigned to their time, and lost sources are opened again.
 """
 
 from __future__ import annotations

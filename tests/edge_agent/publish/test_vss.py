@@ -1,5 +1,5 @@
-"""Tests of friction as VSS signals: percent, limited to the range, absent if unknown; published
-over a session and printed by the command.
+"""Tests of friction as VSS signals: values are percentages within the allowed range, unknown values
+are absent, and the command prints the values that it publishes over a session.
 """
 
 from __future__ import annotations

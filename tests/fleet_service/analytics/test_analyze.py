@@ -1,4 +1,6 @@
-"""Tests of the command `analyze` as a person types it, and of the files that it writes."""
+"""Tests of the command `analyze` as a user types it: every question (predefined query) prints a
+table, files are written completely or not at all, and a mistake gives one line.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests that active alerts are published again, so that a client receives them after its own or its
-router's outage.
+"""Tests that active alerts are published again, so that a client receives them after an outage of
+the client or of its router.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that an acknowledged report is stored on disk and in the bucket: with a lost disk, a bucket
-that does not answer, and a service killed between the two writes.
+"""Tests that an acknowledged report is stored on disk and in the bucket. It must survive the loss
+of the disk, a bucket that does not answer, and the end of the service between the two writes.
 """
 
 from __future__ import annotations

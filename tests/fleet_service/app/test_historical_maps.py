@@ -1,4 +1,6 @@
-"""Tests that past maps are rebuilt in a subprocess from a limited number of rows, or refused."""
+"""Tests that a map of the past is rebuilt in a subprocess from a limited number of rows, and that a
+query which needs more rows is refused.
+"""
 
 from __future__ import annotations
 

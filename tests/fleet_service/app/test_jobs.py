@@ -1,4 +1,6 @@
-"""Tests of the background jobs of a running service."""
+"""Tests of the background jobs of a running service: they lose no row, and a job that fails is
+counted, reported and repeated without stopping other jobs.
+"""
 
 from __future__ import annotations
 

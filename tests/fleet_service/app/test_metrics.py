@@ -1,5 +1,5 @@
-"""Tests of the metrics of a running service: refusals by reason, the queue, waiting batches, and
-health.
+"""Tests of the metrics of a running service: they count accepted, refused (by reason) and waiting
+messages, and health reports each problem.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the running service over real Zenoh sessions, from the view of vehicles, clients and
-operators.
+"""Tests of a running service over real Zenoh sessions, as vehicles, clients and operators use it:
+acknowledged reports are on the map, ice raises an alert, and bad input is refused.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the times at which segments (files of new rows) are written."""
+"""Tests of when the service writes segments (files of new rows): waiting rows are written within
+the set period, and a slow disk is not written to continuously.
+"""
 
 from __future__ import annotations
 

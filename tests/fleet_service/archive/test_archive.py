@@ -1,5 +1,5 @@
-"""Tests of the archive: order of fsync, rename and acknowledgement; faults of the disk; the lock
-against a second service; pseudonyms of vehicles.
+"""Tests of the archive: a row is synced to disk before it is acknowledged, disk errors lose no row,
+a second service is locked out, and vehicles have pseudonyms.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of GeoParquet files with an independent validator and GeoPandas."""
+"""Tests that an independent validator and GeoPandas accept the GeoParquet files."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the removal of old raw rows, of keys and of one vehicle's rows, and of the data that
-must remain.
+"""Tests of the removal of old raw rows, of keys and of one vehicle's rows: the removed data does
+not come back, and all other data remains.
 """
 
 from __future__ import annotations

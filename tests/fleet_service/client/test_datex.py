@@ -1,5 +1,5 @@
-"""Tests of slippery road sections as DATEX II: valid, versioned and ended. A section without new
-reports is not ended.
+"""Tests of slippery road sections as DATEX II: publications are valid, a changed section gets a new
+version, and an ended alert ends its section. The absence of a service ends no section.
 """
 
 from __future__ import annotations

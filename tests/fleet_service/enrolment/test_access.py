@@ -1,5 +1,5 @@
-"""Tests of the routers' access list: real sessions with real certificates and the
-generated list.
+"""Tests of the routers' access list with real sessions, real certificates and the generated list:
+each party can use exactly its own keys.
 """
 
 from __future__ import annotations

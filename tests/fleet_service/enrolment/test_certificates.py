@@ -1,4 +1,4 @@
-"""Tests of `fleet-service certs` for any previous content of its folder."""
+"""Tests of `fleet-service certs`: it must work whatever certificates its folder contains."""
 
 from __future__ import annotations
 

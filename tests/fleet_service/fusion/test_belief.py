@@ -1,5 +1,5 @@
-"""Tests of the mathematical properties of the belief about one cell: how time and votes (effects of
-single visits) may change it.
+"""Tests of the belief about one cell: it stays a probability distribution, time moves it towards
+the prior, and a vote (effect of a single visit) changes it by a bounded factor.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of late reports: a late report counts as an old report and is not dropped."""
+"""Tests that a late report is not dropped, but counts with its true age."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the influence of slippery neighbours on a cell, and of its limits."""
+"""Tests that slippery neighbours influence a cell, and that this influence has limits."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of parameters that the service learns from its vehicles: the weights of vehicles, and how
-much their values fall with the grip left unused.
+"""Tests of two kinds of parameters that the service learns about its vehicles: the weight of each
+vehicle, and how much a reported friction falls if the vehicle used little of the grip.
 """
 
 from __future__ import annotations

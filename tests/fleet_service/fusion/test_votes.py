@@ -1,5 +1,6 @@
-"""Tests of the influence of votes (effects of single visits) on the belief about a cell: one vote
-per vehicle, many vehicles, a changed road, and trust in vehicles.
+"""Tests of the influence of votes (effects of single visits) on the belief about a cell: many
+vehicles count more than many visits of one, a changed road is believed after few visits, and a
+vehicle that always disagrees loses its vote.
 """
 
 from __future__ import annotations

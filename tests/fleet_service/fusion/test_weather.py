@@ -1,4 +1,4 @@
-"""Tests of the effect of weather on the ageing of beliefs. The order in which weather reports
+"""Tests that weather changes how fast beliefs age, and that the order in which weather reports
 arrive has no effect.
 """
 

@@ -1,4 +1,6 @@
-"""Tests of the queue behind the subscribers: its content is bounded, and it is emptied in steps."""
+"""Tests of the queue behind the subscribers: its content is bounded, and it is emptied in steps of
+limited size.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of rate limits: token buckets over time, senders with invented names, and the size of
-acknowledgements.
+"""Tests of rate limits: a vehicle may send a burst and then its rate, a sender with too much
+traffic takes nothing from others, and invented names fill no memory.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the validation of messages: each rule, and malicious bytes."""
+"""Tests of the validation of messages: a bad row is refused with its reason, good rows are
+accepted, and malicious bytes never stop the intake.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of a base map from a file of the operator: accepted files, refused files, and the rendered
-picture.
+"""Tests of a base map from a file of the operator: its tiles are served and shown below the map
+without a network, and other files are refused.
 """
 
 from __future__ import annotations

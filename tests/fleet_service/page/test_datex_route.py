@@ -1,5 +1,5 @@
-"""Tests of the DATEX II publication of the page: equal to the alerts, continued after a restart,
-and valid.
+"""Tests of the DATEX II publication of the page: it is valid, follows the alerts, and continues
+after a restart of the page.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the map as OGC API Features: opened by GDAL's own client, queried directly, and refused
-requests.
+"""Tests of the map as OGC API Features: GDAL's own client can open it, answers contain the right
+cells, and wrong requests are refused with the reason.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of other uses of the page: replay of a night, sound, print, wall display, a dropped route
-file, and screen reader.
+"""Tests of further uses of the page, each of which must work: replay of a night, sound, print, wall
+display, a dropped route file, and screen readers.
 """
 
 from __future__ import annotations

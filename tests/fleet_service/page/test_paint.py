@@ -1,5 +1,5 @@
-"""Tests of the map's drawing in a real browser: squares with a share of unknown cells, no gaps
-between neighbouring cells, values inferred from neighbours, a route, and the map before a service
+"""Tests of the map's drawing in a real browser: unknown parts stay visible in each square,
+neighbouring cells leave no gap, a route hides no cell, and the map is hatched before a service
 answers.
 """
 

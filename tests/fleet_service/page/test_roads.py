@@ -1,5 +1,5 @@
-"""Tests of the roads of the page: lines from a file, lines derived from cells, recent times, and
-areas with data.
+"""Tests of the road lines on the page: they are read from a file or derived from cells, streets
+that cross stay separate, and a few scattered cells make no road.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the page's server: refused requests, messages at connect, number of connected browsers,
-and requests to reload.
+"""Tests of the page's server: wrong requests are refused with the reason, a browser that connects
+gets the present state and then each change, and a slow browser is told to reload.
 """
 
 from __future__ import annotations

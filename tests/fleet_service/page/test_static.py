@@ -1,5 +1,5 @@
-"""Tests of the page's static files: all texts in one table, short modules, one bundle, and no
-external file.
+"""Tests of the page's static files: every text stands in one table, modules are short, all are
+joined into one script, and nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of the beginning and end of alerts."""
+"""Tests of alerts: they begin when enough independent vehicles report ice, and end only when grip
+is certain or nobody confirms the ice.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the limit on idle roads: two vehicles alone raise alerts only in a few places; traffic
-or a third vehicle lifts the limit.
+"""Tests of the limit on idle roads: two vehicles alone can raise alerts only in a few places, but
+traffic or a third vehicle removes this limit.
 """
 
 from __future__ import annotations

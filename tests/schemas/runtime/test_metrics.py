@@ -1,5 +1,5 @@
-"""Tests of metrics and health for a scraper and for programs: real HTTP on loopback, and lines of
-JSON.
+"""Tests of metrics and health over real HTTP on loopback: a metrics parser reads all values, health
+follows the reported problems, and log lines are JSON if requested.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of shared libraries of kernels (compiled functions): results, failures, and calls that a
-library lacks.
+"""Tests of shared libraries of kernels (compiled functions): they give the results of Numba, and
+calls that a library cannot serve are left to Numba or refused.
 """
 
 from __future__ import annotations

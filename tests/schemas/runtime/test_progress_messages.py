@@ -1,4 +1,6 @@
-"""Tests of progress messages on a terminal."""
+"""Tests of progress messages on a terminal: they appear while slow libraries are still being
+loaded, and not at all in quiet mode.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tests that the tile decoder treats its input as untrusted."""
+"""Tests of the tile decoder with untrusted input: a written tile is read back unchanged, and any
+other bytes give a decoding error and nothing else.
+"""
 
 from __future__ import annotations
 

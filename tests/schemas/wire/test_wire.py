@@ -1,4 +1,6 @@
-"""Tests that bytes and columns agree for every version of the messages that was ever sent."""
+"""Tests of the wire format: a decoded message equals the encoded one for every version ever sent,
+and other bytes are refused with a reason.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests of the figures of the detection evaluation: their definitions on synthetic drives, and one
-small town through the whole pipeline.
+"""Tests of the figures of the detection evaluation: on made-up drives each figure follows its
+definition, and one small town passes through the whole pipeline.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of `edge-agent evaluate --paper`: tables, plots, page and exit code."""
+"""Tests of `edge-agent evaluate --paper`, which reproduces the papers' results: it writes tables,
+plots and a page, and its exit code is 1 if a required result is missed.
+"""
 
 from __future__ import annotations
 

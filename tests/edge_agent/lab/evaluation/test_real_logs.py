@@ -1,5 +1,5 @@
-"""Tests of the evaluation of recorded drives in a folder against the measured part of their true
-states.
+"""Tests of the evaluation of recorded drives in a folder: the estimates are compared with the true
+values that were measured, and ice reported on a road with grip counts as false.
 """
 
 from __future__ import annotations

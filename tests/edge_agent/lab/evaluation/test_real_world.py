@@ -1,5 +1,5 @@
-"""Tests of the figures of simulated drives with realistic sensor errors on hills, on seeds that are
-not used for tuning.
+"""Tests of the figures for simulated drives with realistic sensor errors on hills: trivial
+estimators get the expected scores, and the drives' seeds are not used for tuning.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the figures about the reliability of friction intervals and the consistency of filters,
-on estimates with a known error and on the estimators.
+"""Tests of the figures about the reliability of friction intervals and the consistency of filters:
+a known error in made-up estimates must be visible in them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the benefit of fuzzy inference and of the ant colony, measured on simulated drives that
-are not used for tuning.
+"""Tests of the comparison that shows the benefit of fuzzy inference and of the ant colony. It uses
+only simulated drives that are not used for tuning.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""Tests of options of the simulated vehicle and drive for the papers: tyres, friction over time,
-motors, noise per channel.
+"""Tests of options of the simulation that the papers need: each option (tyre model, friction that
+changes in time, motors, noise per channel) has exactly the stated effect.
 """
 
 from __future__ import annotations

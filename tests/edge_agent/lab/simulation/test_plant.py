@@ -1,5 +1,5 @@
-"""Tests of the simulated vehicle (plant) against mechanics: Newton's laws, friction circle, energy,
-circles and signs; then its limits.
+"""Tests that the simulated vehicle (plant) obeys mechanics: Newton's laws, friction circle, energy,
+steady circles and signs. Further tests check its limits.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of roads and friction: geometry, endless driving, and the surface at every
-place and time.
+"""Tests of roads and friction in the simulation: lanes join without gaps and never end, and the
+friction is right at every place and time.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of slopes, banks, standing vehicles and misaligned sensors: first the mechanics, then the
-readings of the sensors.
+"""Tests of slopes, banks, standing vehicles and misaligned sensors in the simulation. The first
+tests check the mechanics, the others the readings of the sensors.
 """
 
 from __future__ import annotations

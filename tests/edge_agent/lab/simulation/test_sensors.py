@@ -1,4 +1,4 @@
-"""Tests of simulated sensors: their errors have the statistics in their table."""
+"""Tests of simulated sensors: their errors have the statistics that their table states."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Tests of winter equipment and roads: controllers (ABS and others) that switch on and off, tyres
-with relaxation, engine drag when the accelerator is released, and winter towns.
+"""Tests of winter equipment and roads in the simulation: controllers (ABS and others) act on
+slippery road only, tyres build up side force over a distance, and a winter town has the intended
+surfaces.
 """
 
 from __future__ import annotations

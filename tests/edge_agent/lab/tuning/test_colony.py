@@ -1,5 +1,5 @@
-"""Tests of the ant colony as a search: its equations, its bounds, and its result compared with
-random search.
+"""Tests of the ant colony as a search: it follows its equations, stays within its bounds, and finds
+better results than random search.
 """
 
 from collections.abc import Callable

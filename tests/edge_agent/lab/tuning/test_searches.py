@@ -1,5 +1,5 @@
-"""Tests of the tuning searches over continuous parameters, and of their comparison with equal
-numbers of trials.
+"""Tests of the tuning searches over continuous parameters, and of their comparison, in which each
+search has the same number of trials.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the study of paper 004's tuning: its conditions, its objective, and the command from end
-to end.
+"""Tests of the study of paper 004's tuning: drives for the search and for judging are separate, the
+noise follows the stated schedule, and the command runs from end to end.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of DENM (hazard messages): encoding, event numbers that stay the same over restarts,
-properties for the interchange, and DENM of other parties, which count as reports of one vehicle.
+"""Tests of DENM (hazard messages): other encoders write the same bytes, an event keeps its number
+over restarts, and DENM of other parties count as reports of one vehicle.
 """
 
 from __future__ import annotations
