@@ -203,7 +203,7 @@ def plot(table: pa.Table, question: Question, path: Path) -> None:
 
 def make_page(table: pa.Table, question: Question) -> str:
     """Return an HTML page with a map of the answer's coloured cells, animated if the answer has
-    frames. The page needs no network.
+    frames (maps of several moments). The page needs no network.
     """
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError(

@@ -6,9 +6,10 @@ this machine or on Spark. The archive is processed zone by zone (a zone is a map
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  statistics, one file per
                                                                      compacted file, all days
 
-Once the vehicles' weights are known, a cell does not depend on distant cells. A zone therefore
-needs only its own rows and those of a margin around it, and gives the same result as a replay of
-the whole archive. Both engines run the same function for each zone and write the same bytes.
+Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
+cells. A zone therefore needs only its own rows and those of a margin around it, and gives the same
+result as a replay of the whole archive. Both engines run the same function for each zone and write
+the same bytes.
 """
 
 from __future__ import annotations

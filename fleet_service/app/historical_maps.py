@@ -187,7 +187,7 @@ def box_of(question: PastQuery) -> Box | None:
 
 def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     """Answer a query about a past map: yield the tile number and the payload of every reply. This
-    runs in the separate process.
+    runs in a process of its own.
 
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.

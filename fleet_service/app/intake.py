@@ -87,7 +87,7 @@ class Intake:
         self.weather.fusion = self._shared.state.fusion
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Check messages, and update the map with the admitted ones; return the alerts that are
+        """Check messages, and update the map with the admitted messages; return the alerts that are
         raised or cleared. `at` is the time; a plain number [ns] is taken as certain.
         """
         at = at if isinstance(at, TimeNow) else TimeNow(at)

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 class Tasks:
     """Queue of functions that other threads ask the worker (the thread that processes messages) to
-    run; `bool()` of it is True if it is not empty.
+    run. The queue as a boolean is True if it is not empty.
     """
 
     def __init__(self) -> None:

@@ -50,7 +50,8 @@ class _Load(Generic[Batch]):
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
         """Write one segment per kind (observations or states) that has waiting rows. Then make all
-        segments (files of new rows) durable, on disk and with `upload`.
+        segments (files of new rows) durable: on disk and, if `upload` is given, also in a second
+        place.
         """
         for kind, waiting in self.waiting.items():
             if waiting:

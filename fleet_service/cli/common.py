@@ -193,7 +193,7 @@ def on_archive(
 
 
 def compact_first(root: Path) -> None:
-    """Move the new rows of an archive into its compacted (sorted) files, so that their rows are
+    """Move the new rows of an archive into its compacted (sorted) files, so that these rows are
     included in the answer. If that is impossible, print how many segments (files of new rows) are
     left out.
 

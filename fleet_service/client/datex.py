@@ -87,7 +87,7 @@ def make_publication(
         now: current time [ns UTC].
         before: the previous publication; None to start a new one.
         is_heard: function that returns True if a service answers for a place (latitude, longitude).
-            Situations elsewhere are not ended.
+            Situations at other places are not ended.
 
     Raises:
         InputError: `before` is not a publication.

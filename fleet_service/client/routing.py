@@ -4,8 +4,8 @@ model for GraphHopper. Pure (no I/O).
 The factor is computed from the lower bound of friction. Only cells that were measured, or estimated
 from neighbours ("borrowed"), count. In other cells the lower bound is low because no vehicle has
 tested the grip, which does not mean that the road is slippery. A factor is a cost, not a time.
-Valhalla also multiplies the reported travel time by it, so the time of a chosen route must be
-queried again without factors.
+Valhalla also multiplies the reported travel time by the factor, so the time of a chosen route must
+be queried again without factors.
 """
 
 from __future__ import annotations

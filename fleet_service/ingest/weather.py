@@ -162,8 +162,8 @@ def archived_reports(
     """Return every report that a map used, in order of receipt, up to the time `received_until`
     [ns]. Files whose names are in `known` are skipped.
 
-    `damaged` is called with each damaged file. Its reports are missing, so the roads of its regions
-    age as without weather.
+    `damaged` is called with each damaged file. The reports of such a file are missing, so the map
+    is computed as if the weather of these regions were unknown.
 
     Raises:
         InputError: a file has a newer major version.

@@ -229,8 +229,9 @@ def _alerts_by_minute(
     sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes
 ) -> list[BoolArray]:
     """Send messages through the service's admission, and return the alerts of each minute, as masks
-    of cells. `key` determines the vehicles' numbers, and so which vehicles the service compares;
-    with the same `key`, two runs differ only by the attack.
+    of cells. `key` determines the permanent numbers of the vehicles, and these numbers determine
+    which vehicles the service compares. With the same `key`, two runs therefore differ only by the
+    attack.
     """
     out = []
     with tempfile.TemporaryDirectory() as folder:

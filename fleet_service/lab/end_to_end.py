@@ -39,8 +39,13 @@ Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
 
 class World(NamedTuple):
-    """Conditions of a drive: scenario of the simulator, and share of vehicles with realistic
-    ("rough") sensor errors.
+    """Conditions of a simulated drive.
+
+    Attributes:
+        scenario: scenario of the simulator.
+        rough: share of vehicles with realistic ("rough") sensor errors.
+        prefix: first part of the names of this drive's figures.
+        seed: seed of the simulation.
     """
 
     scenario: str

@@ -52,9 +52,9 @@ def drive_town(rng: Generator) -> Visits:
 
 
 def order_difference(rng: Generator) -> float:
-    """Return the largest difference of a probability of a belief between two maps: one from
-    observations in order of time, the other from observations in random order within the allowed
-    delay.
+    """Return the largest difference in any probability of any cell's belief between two maps: one
+    from observations in order of time, the other from observations in random order within the
+    allowed delay.
     """
     visits = drive_town(rng)
     o = observations_of(rows_of(visits), visits.vehicle)
@@ -69,8 +69,9 @@ def order_difference(rng: Generator) -> float:
 
 
 def replay_difference(rng: Generator) -> float:
-    """Return the largest difference of a probability of a belief between two services: one received
-    messages, some late or twice, and the other was restarted from its archive.
+    """Return the largest difference in any probability of any cell's belief between two services:
+    one received messages, some late or twice, and the other was restarted from the archive of the
+    first.
     """
     visits = drive_town(rng)
     sent = make_messages(visits)

@@ -114,8 +114,8 @@ def lower_excess() -> float:
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Return the share of late observations that affect the map in this situation: the rows of an
-    hour arrive after an outage, while one other vehicle was connected all the time.
+    """Return the share of late observations that affect the map after an outage. In this situation,
+    all rows of an hour arrive at its end, while one other vehicle was connected all the time.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

@@ -2,9 +2,9 @@
 have an error model of their own. Pure (no I/O).
 
 Each vehicle has a gain error that affects both its value of μ and the grip that it reports as used.
-If a fusion learned a correction from both, it would see a relation between them that is not a
-property of the road. The values have noise, whose size the vehicles state correctly. Vehicles send
-complete log-likelihoods and none of the optional columns.
+If the map's computation learned a correction from both, it would see a relation between them that
+is not a property of the road. The values have noise, whose size the vehicles state correctly.
+Vehicles send complete log-likelihoods and none of the optional columns.
 
 There are two drives:
 

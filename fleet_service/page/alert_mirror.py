@@ -32,8 +32,8 @@ class AlertMirror:
     def take_standing(
         self, standing: Iterable[Alert], served: Callable[[int], bool], now: float
     ) -> None:
-        """Replace the active alerts with the given ones. `served` is a function that returns True
-        if a service answers for a cell; alerts of cells without a service are kept.
+        """Replace the active alerts with the alerts in `standing`. `served` is a function that
+        returns True if a service answers for a cell; alerts of cells without a service are kept.
         """
         with self._lock:
             self.heard = now

@@ -53,8 +53,9 @@ class BoundedProtocol(H11Protocol):
             super().connection_lost(exc)
 
     def _make_place(self) -> bool:
-        """Make room for a new connection of a browser: close a connection without a request, or one
-        of the address with the most connections. Return False if no connection may be closed.
+        """Make room for a new connection of a browser: close a connection without a request, or
+        else a connection of the address that has the most connections. Return False if no
+        connection may be closed.
         """
         others = [one for one in self.connections if isinstance(one, BoundedProtocol)]
         found = [one for one in others if one.is_silent]

@@ -18,7 +18,9 @@ MOST: Final = 256  # regions that are watched
 
 
 class ServedRegions:
-    """Regions with cells, and regions that lost their service before a cell was known."""
+    """Regions with cells, and regions that lost their service before the page knew one of their
+    cells.
+    """
 
     def __init__(self) -> None:
         self._queriers: dict[int, Any] = {}

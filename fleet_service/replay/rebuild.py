@@ -124,9 +124,9 @@ def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntAr
 class Since(NamedTuple):
     """Selection of rows for a replay.
 
-    Once the vehicles' weights are known, a cell does not depend on distant cells. Therefore cells
-    inside a box get the same belief (probabilities of each friction) as in a complete replay, if
-    the rows of a margin around the box are read too.
+    Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
+    cells. Therefore cells inside a box get the same belief (probabilities of each friction) as in a
+    complete replay, if the rows of a margin around the box are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.
@@ -341,8 +341,8 @@ def _fuse_epochs(
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
-    """Yield the rows of the listed files in chunks of about CHUNK_ROWS, in order of time. Chunks
-    are cut between epochs.
+    """Yield the rows of the archive files in `listing` in chunks of about CHUNK_ROWS, in order of
+    time. A chunk ends between two epochs (minutes).
 
     A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are given as
     numbers. If the number of rows is not limited, a part is read while the previous one is used.

@@ -31,8 +31,9 @@ class FencedBucket:
         self._turn = 0
 
     def attach_lease(self, may_write: Callable[[], bool], assert_alone: Callable[[], None]) -> None:
-        """From now on, write to the bucket only while this service has the lease (ownership of the
-        archive); see the attributes.
+        """Allow writes to the bucket from now on only while this service has the lease (ownership
+        of the archive). The attributes `may_write` and `assert_alone` are the functions that check
+        this.
         """
         self.may_write = may_write
         self.assert_alone = assert_alone

@@ -34,7 +34,7 @@ class Ownership:
         lease: lease of the copy; None if no other service must be excluded.
         to: name of the standby (waiting service) that takes over when this service stops; "" for
             none.
-        leaves: True once everything is ready for this hand-over.
+        leaves: True once this service is ready to hand the archive over to `to`.
     """
 
     def __init__(

@@ -1,11 +1,11 @@
 """Bucket replica of an archive: the same files under the same names.
 
-Files on which an acknowledgement depends (segments (files of new rows), keys, vehicle identities)
-are uploaded before the acknowledgement (`upload_segments`). All other files follow later (`sync`).
-Uploads come first and deletions last, so that the copy contains every row at least once at any
-time. At start (`sync_without_lease`), files that only the bucket has are downloaded (all files, if
-the disk is empty), and files that only the folder has are uploaded. An object is deleted only if
-the upload journal (list of own uploads) contains it.
+Files on which an acknowledgement depends are segments (files of new rows), keys and vehicle
+identities. They are uploaded before the acknowledgement (`upload_segments`). All other files follow
+later (`sync`). Uploads come first and deletions last, so that the copy contains every row at least
+once at any time. At start (`sync_without_lease`), files that only the bucket has are downloaded
+(all files, if the disk is empty), and files that only the folder has are uploaded. An object is
+deleted only if the upload journal (list of own uploads) contains it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Low-friction alerts. An alert is raised when at least two vehicles reported ice and the cell is
-slippery with high probability. It is cleared only when the probability has clearly fallen
-(hysteresis), and the end message states a reason. Pure (no I/O).
+slippery with high probability. The alert is cleared only when the probability has clearly fallen
+(hysteresis). The message about its end states a reason. Pure (no I/O).
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ nothing that is visible. Pure (no I/O).
 Readers see a copy of the map. Copies are made only at fixed times (every PERIOD_NS). A cell is
 copied if at least LEAST vehicles have visited it since its last copy, and as many have been in its
 tile within the current hour. So neither the cell nor the time of the copy points to one vehicle.
-Between copies, readers see the cell without the newer visits, aged to the time of reading. There is
-one exception for safety: a cell that has become more slippery than shown is copied at once.
+Between copies, readers see the cell without the newer visits, with its belief predicted to the time
+of reading. There is one exception for safety: a cell that has become more slippery than shown is
+copied at once.
 
 Legend
     k        LEAST, `public_vehicles` of the settings

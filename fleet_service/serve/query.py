@@ -95,7 +95,7 @@ def _view_tile(
     cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int
 ) -> ShownTile:
     """Return the cells of one tile that may match the query, including estimated (unvisited) cells
-    if it asks for them. For a query along a route, they are in the order of the route.
+    if the query asks for them. For a query along a route, they are in the order of the route.
     """
     with cache.guard:
         fusion = cache.state.fusion

@@ -74,9 +74,9 @@ def _hold_tokens(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 def watch_successors(
     session: zenoh.Session, mine: frozenset[ServiceToken]
 ) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True if another service has taken these regions since the block
-    began. In this way a service that cannot reach its bucket learns that it was replaced, and stops
-    serving outdated data.
+    """Yield a function that returns True if another service has taken over the regions of the
+    tokens `mine` since the block began. In this way a service that cannot reach its bucket learns
+    that it was replaced, and stops serving outdated data.
     """
     with presence.track_tokens(session) as there:
         before = there.active

@@ -6,12 +6,12 @@ slippery and the other is not. The probability of this after a time Δ is
 
     P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
 
-    λ   rate of change of the road, as in the fusion (CHANGE_S is 1/λ)                      [1/s]
+    λ   rate of change of the road, as in the computation of the map (CHANGE_S is 1/λ)      [1/s]
     e   probability that two values of the same road are unlike because of errors
     m   probability that values of two roads are unlike; π is the share of slippery values in the
         class (a temperature band, or a part of the day)
 
-This is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are
+The map's computation uses the same model of change (`fleet_service/fusion/README.md`). λ and e are
 maximum-likelihood estimates over bins of Δ. Roads of a region change together, so pairs of values
 are not independent, but days are. Therefore the 90 % interval is computed by bootstrap: days are
 drawn with replacement. With fewer than LEAST_DAYS days, no interval is given.

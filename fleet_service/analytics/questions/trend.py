@@ -1,8 +1,8 @@
 """`trend`: friction month by month, and the difference to the previous month in the same cells.
 
 Different cells are measured in different months, so the percentiles of months cannot be compared
-directly. The difference uses only cells with values in both months, with the interval of
-`before-after`.
+directly. The difference uses only cells with values in both months. Its interval is computed as in
+the question `before-after`.
 """
 
 from __future__ import annotations

@@ -6,11 +6,11 @@ pseudonym in the archive changes each month.
     keys/2026-01.TERM.witnesses the same for a service that owns the archive by a lease; each
                                 service writes a file of its own
 
-A car must not count as two independent sources because a month has ended, or because it claims to
-be another car. Restarts and replays know only pseudonyms, so they read the files per month. If a
-line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A service
-therefore checks the lines at start, counts damaged lines and removes them. The vehicle's next batch
-(message with records) writes its line again.
+One car must never count as two independent sources, neither after the end of a month nor when it
+claims to be another car. Restarts and replays know only pseudonyms, so they read the files per
+month. If a line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A
+service therefore checks the lines at start, counts damaged lines and removes them. The vehicle's
+next batch (message with records) writes its line again.
 """
 
 from __future__ import annotations
