@@ -75,8 +75,8 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return a rule base without fuzzy sets: `plain_share` with these arguments gives the share of
-    the evidence on friction that is used, and neither the measurement noise R nor forgetting is
+    """Return a rule base without fuzzy sets. The used share of the evidence on friction is then
+    `plain_share` with these arguments, and neither the measurement noise R nor forgetting is
     adapted.
     """
     idle = Memberships(consequents=(0.0, 0.0))

@@ -135,16 +135,18 @@ def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
 
 
 def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibration:
-    """Return the calibration with only the quantities of the given groups."""
+    """Return the calibration with only the quantities of the given groups (such as "steering" or
+    "clocks").
+    """
     names = {name for group in groups for name in GROUPS[group]}
     update = {name: None for every in GROUPS.values() for name in every if name not in names}
     return calibration.model_copy(update=update)
 
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
-    """Return True if the predictions `tried` are worse than `best`: their mean log-likelihood is
-    lower by more than WORSE, or on some drive the flag CONTRADICTION (measurements contradict the
-    model) is set for longer, by more than LONGER.
+    """Return True if the predictions `tried` are worse than `best`. They are worse if their mean
+    log-likelihood is lower by more than WORSE, or if on some drive the flag CONTRADICTION
+    (measurements contradict the model) is set for longer, by more than LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

@@ -11,9 +11,9 @@ follow from (54).
 
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
 friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
-stiffness does not depend on friction. Therefore R here is sensor noise plus model error, and the
-estimate returns to the prior with the distance driven, so that a friction that is not observed
-becomes as uncertain as the prior. ELEMENTS lists each element of the paper and every departure with
+stiffness does not depend on friction. Therefore R here is sensor noise plus model error. The
+estimate returns to the prior with the distance driven, because a friction that is not observed must
+become as uncertain as the prior. ELEMENTS lists each element of the paper and every departure with
 its reason.
 """
 

@@ -2,11 +2,11 @@
 
 `aco-fckf`, `fckf` and `ckf` are one filter, a Rao-Blackwellised mixture: a grid of friction values
 (nodes), each with a cubature filter. They differ in the fuzzy adaptation of the measurement noise:
-it is tuned by ant colony optimisation, untuned, or absent. The filter is based on paper 004 and
-departs from it in these points: kinematic prediction; wheel speed as a measurement; force from
-torque; residuals by total least squares; friction as a mixture instead of a state; stiffness, leaks
-(gravity in tilted accelerometers) and offsets as states; bounded adaptation of R, with its
-direction corrected (errata).
+it is tuned by ant colony optimisation, untuned, or absent. The filter is based on paper 004. It
+departs from the paper in its prediction (kinematic), its measurements (wheel speed, force from
+torque) and its residuals (total least squares). Friction is a mixture instead of a state;
+stiffness, leaks (gravity in tilted accelerometers) and offsets are states. The adaptation of R is
+bounded, and its direction is corrected (errata).
 """
 
 from __future__ import annotations

@@ -11,9 +11,9 @@ the friction of each driven wheel is observable. With the paper's a_x, a_y, r al
 the four frictions are observable (errata).
 
 `literal.wheel_friction_ukf` is the filter as printed, with four states and given motion. The filter
-in this module is for a car, where v_x and v_y are not given: they are states, a_x and a_y are
-inputs of the kinematics, and the wheel torques replace the measurement a_x. ELEMENTS lists each
-element of the paper and every departure with its reason.
+in this module is for a car, in which v_x and v_y are unknown. Therefore they are states, a_x and
+a_y are inputs of the kinematics, and the wheel torques replace the measurement a_x. ELEMENTS lists
+each element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations

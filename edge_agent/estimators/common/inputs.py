@@ -3,9 +3,9 @@
 This module refuses implausible readings, detects gaps in time, replaces missing inputs and computes
 the grip in use. A reading that is missing, infinite or implausible is NaN in `now`; the filter then
 leaves out the measurement equation that needs it. Where the filter needs a reading as an input,
-`inputs` holds a replacement: zero and r*v_x for the accelerations, the last value for yaw rate and
-steering, and for torque the wheel's share of the force m*a_x. A missing wheel speed stays NaN, and
-that wheel is assumed to roll freely.
+`inputs` holds a replacement. For the accelerations it is zero (a_x) and r*v_x (a_y), for yaw rate
+and steering the last value, and for torque the wheel's share of the force m*a_x. A missing wheel
+speed stays NaN, and that wheel is assumed to roll freely.
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""Processing of one sample of one vehicle: add the sample to the sums of the block (the samples
-within 0.05 s) and, at the end of the block, run one step of the friction mixture (all hypotheses).
+"""Processing of one sample of one vehicle. The sample is added to the sums of the block (the
+samples within 0.05 s). At the end of a block, one step of the friction mixture (all hypotheses) is
+run.
 
-At the end of a block, the steps are: possible change of the road; for each group of nodes mixing,
-measurement update at the state of the block's beginning, and prediction to the block's end; update
-of the node probabilities; adaptation of the measurement noise R; mean and covariance of the
-mixture. Between block ends, the velocity is advanced by integrating the accelerometers.
+A step begins with a possible change of the road. Then, for each group of nodes, it mixes the
+states, applies the measurements at the state of the block's beginning, and predicts to the block's
+end. Finally it updates the node probabilities, adapts the measurement noise R, and computes mean
+and covariance of the mixture. Between the ends of blocks, the velocity is advanced by integrating
+the accelerometers.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ curve; F_z load; mu friction.
                    stiffness mu*k*F_z, as printed in the papers
     similarity     F = mu*F_z*f(theta/mu)*direction, stiffness k*F_z, as on a real tyre
 
-With the printed tyre the force is linear in friction, so the filter may use negative friction
-between two samples.
+With the printed tyre the force is linear in friction. Therefore it is defined for negative friction
+too, and the filter need not limit its friction estimates between two samples.
 """
 
 from __future__ import annotations

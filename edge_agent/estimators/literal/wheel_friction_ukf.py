@@ -91,8 +91,8 @@ def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
 
 
 class _Model:
-    """Measurements of a drive, and the function that predicts them, in the precision of
-    the filter.
+    """Measurement model of the filter: the measurements of a drive, and the function that predicts
+    them, in the precision of the filter.
     """
 
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:

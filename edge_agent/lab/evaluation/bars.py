@@ -53,16 +53,16 @@ def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
 
 def in_the_world(name: str) -> Callable[[Results], float]:
     """Return a function that takes the campaign's results and returns the figure (number) called
-    `name` of the default estimator in `real_world`: towns with inaccurate cars, or cars that stand
-    on a slope.
+    `name` of the default estimator. It comes from `real_world`: towns with inaccurate cars, or cars
+    that stand on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns the ratio `name` of two
-    interval scores of friction, for example the score with fuzzy sets divided by the score without
-    them.
+    """Return a function that takes the campaign's results and returns the ratio called `name`. It
+    compares two interval scores of friction, for example the score with fuzzy sets divided by the
+    score without them.
     """
     return lambda results: worth.ratio(results.worth, name)
 

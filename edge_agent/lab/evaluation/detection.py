@@ -157,9 +157,9 @@ def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretche
 
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
-    """Return the cause of a slide from car n's mean accelerations in the samples first to end:
-    "cornering" if the lateral one is larger, otherwise "braking" or "driving" by the sign of the
-    longitudinal one.
+    """Return the cause of a slide, from the mean accelerations of car n in the samples `first` to
+    `end`. It is "cornering" if the lateral acceleration is larger. Otherwise the sign of the
+    longitudinal acceleration decides between "braking" and "driving".
     """
     along = float(drive.ax[first:end, n].mean())
     across = float(drive.ay[first:end, n].mean())
@@ -186,9 +186,9 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Add to the tally (sums of the evaluation) over all samples of the town: coverage of the
-    friction interval, false ice (grip reported as slippery), false grip (the interval's lower end
-    too far above the true friction) and interval score.
+    """Evaluate all samples of the town, and add the results to the tally (sums of the evaluation):
+    coverage and interval score of the friction interval, false ice (grip reported as slippery), and
+    false grip (lower end too far above the true friction).
     """
     mu = drive.mu
     apart = ~drive.stood
@@ -220,9 +220,9 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
 
 
 def passes_of(drive: DetectionDrive, n: int, kind: str) -> Stretches:
-    """Return the passes of car n over slippery road, as pairs (first index, last index + 1):
-    stretches of at least PASS_S seconds on ice, or on snow with friction up to SLIPPERY_MU, as
-    `kind` selects.
+    """Return the passes of car n over slippery road, as pairs (first index, last index + 1). A pass
+    is a stretch of at least PASS_S seconds on ice, or on snow with friction up to SLIPPERY_MU;
+    `kind` is "ice" or "snow".
     """
     mu = drive.mu[:, n]
     on = mu <= ICE_MU if kind == "ice" else (mu > ICE_MU) & (mu <= SLIPPERY_MU)
@@ -312,8 +312,9 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count false reports of slippery road at least SETTLED_S after snow and ice: those of the
-    estimator, of its friction belief at each threshold, and of the slip flag (ordinary ABS logic).
+    """Count false reports of slippery road, at least SETTLED_S after snow and ice. They are counted
+    for the estimator, for its friction belief at each threshold, and for the slip flag (ordinary
+    ABS logic).
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)

@@ -99,9 +99,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return two measures by name, one value per drive, over the last LAST_S of drives on a road
-    with different friction left and right: the friction error on the side with less friction, and
-    the coverage of the interval on the other side.
+    """Return two measures by name, one value per drive, for drives on a road with different
+    friction left and right. Over the last LAST_S, they are the friction error on the side with less
+    friction, and the coverage of the friction interval on the other side.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel
@@ -120,8 +120,8 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Return, per drive, the time [s] from the change of friction until the friction estimate is
-    within NEAR of the new value; if this never happens, the time from the change to the end of the
-    drive.
+    within NEAR of the new value. If this never happens, return the time from the change to the end
+    of the drive.
     """
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])

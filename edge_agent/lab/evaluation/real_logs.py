@@ -226,8 +226,8 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return a lower limit of the friction of a log's surface, one number for the log: the larger
-    of CERTAIN times the known value, and the grip that the car used.
+    """Return one number for a log: a lower limit of the friction of its surface. It is the larger
+    of CERTAIN times the known friction (if it is known) and the grip that the car used.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (

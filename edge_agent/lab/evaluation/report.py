@@ -150,8 +150,8 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Return the mean of the figure (named number) `name` as text for the report, with ± standard
-    deviation if `spread` is True and it is known; a dash if it was not measured.
+    """Return the mean of the figure (named number) `name` as text for the report. With `spread`, "±
+    standard deviation" is added if it is known. If the figure was not measured, return a dash.
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
@@ -181,7 +181,8 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
     """Return a Markdown table of those results with a target for which an oracle (an ideal
-    observer) was run: the target, the value of the default estimator, and that of the oracle.
+    observer) was run. It shows the target, the value of the default estimator, and that of the
+    oracle.
     """
     rows = []
     for bar in barred:
@@ -285,8 +286,9 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return the cell of the report for a check of several drives: "yes" if all `shares` (of drives
-    that passed) are 1, else "NO" with the smallest share; a dash without shares.
+    """Return the cell of the report for a check of several drives. `shares` are shares of drives
+    that passed. The cell is "yes" if all are 1, otherwise "NO" with the smallest share; a dash if
+    there are none.
     """
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 

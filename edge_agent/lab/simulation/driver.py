@@ -180,8 +180,9 @@ def cruise(d: FloatArray) -> float:
 
 @compiled
 def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s], from the
-    friction `looks` that the road ahead seems to have, and from sliding wheels in `w`.
+    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s]. It
+    depends on `looks`, the friction that the road ahead seems to have, and on sliding wheels in
+    `w`.
     """
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
@@ -367,9 +368,9 @@ def drive(
     """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
     d[STEER] and d[FORCE] are the road-wheel angle and the force that the driver now demands.
 
-    `vehicle` contains its state, parameters and wheels at the last sample; `world` lanes and
-    friction table; `now` time [s], length of the sample [s] and acceleration by gravity along the
-    road [m/s^2]; `keys` the random keys of route and traffic.
+    `vehicle` is the vehicle's state, its parameters, and its wheels at the last sample. `world` is
+    the lanes and the friction table. `now` is the time [s], the length of the sample [s] and the
+    acceleration by gravity along the road [m/s^2]. `keys` are the random keys of route and traffic.
     """
     x, p, w = vehicle
     d, g = driver

@@ -103,10 +103,10 @@ def run(
     """Simulate the next samples; return records with the true values (T, N, RECORD). The states
     are advanced in place.
 
-    states: vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4), wheels (N, 8, 4); ground:
-    lanes, tables of friction and of relief; keys: random keys of routes and of traffic (N,);
-    samples: number of the first sample, and of samples; timing: sample period [s] and integration
-    steps per sample.
+    `states` are those of vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4) and wheels
+    (N, 8, 4). `ground` is the lanes, the friction table and the relief table. `keys` are the random
+    keys of routes and of traffic (N,). `samples` is the number of the first sample, and how many
+    samples to simulate. `timing` is the sample period [s], and the integration steps per sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground

@@ -1,8 +1,8 @@
 """The simulated vehicle ("plant"): a planar body on four wheels with Magic Formula tyres.
 
-It shares equations with `edge_agent.dynamics`, but it is not the estimator's model: its tyre curve
-has another shape, tyre stiffness grows less than the load, the wheel loads follow the accelerations
-with a lag, the body rolls, and there are air drag and rolling resistance.
+It shares equations with `edge_agent.dynamics`, but it is not the estimator's model. Its tyre curve
+has another shape, and tyre stiffness grows less than the load. The wheel loads follow the
+accelerations with a lag, the body rolls, and there are air drag and rolling resistance.
 
     m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x
     m (dv_y/dt + r v_x) = ΣY + m g_y

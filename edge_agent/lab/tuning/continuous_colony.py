@@ -171,8 +171,9 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """Return the next vector (V,) to evaluate: first the start vector, then random vectors until
-    the archive is full, then vectors drawn near a vector of the archive (the best vectors so far).
+    """Return the next vector (V,) to evaluate. First comes the start vector, then random vectors
+    until the archive (the best vectors so far) is full. After that, vectors are drawn near a vector
+    of the archive.
     """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))

@@ -11,9 +11,10 @@ IS and l_v are proper scores: in expectation, stating the true distribution give
 Therefore inflating R does not improve them. Paper 004's objective (equation 33, variance mismatch)
 is not a proper score, and neither is the error of an estimate. IS is the score of Gneiting and
 Raftery (JASA 2007). l_v does not need the true friction. However, it looks only one update ahead
-and does not show persistent errors: a tuning on l_v alone reduces R to that of white noise, and
-friction intervals become too narrow. Therefore the objective `predictive` subtracts a cost for the
-deviation of NIS from its expectation. README.md, section "Choices", explains the default objective.
+and does not show persistent errors. A tuning on l_v alone therefore reduces R to that of white
+noise, and friction intervals become too narrow. Therefore the objective `predictive` subtracts a
+cost for the deviation of NIS from its expectation. README.md, section "Choices", explains the
+default objective.
 
 The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
 the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle

@@ -46,13 +46,14 @@ Progress = Callable[[Iteration], None]
 
 @dataclass(frozen=True)
 class Problem:
-    """The objective to maximise, and the vectors to search.
+    """The objective to maximise, and the vectors to search. A vector (V,) has one number per
+    variable ("vertex").
 
-    objective: function that returns the value of a vector (V,), one number per vertex (variable).
-    choices: per vertex its positions (possible values), in ascending order. start (V,): the vector
-    that is evaluated first, so that the result is never worse than it. admissible: returns True for
-    vectors that may be evaluated; others are replaced by new draws. visibility: per vertex the
-    preference η > 0 of each position, which the ant colony uses; None: all are equally preferred.
+    `objective` returns the value of a vector. `choices` are the possible values ("positions") of
+    each vertex, in ascending order. `start` (V,) is the vector that is evaluated first, so that the
+    result is never worse than it. `admissible` returns True for vectors that may be evaluated;
+    others are replaced by new draws. `visibility` is the preference η > 0 of each position, which
+    the ant colony uses; None: all are equally preferred.
     """
 
     objective: Objective

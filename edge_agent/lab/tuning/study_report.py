@@ -106,8 +106,8 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return the figures (named numbers) of the study for each kind of search: the scores under
-    each condition of the measurement noise on held-out drives, the objective on both sets of
+    """Return the figures (named numbers) of the study for each kind of search. They are the scores
+    under each condition of the measurement noise on held-out drives, the objective on both sets of
     drives, and the progress of the searches.
     """
     listed = []

@@ -259,8 +259,8 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Set the lateral force of an axle to NaN if it cannot be used, because the steering angle (for
-    the slip) or the yaw rate (for the force) was not measured. Return the health flags.
+    """Set the lateral force of an axle to NaN if it cannot be used: the slip is unknown without the
+    steering angle, and the force is unknown without the yaw rate. Return the health flags.
     """
     health = 0
     counts = memory.block.counts

@@ -146,8 +146,9 @@ def share_weights(memory: MixtureMemory, scratch: Scratch) -> None:
 
 @compiled
 def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
-    """Replace, in each node (friction hypothesis) of a group, the share scratch.mixing of its state
-    by the state of the whole mixture, for nodes to which a road change has moved probability.
+    """Mix the states of a group of nodes (friction hypotheses) after a road change has moved
+    probability to them. In each node, the share scratch.mixing of the state is replaced by the
+    state of the whole mixture.
     """
     zeta = lanes_at(scratch.mixing, group)
     zeta = select(zeta < LEAST_MIXING, 0.0, zeta)

@@ -2,10 +2,11 @@
 contradictions between model and measurements.
 
 **Strain** is the chi-square of the estimated vehicle and sensor states against their prior, divided
-by the degrees of freedom that have been learned (Birge 1932). Errors have common causes: where
-offsets, radii, lags and steering errors are small, the other errors of the axles are small too, and
-where these states are large, so are the other errors. Therefore strain scales R of the axles. It is
-also an input of the rules that decide how much of the evidence on friction is used.
+by the degrees of freedom that have been learned (Birge 1932). Errors have common causes. In a car
+with small offsets, lags, and radius and steering errors, the other errors of the axles are small
+too; with large ones, the other errors are large. Therefore strain scales the measurement noise R of
+the axles. It is also an input of the rules that decide how much of the evidence on friction is
+used.
 
 **Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds, or
 that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
@@ -13,9 +14,9 @@ steering signals or on the banking of a race track. Ice that explains the data d
 against the model, nor do unusual states alone. The sum of the log-likelihood ratios against the
 model is `odd` [nat]; old terms fade within minutes. Straight driving does not count in favour of
 the model, because the model cannot fail there. Once `odd` reaches the threshold `odd_least`, the
-filter draws no conclusions: the friction interval returns to the prior, the axles do not affect the
-motion, and states learned meanwhile are reset. The test leaves out slides, slippery road and
-walking pace (`unexplained_ratio`).
+filter draws no conclusions. The friction interval and the vehicle states then return to their
+prior, and the axles do not affect the motion. The test leaves out slides, slippery road and walking
+pace (`unexplained_ratio`).
 
 While the filter draws no conclusions, the model cannot be tested. After `patience` [s] the filter
 tries it again. Each further contradiction makes that time four times as long, because sensors do

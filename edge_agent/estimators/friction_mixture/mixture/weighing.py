@@ -70,7 +70,7 @@ def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Advance all groups of active nodes (filters of one friction hypothesis each) by one block
-    (0.05 s): mix their states after a road change, apply the measurements, and predict to the
+    (0.05 s). Mix their states after a road change, apply the measurements, and predict to the
     block's end. Store the NIS (squared innovation over its variance) and the predictive
     log-likelihood of the mixture.
     """

@@ -108,9 +108,9 @@ def predict_covariance(
     """Replace the covariances by F*P*F' + diag(noise), where F is the matrix of the prediction over
     a block (0.05 s).
 
-    F consists of three parts: the rotation of the velocity by the yaw angle with cosine and sine
-    `turn`, the effect of accelerometer offsets on the velocity `gain`, and the factors `keep` (n,)
-    by which the other states decay.
+    F rotates the velocity by the yaw angle (cosine and sine `turn`), and adds the effect of the
+    accelerometer offsets on the velocity (`gain`). The other states decay by the factors `keep`
+    (n,).
 
     `turned` (2, n, LANES) is scratch memory for the covariance of the new velocity with the old
     states.

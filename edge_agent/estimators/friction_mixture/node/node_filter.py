@@ -132,7 +132,7 @@ def weigh_rows(
     inflation: float,
 ) -> float:
     """Compute innovation, variance and inflated noise of each of the six measurements (four wheels,
-    two axles), and add them to the sums of the block (0.05 s), weighted by the nodes' probabilities
+    two axles). Add them to the sums of the block (0.05 s), weighted by the nodes' probabilities
     `share`. Return the log-likelihood with the measurement noise R as it is before inflation.
 
     The noise of the axles is increased further if their measurements contradict the model, and
@@ -277,7 +277,7 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
     """Return the penalty [nat] of each node (filter of one friction hypothesis) for deviations of
-    its vehicle and sensor states from their prior: half the sum of the squared deviations in
+    its vehicle and sensor states from their prior. It is half the sum of the squared deviations, in
     standard deviations. `mean` has shape (n, LANES).
     """
     total = 0.0
@@ -381,8 +381,8 @@ def predict_nodes(
     memory: MixtureMemory, scratch: Scratch, group: int, turn: tuple[float, float]
 ) -> None:
     """Predict the states of a group of nodes (friction hypotheses) to the end of the block (0.05
-    s): rotate the velocity by the yaw angle (cosine and sine `turn`), add the velocity gained by
-    acceleration, and add the process variances scratch.process.
+    s). The velocity is rotated by the yaw angle (cosine and sine `turn`), the velocity gained by
+    acceleration is added, and the variances grow by scratch.process.
 
     The prediction is affine, so cubature is exact. Vehicle and sensor states return to their prior
     by the factors scratch.keep.

@@ -106,9 +106,11 @@ class RollingMotion:
 
 
 class WheelSlip:
-    """Record of the evidence that a wheel slides (from the wheel speeds alone, see
-    `block/wheel_slip.py`), and that an axle slides on a slippery road (from its slip and the
-    friction estimate, see `mixture/weighing.py`). A membership is a fuzzy truth value, 0 to 1.
+    """Record of the evidence that wheels or axles slide.
+
+    The evidence that a wheel slides comes from the wheel speeds alone (`block/wheel_slip.py`). The
+    evidence that an axle slides on a slippery road comes from its slip and the friction estimate
+    (`mixture/weighing.py`). A membership is a fuzzy truth value, 0 to 1.
     """
 
     held: float  # membership of the last second in "a wheel slides" [1]

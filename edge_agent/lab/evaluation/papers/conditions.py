@@ -35,9 +35,9 @@ def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
-    """Return the vehicle of paper 002 (in-wheel motors) with the cornering stiffnesses C_f, C_r and
-    the wheel inertia J of the paper's table 1, and the tyre option that tells the filter the ratio
-    of the two stiffnesses.
+    """Return the vehicle of paper 002 (in-wheel motors) and the tyre option for its filter. The
+    vehicle has the cornering stiffnesses C_f, C_r and the wheel inertia J of the paper's table 1.
+    The tyre option tells the filter the ratio of the two stiffnesses.
     """
     row = parameter_row(SMALL.vehicle)
     base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]

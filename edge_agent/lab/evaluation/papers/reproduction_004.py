@@ -62,9 +62,9 @@ class NoisyRun:
     reported: dict[str, Estimates]
 
     def values(self, name: str) -> Values:
-        """Return the errors of the states (v_x, v_y, yaw rate, friction) of one filter by name: MAE
-        and RMSE averaged over the noise seeds, and the relative errors of the largest absolute
-        values.
+        """Return the errors of the states (v_x, v_y, yaw rate, friction) that the filter `name`
+        estimates: MAE and RMSE, averaged over the noise seeds, and the relative errors of the
+        largest absolute values.
         """
         found: Values = {}
         truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {
