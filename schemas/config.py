@@ -19,7 +19,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base of every settings table: unknown names are refused, so that a misspelt name is reported
+    """Base of every settings table. Unknown names are refused, so that a misspelt name is reported
     and not ignored.
     """
 

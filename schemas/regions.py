@@ -26,26 +26,30 @@ Box = tuple[float, float, float, float]
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return True if two region expressions have a region in common."""
+    """Return True if two region expressions (key patterns that select regions) have a region in
+    common.
+    """
     return all(
         a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
     )
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Return True if the expression `wide` contains all regions of the expression `narrow`."""
+    """Return True if the region expression `wide` (key pattern that selects regions) contains all
+    regions of the expression `narrow`.
+    """
     return all(a in (b, "*") for a, b in zip(wide.split("/"), narrow.split("/"), strict=True))
 
 
 def region_of(tile: int) -> str:
-    """Return the region expression of the region in which a tile lies."""
+    """Return the region expression (part of a key) of the region in which a tile lies."""
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 
 def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
-    """Return as few region expressions as possible that cover the part of a query for which no
-    service answers. If the query names no place, it covers the whole earth, so that the result is
-    the area outside every service's regions.
+    """Return region expressions (key patterns that select regions), as few as possible, that cover
+    the part of a query for which no service answers. If the query names no place, it covers the
+    whole earth, so that the result is the area outside every service's regions.
 
     Raises:
         InputError: the route is too long.

@@ -143,6 +143,8 @@ class PlannerKey:
         self._identity = secrets.token_bytes(_GID_BYTES)
 
     def attachment(self, now: int) -> bytes:
-        """Return the attachment of the next speed-limit message, sent at the time `now` [ns]."""
+        """Return the attachment (sequence number, time, identity of the sender) of the next
+        speed-limit message, sent at the time `now` [ns].
+        """
         self._number += 1
         return struct.pack("<qqB", self._number, now, _GID_BYTES) + self._identity

@@ -46,7 +46,9 @@ NOWHERE: Final = -1
 
 
 class MapPrior:
-    """Combination of the map's beliefs with the beliefs of N vehicles' filters."""
+    """Combination of the map's beliefs (probabilities of friction) with the beliefs of the filters
+    of N vehicles.
+    """
 
     def __init__(self, vehicles: int) -> None:
         self._key = np.full(vehicles, NOWHERE)
@@ -59,7 +61,8 @@ class MapPrior:
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
         """Return the indices of the vehicles that entered another place (map cell with heading
-        sector) since the last step. The method `step` needs the map's beliefs about these places.
+        sector) since the last step. For these places, the caller must give the map's beliefs
+        (probabilities of friction) to `step`.
         """
         return np.flatnonzero(keys != self._key).tolist()
 
@@ -70,8 +73,8 @@ class MapPrior:
         visit: FloatArray,
         map_beliefs: dict[int, FloatArray | None],
     ) -> FloatArray:
-        """Return the friction beliefs of the vehicles' filters combined with the map, (N, 32)
-        probabilities.
+        """Combine the friction beliefs of the vehicles' filters with the map; return the results,
+        (N, 32) probabilities.
 
         Args:
             keys: (N,) current place (cell·4 + sector) of each vehicle, NOWHERE where unknown.

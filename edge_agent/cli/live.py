@@ -49,8 +49,9 @@ class LookoutPart:
 
     # `admitted` is unused: warnings need no admission
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002
-        """Pass the vehicles' positions and the friction beliefs of their filters to the lookout
-        (the thread that looks ahead in the map)."""
+        """Pass to the lookout (the thread that looks ahead in the map) the vehicles' positions, and
+        the beliefs of their filters (probabilities of friction).
+        """
         if pipeline.seen is None:
             return
         columns = (column.tolist() for column in pipeline.seen)

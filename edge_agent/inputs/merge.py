@@ -374,8 +374,11 @@ def _row_rate(dense: Mapping[str, Series]) -> float:
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series (recorded signal) sampled at the times `t` (n,) of the log's rows; NaN in
-    rows that have no reading near enough in time.
+    """Return a series (recorded signal) sampled at the times `t` (n,) of the log's rows (samples).
+
+    A dense series is interpolated; the result is NaN in rows without readings near enough in time.
+    A `sparse` series, for example positions, is not interpolated: each reading is written only into
+    the row nearest to its time.
     """
     good = np.isfinite(series.values)
     known = series.t[good]

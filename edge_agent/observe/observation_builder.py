@@ -285,8 +285,9 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
     """Begin a new part of a visit (passage of a map cell), because the friction changed within the
     cell.
 
-    The recorded grip used in the visit is limited to the largest friction that `told`, the
-    likelihood of the ended part, does not exclude.
+    `told` is the log-likelihood of friction from the part that ends. The grip used in that part
+    cannot exceed the largest friction that `told` does not exclude, so that the record of the grip
+    used is limited to this value.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):

@@ -118,9 +118,9 @@ class Pipeline:
         )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return two arrays (N, 32): the current friction beliefs of the estimators, and the
-        likelihoods of the current visits (passages of a map cell) so far. `EstimatorBank.beliefs`
-        describes both.
+        """Return two arrays (N, 32), as described in `EstimatorBank.beliefs`: the estimators'
+        current beliefs (probabilities of friction), and the likelihoods of the measurements in the
+        current visits (passages of a map cell) so far.
         """
         return self._bank.beliefs()
 

@@ -56,8 +56,8 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Return the lowest sequence number of a batch that is still in the outbox, or the next
-        free number if the outbox has no batch of the stream.
+        """Return the lowest sequence number of a batch of this stream that is still in the outbox
+        (store on disk). If there is none, return the next free number.
 
         The search continues where the last one ended, so that each number is skipped only once.
         """
@@ -136,20 +136,22 @@ class HeldBatches:
 
     def has_stream(self, stream: Stream) -> bool:
         """Return True if the index knows the stream (vehicle, start, kind, region): it has had
-        batches since this start, or it has batches of an earlier start in the outbox.
+        batches since this start, or it has batches of an earlier start in the outbox (store on
+        disk).
         """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
         """Return two sequence numbers of a stream (vehicle, start, kind, region): the next free
-        one, and the lowest one of a batch in the outbox.
+        one, and the lowest one of a batch in the outbox (store on disk).
         """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
-        """Return the keys of the batches in the outbox that belong to a stream (vehicle, start,
-        kind, region) and whose sequence numbers lie in one of the inclusive `ranges`.
+        """Return the keys of the batches in the outbox (store on disk) that belong to a stream
+        (vehicle, start, kind, region) and whose sequence numbers lie in one of the inclusive
+        `ranges`.
         """
         sequence = self._streams.get(stream)
         if sequence is None:

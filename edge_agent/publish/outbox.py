@@ -33,8 +33,8 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Batch on disk that no service has settled (finally answered). A `fresh` batch is sent
-    immediately, any other when `due_batches` returns it.
+    """Batch on disk that no service has settled (finally answered). A new batch (`fresh`) is sent
+    immediately. Any other batch is sent when `due_batches` returns it.
     """
 
     key: int
@@ -47,8 +47,10 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records in the outbox's history: stored, settled (finally answered), evicted for
-    lack of space, damaged, or never answered.
+    """Numbers of records that the outbox (store of batches on disk) has handled in this process:
+    stored, settled (finally answered), evicted for lack of space, lost by damage of the file, or
+    given up because the service answers only later ones. `damages` is the number of times that the
+    file was found damaged.
     """
 
     stored: int = 0

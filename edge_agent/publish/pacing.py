@@ -144,8 +144,8 @@ class Pacer:
         self._probe_s = FIRST_PROBE_S
 
     def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
-        """Return the keys of at most `most` batches to send now, oldest first. Keys of batches that
-        are no longer in the outbox (`held` has the keys in it) are dropped.
+        """Return the keys of at most `most` batches to send now, oldest first. Keys that are not in
+        `held`, the batches in the outbox (store on disk), are dropped.
         """
         if self._answered:
             self._answered = False

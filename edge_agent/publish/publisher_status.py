@@ -94,8 +94,8 @@ class PublisherStatus:
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled (finally answered): those in the
-        outbox, also of an earlier start, and those not yet stored.
+        """Return the number of records that no service has settled (finally answered). They are in
+        the outbox (store on disk), also from an earlier start, or not stored yet.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

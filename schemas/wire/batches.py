@@ -35,7 +35,7 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """Head of a batch: the fields other than its records."""
+    """Head of a batch (message with records): the fields other than its records."""
 
     kind: Kind
     vehicle: str
@@ -151,7 +151,8 @@ def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
 
 
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
-    """Decode the bytes of one batch; the inverse of `encode` for every column that was sent.
+    """Decode the bytes of one batch (message with records). For the columns that were sent, this is
+    the inverse of `codec.encode`. Other columns are filled.
 
     Raises:
         WireError: the payload is too large or not the expected message, a required column is

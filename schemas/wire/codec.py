@@ -119,7 +119,7 @@ class Batch:
 
 
 def encode(batch: Batch) -> bytes:
-    """Return the protobuf bytes of a batch.
+    """Return the protobuf bytes of a batch (message with records of one vehicle).
 
     Raises:
         WireError: columns of unequal length, too many records, or a column that the kind does not

@@ -81,8 +81,8 @@ class Relation(NamedTuple):
     If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
     given, the left side also contains an unknown share of right · bend (understeer). This share has
     a prior distribution, because at a single speed understeer cannot be separated from a gain of
-    the steering. `loose` are prior standard deviations of the gains k of the last terms, which are
-    also hard to separate from the main gain.
+    the steering. `loose` are prior standard deviations of the gains k of the last terms, because
+    these gains are also hard to separate from the main gain.
     """
 
     left: FloatArray

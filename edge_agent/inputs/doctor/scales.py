@@ -1,21 +1,22 @@
-"""Search for quantities with a wrong unit, sign or clock: the smallest set of faults that explains
-all identities. An identity is a pair of expressions that are equal by physics, for example the
-measured a_y and the product v·r (speed and yaw rate); see `identities`.
+"""Search for quantities with a wrong unit, sign or clock. The result is the smallest set of faults
+that explains all identities. An identity is a pair of expressions that are equal by physics, for
+example the measured a_y and the product v·r (speed and yaw rate); see `identities`.
 
 The gain of an identity is the slope of its left side over its right side in the recorded drive
-(`Fit.gain`). Without faults it is near the identity's centre, which is about 1 and includes known
-effects such as body roll. Every quantity may be free of faults or have one of a few faults. A fault
-multiplies the recorded value by a factor, for example 57.3 for deg instead of rad. So
+(`Fit.gain`). Without faults, the gain is near the identity's centre. The centre is about 1 and
+includes known effects such as body roll. A fault multiplies the recorded value of a quantity by a
+factor, for example 57.3 for deg instead of rad. So
 
     ln |gain| = ln centre + Σ power · ln |factor| + error      over the quantities of the identity
     sign(gain) = Π sign(factor)
 
-where the power is 1 for a quantity on the left side and -1 on the right side. Each fault costs
-FAULT_COST, twice its negative log probability, because faulty columns are rare (Occam's razor). An
-explanation is a set of faults; its cost is the sum of its faults' costs and of the squared
-normalised errors. Every set of at most two faulty quantities is tried. A quantity is settled (its
-fault is certain) if each explanation that gives it another fault costs at least SETTLED more than
-the best explanation.
+where the power is 1 for a quantity on the left side and -1 on the right side.
+
+An explanation is a set of faults. Its cost is the sum of the costs of its faults and of the squared
+normalised errors. Each fault costs FAULT_COST, twice its negative log probability, because faulty
+columns are rare. Every set of at most two faulty quantities is tried. The fault of a quantity is
+certain if each explanation with another fault of this quantity costs at least SETTLED more than the
+best explanation.
 
 Clocks are treated in the same way: the lag of an identity is the difference between the lags of two
 devices.

@@ -197,11 +197,12 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
 def measure_lags_twice(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
 ) -> dict[str, float]:
-    """Return the lags [s] on which both halves of a drive agree, for devices whose identity
-    (relation to other signals) is valid throughout the drive.
+    """Return the lags [s] of wheels and steering behind the inertial unit on which both halves of a
+    drive agree. A device is left out if its yaw rate does not follow the gyroscope's throughout the
+    drive.
 
-    In a slide, a car responds to its steering later or sooner than the model, and by a different
-    time in each slide. Such a lag is therefore left out.
+    Both tests exclude slides. In a slide, the car turns earlier or later than its steering
+    predicts, by a different time in each slide, so that the lag would be wrong.
     """
     half = len(t) // 2
     whole = find_lags(t, signals, vehicle)
