@@ -148,8 +148,8 @@ def _render_searches(values: dict[str, float]) -> str:
 
 
 def _format_fading(values: dict[str, float]) -> str:
-    """Return a Markdown table of the interval's lower end and of the deceleration [m/s²] that it
-    allows, by weather and time.
+    """Return a Markdown table, by weather and time, of the lower end of a dry road's friction
+    interval and of the deceleration [m/s²] that it allows.
     """
     times = [
         f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in fading.AFTER_MIN

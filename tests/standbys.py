@@ -129,8 +129,8 @@ def open_hosts(
     named: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> Iterator[list[Host]]:
-    """Yield hosts whose services are not yet started, and close them after the block. If `named`,
-    each service has its host's name.
+    """Yield hosts whose services are not yet started, and close them after the `with` block. If
+    `named`, each service has its host's name.
     """
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]

@@ -70,8 +70,8 @@ def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
 
 
 def test_the_old_scale_fails() -> None:
-    """The former palette (red to green) must fail the check of distances: for deuteranopes its dry
-    and snow had the same olive colour.
+    """The former palette (red to green) must fail the check of distances: to deuteranopes its
+    colours for dry road and snow look the same olive.
     """
     snow = to_lab("#b8831b", "deuteranopia")
     dry = to_lab("#1bb83e", "deuteranopia")

@@ -1,5 +1,5 @@
-"""Exhaustive check of the protocol model: every reachable state keeps the promises, and without any
-one of the rules some state breaks a promise.
+"""Exhaustive check of the protocol model (takeover of an archive between services): every reachable
+state keeps the promises, and without any one of the rules some state breaks a promise.
 """
 
 from __future__ import annotations

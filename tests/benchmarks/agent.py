@@ -79,8 +79,8 @@ def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[
 
 
 def measure_start(folder: Path) -> list[Figure]:
-    """Measure the time of `--help`, and of the first estimate of a new process that is set up as
-    `edge-agent run` does and whose compiled code is cached.
+    """Measure two times of a new process: until it has printed `--help`, and until its first
+    estimate. The process is set up as by `edge-agent run`, and its compiled code is cached.
     """
     files = [str(path) for path in simulate_drive(folder, "short", 0, 2.0)]
 
@@ -144,8 +144,8 @@ def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
 
 
 def measure_live(folder: Path, endpoint: str) -> list[Figure]:
-    """Measure the processor time of one vehicle at 100 Hz: the difference of a long and a short
-    run, so that the start is not included.
+    """Measure the processor time of one vehicle at 100 Hz: the difference between a long and a
+    short run, so that the start is not included.
     """
     log, vehicle = simulate_drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (

@@ -1,6 +1,6 @@
-"""`make batch-bench`: work on many files at once. Estimation of drives and rebuilding of a map on
-Spark are compared with the same work in one process, and Iceberg tables with the archive's files.
-It writes .batch/figures.json.
+"""`make batch-bench`: benchmark of work on many files at once. On Spark, drives are estimated and a
+map is rebuilt, and the results are compared with those of one process. Iceberg tables are compared
+with the archive's files. Writes `.batch/figures.json`.
 """
 
 from __future__ import annotations

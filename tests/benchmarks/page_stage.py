@@ -101,8 +101,8 @@ class Town:
         return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
     def change_cells(self, tile: int, cells: int, number: int) -> bytes:
-        """Change `cells` cells of a tile and set its marker to `number`. Return the tile's bytes
-        for publication.
+        """Change `cells` cells of a tile and set its marker (cell that identifies the publication)
+        to `number`. Return the tile's bytes for publication.
         """
         columns = self.tiles[tile]
         which = self.rng.choice(len(columns["cell"]) - 1, cells, replace=False) + 1
@@ -166,8 +166,8 @@ def tiles_of(address: str) -> int:
 
 
 def seen_town(address: str, town: Town) -> str:
-    """Return the address of the page with the whole town in view, zoomed in enough to
-    show cells.
+    """Return the address that opens the page with the whole town in view, zoomed in enough to show
+    cells.
     """
     x, y = town.corner
     return f"{address}#x={x / 2**14:.8f}&y={y / 2**14:.8f}&zoom={ZOOM}"

@@ -142,7 +142,9 @@ class Watch:
 
 
 def part(block: Block, rows: slice) -> Block:
-    """Return a block with those samples of the given block that the slice `rows` selects."""
+    """Return a block (signals of some samples) with only those samples that the slice `rows`
+    selects.
+    """
     return Block(block.t[rows], block.time[rows], block.signals[rows])
 
 

@@ -284,8 +284,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record_arguments(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """Run a live command with a recorded loop. Return the arguments that the loop received:
-    vehicles, names, signals, settings, estimator, duration, and files.
+    """Run a live command with a stub in place of its main loop. Return the arguments that the stub
+    received: vehicles, names, signals, settings, estimator, duration, and files.
     """
     seen: list[object] = []
 
@@ -333,8 +333,8 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
 
 @cache
 def run_search(folder: Path, *words: str) -> tuple[object, list[str]]:
-    """Run a quick search for good memberships (parameters of fuzzy sets). Return the memberships
-    found, scores and budget, and the names of the files that it wrote.
+    """Run a quick search for good memberships (parameters of fuzzy sets). Return its result (the
+    memberships found, scores and budget) and the names of the files that it wrote.
     """
     folder.mkdir(parents=True)
     with contextlib.chdir(folder):

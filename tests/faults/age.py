@@ -94,7 +94,7 @@ def run(site: Site) -> list[Figure]:
 
 def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
     """Generate an archive of `millions` million observations, and return the figures of a service's
-    start from a checkpoint (saved state) and of a query about the past on it.
+    start from a checkpoint (saved state) and of a query about the past, both on this archive.
     """
     root = _ensure_archive(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
     ready, past = _measure_archive(root)

@@ -1,5 +1,5 @@
-"""Attacks on a secured fleet. Each function returns True if the attack succeeded, which no attack
-may do.
+"""Attacks on a secured fleet. Each function returns True if its attack succeeded; on a secured
+fleet all must return False.
 """
 
 from __future__ import annotations

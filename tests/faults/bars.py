@@ -8,7 +8,7 @@ from schemas.runtime.figures import Figure
 
 
 class Bar(NamedTuple):
-    """Target of a figure, with its unit and the side on which the figure must lie."""
+    """Target of a figure, with its unit and the kind of target: upper or lower limit."""
 
     unit: str
     bar: float

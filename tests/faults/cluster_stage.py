@@ -134,8 +134,8 @@ def start_loads(
 
 
 class Asking:
-    """Client that queries a box continuously. A correct answer is complete, or reports that no
-    service serves the box.
+    """Client that continuously queries the map in a box (rectangle of latitude and longitude). A
+    correct answer is complete, or reports that no service serves the box.
 
     Attributes:
         whole: number of answers with everything that was known at the beginning.
@@ -162,8 +162,8 @@ class Asking:
         self._thread.join(PATIENCE_S)
 
     def _read_cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
-        """Return (cell, sector) of each row in the box, and True if the answer reports a missing
-        region.
+        """Return (cell, heading sector) of each row in the box, and True if the answer reports a
+        missing region.
         """
         try:
             answer = map_client.query_map(self._router, {"bbox": self._box})

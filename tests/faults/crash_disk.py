@@ -76,8 +76,8 @@ class CrashDisk:
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Record the content that is durable on the simulated disk of a file that is about to be
-        renamed, removed or replaced.
+        """Before a file is renamed, removed or replaced, record that content of it which is durable
+        on the simulated disk.
         """
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()

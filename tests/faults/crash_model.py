@@ -192,8 +192,9 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
-    """Return the violations (broken promises) found in one simulated history of the outbox, and 0
-    for the number of acknowledged batches, which an outbox does not have.
+    """Return the violations (broken promises) found in one simulated history of the outbox (store
+    of unacknowledged messages), and 0 for the number of acknowledged batches, which an outbox does
+    not have.
     """
     return spool_history(number), 0
 
@@ -215,8 +216,9 @@ def _find_memory_folder() -> str | None:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run 5 000 simulated histories of the log, 500 of the outbox and 600 of a service (in a quick
-    run, 120 in total), and return the figures.
+    """Run 5 000 simulated histories of the log (writer of new rows), 500 of the outbox (store of
+    unacknowledged messages) and 600 of a service (in a quick run, 120 in total), and return the
+    figures.
     """
     logs = site.choose_amount(5000, 100)
     outboxes = site.choose_amount(500, 10)

@@ -5,9 +5,9 @@ with a bar (target). A figure that only describes the load (kills, rates) is a `
 bar. To add a campaign, write `tests/faults/NAME.py` with `def run(site: Site) -> list[Figure]`, and
 add its name to `campaigns.py` with the figures that it must return.
 
-`make check` runs the campaigns with `quick`: seconds, the same mechanism, smaller numbers. A
-missing required figure is a failure. If a campaign raises an error, the run ends with its
-traceback, because its measurements are unknown.
+`make check` runs the campaigns in their quick form, which takes seconds: the mechanism is the same,
+but the numbers are smaller. A missing required figure is a failure. If a campaign raises an error,
+the run ends with its traceback, because its measurements are unknown.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Site:
 
 
 class Campaign(NamedTuple):
-    """Campaign by name, with the figures that it must return; a figure may be marked as left out of
-    quick runs.
+    """Name of a campaign, and the figures that the campaign must return. A figure may be marked as
+    absent in quick runs.
     """
 
     name: str

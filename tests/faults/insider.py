@@ -161,7 +161,7 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
     """Return a batch of the insider with visits to fifty random cells within `degrees` of the road.
-    Its region is that of the first cell.
+    The region of the batch is that of its first cell.
     """
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)

@@ -238,8 +238,8 @@ class VirtualBucket:
         self._request(lambda: self.objects.__setitem__(name, content))
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object in the simulated bucket. Return False if one with other content exists;
-        so a repeated request succeeds.
+        """Create an object in the simulated bucket. Return False if an object of this name with
+        other content exists. A repeated request with the same content succeeds.
         """
         return bool(self._request(lambda: self.objects.setdefault(name, content) == content))
 
@@ -263,7 +263,8 @@ class VirtualBucket:
 
 
 class ServiceHistory:
-    """Simulation of three services that compete for the lease of one archive; call `run` once.
+    """Simulation of three services that compete for the lease (exclusive ownership) of one archive;
+    call `run` once.
 
     Attributes:
         events: events in the order of true time.
@@ -375,7 +376,7 @@ class ServiceHistory:
         return set(batches)
 
     def _accept_batch(self, lease: Lease, known: set[int]) -> None:
-        """Upload a batch that a simulated vehicle offers to the bucket, and acknowledge it if the
+        """Upload to the bucket a batch that a simulated vehicle offers, and acknowledge it if the
         service's lease allows this.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))

@@ -232,7 +232,8 @@ def change_address(
     and the longest gap [s] between received messages.
 
     A router with a rate limit (`capped`) drops a message that arrives within 10 ms of the previous
-    one. Then timing jitter of a busy machine would count as loss of the link.
+    one. With this limit, timing jitter of a busy machine would count as loss of the link, so it is
+    off by default.
     """
     with open_namespaces(site.folder / f"address-{protocol}-{capped}") as there:
         there.start_router(capped=capped)
@@ -329,8 +330,8 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
 
 def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, float]:
     """Let one car send as many messages as it can. Return the p99 delay of the other cars' messages
-    during this flood divided by that before it, and the rate at which messages of the flooding car
-    passed the router [1/s]. `capped` is True if the router limits message rates.
+    during this flood divided by their delay before it, and the rate at which messages of the
+    flooding car passed the router [1/s]. `capped` is True if the router limits message rates.
     """
     with open_namespaces(site.folder / f"flood-{capped}") as there:
         there.start_router(capped=capped)

@@ -1,8 +1,8 @@
 """Campaign on expensive queries: two readers query the whole map as GeoJSON in a loop, and the
 waiting time of a third reader that queries one tile is measured.
 
-The service runs in a separate process, and its map is filled before. The readers are threads of
-other processes.
+The service runs in a separate process, and its map is filled before the queries. The readers are
+threads of other processes.
 """
 
 from __future__ import annotations

@@ -52,7 +52,8 @@ def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
     """Return the growth of a process's memory [MB per 10 min]: the slope of a line through the
     minimum of each minute.
 
-    Within a minute memory rises and falls because of writing to disk, compactions and queries.
+    Within a minute memory rises and falls because of writing to disk, compactions and queries; the
+    minima show the lasting growth.
     """
     minute = (times // 60.0).astype(int)
     least = np.array([megabytes[minute == m].min() for m in np.unique(minute)])

@@ -139,8 +139,8 @@ def test_limits_that_are_written_in_words_are_those_of_the_code() -> None:
 
 
 def table_of_ranges() -> str:
-    """Return the README's table of the ranges of a report's columns, from the tables of the
-    contract.
+    """Return the README's table of the ranges of a report's columns, computed from the tables of
+    the contract (`schemas`).
     """
     lines = ["| column | unit | range |", "|---|---|---|"]
     fields = {

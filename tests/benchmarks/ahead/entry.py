@@ -1,5 +1,5 @@
-"""Benefit and risk of the map as a prior: error when a vehicle enters a cell, delay caused by a
-wrong map, and effect on published records.
+"""Benefit and risk of the map as a prior of the friction estimate: error when a vehicle enters a
+cell, delay caused by a wrong map, and effect on published records.
 
 The default estimator drives through random towns, and its beliefs and likelihoods are recorded ten
 times a second. The maps are applied afterwards, because the filter itself never uses a map. The
@@ -144,8 +144,8 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Return pairs of times [s] until the estimate is right, with and without the map; one pair per
-    stretch where the map is wrong.
+    """Return pairs of times [s] until the estimate is right, with and without the wrong map `wrong`
+    as a prior; one pair per stretch where it differs from `right`.
 
     A time is counted from the entry of the stretch until the estimate differs by at most ARRIVED
     from the true friction; if it never does, the time spent on the stretch counts.

@@ -23,7 +23,7 @@ from schemas.wire import Alert
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
     """Return the payload of a map tile in the form that a service sends, with the cells `key`
-    (cell·4 + sector) and their friction; `changes` replace columns of the table.
+    (cell·4 + heading sector) and their friction; `changes` replace columns of the tile's table.
     """
     n = len(key)
     mu = np.broadcast_to(friction, len(key))
@@ -64,8 +64,8 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 @dataclass
 class MadeUpService:
-    """Simulated service with places of known friction (`mu` by cell·4 + sector) and active alerts;
-    it records the queries.
+    """Simulated service with places of known friction (`mu` by cell·4 + heading sector) and active
+    alerts; it records the queries.
 
     The places were observed at the time `now`. With `kept`, its answers always state the ages that
     the places had at `now`, like a store that repeats old messages.
@@ -102,7 +102,7 @@ class MadeUpService:
         )
 
     def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
-        """Return the answer to a query for map places (cell·4 + sector) of a tile, with the
+        """Return the answer to a query for map places (cell·4 + heading sector) of a tile, with the
         friction values `mu`.
         """
         age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS

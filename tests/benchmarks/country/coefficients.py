@@ -2,7 +2,8 @@
 an engine (service without network) in a separate process.
 
 Each run ingests the same number of observations, in messages that differ only in the varied
-quantity. Therefore the window of late observations has the same size in all runs.
+quantity. Therefore the memory that the service keeps for late observations has the same size in all
+runs.
 """
 
 from __future__ import annotations
@@ -78,7 +79,9 @@ def _make_stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Ingest simulated messages of the given kind, and print the memory that it added [bytes]."""
+    """Let a service ingest simulated messages of the given kind, and print the memory that they
+    added [bytes].
+    """
     sent = _make_stream(kind)
     with (
         tempfile.TemporaryDirectory() as folder,

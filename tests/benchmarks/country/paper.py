@@ -1,5 +1,5 @@
-"""Extrapolation to ten times the vehicles: the country's measured costs, multiplied by the expected
-numbers of observations and cells.
+"""Extrapolation from the simulated country to ten times as many vehicles: the country's measured
+costs, multiplied by the expected numbers of observations and cells.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def drive_at(t: float) -> dict[str, float]:
 
 
 def profile_of(kind: str) -> Profile:
-    """Return the profile that maps the signals of a test sender ("peer"). For a databroker it is
-    the shipped profile.
+    """Return the profile (assignment of signals to channels) of a test sender ("peer"). For a
+    databroker it is the shipped profile.
     """
     if kind == "can":
         return Profile(

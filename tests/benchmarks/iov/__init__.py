@@ -1,3 +1,3 @@
-"""Benchmarks of interfaces for the Internet of Vehicles: DENM messages at an interchange, and
-routes around ice.
+"""Benchmarks of interfaces for the Internet of Vehicles: DENM (hazard messages) at an interchange,
+and routes around ice.
 """

@@ -1,5 +1,5 @@
-"""Benchmark of DENM for many events through an interchange: validity checked by a second decoder,
-constant event numbers after restarts, and message rate.
+"""Benchmark of DENM (hazard messages) for many events through an interchange: validity checked by a
+second decoder, constant event numbers after restarts, and message rate.
 """
 
 from __future__ import annotations
@@ -159,8 +159,8 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
 
 
 def _encode_speedup(bodies: list[bytes]) -> float:
-    """Return the processor time in which the library asn1tools encodes these DENM, divided by that
-    of our encoder.
+    """Return the processor time in which the library asn1tools encodes these DENM (hazard
+    messages), divided by that of our encoder.
     """
     general = compiled_denm()
     contents = [general.decode("DENM", body) for body in bodies]

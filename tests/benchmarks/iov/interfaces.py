@@ -1,5 +1,6 @@
-"""Benchmarks of three interfaces: foreign DENM that report ice where there is none, the Kuksa
-provider with a server of the published protocol, and readers of MCAP files.
+"""Benchmarks of three interfaces: foreign DENM (hazard messages of other parties) that report ice
+where there is none, the Kuksa provider with a server of the published protocol, and readers of MCAP
+files.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def cells(
     key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
     """Return cells in the form in which a car receives them; all have the friction `mu` with an
-    interval of ± `width`.
+    interval of ± `width`. `basis` is the kind of evidence, such as MEASURED.
     """
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)

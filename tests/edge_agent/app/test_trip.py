@@ -36,9 +36,9 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Pass a drive through a trip, and wait for the result of the signal doctor (a check for sensor
-    faults). Return two lists with one item per block of samples: True if its records may be
-    published, and the block that the estimator received.
+    """Pass the samples of a recorded drive through a live trip, and wait for the result of the
+    signal doctor (a check for sensor faults). Return two lists with one item per block of samples:
+    True if its records may be published, and the block that the estimator received.
     """
     admitted = []
     blocks = []

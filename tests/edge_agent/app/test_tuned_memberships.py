@@ -60,7 +60,9 @@ def test_memberships_and_provenance_survive_the_way_through_a_file(tmp_path: Pat
 
 
 def broken(change: Change) -> str:
-    """Return the text of a file of tuned memberships after `change` has made it invalid."""
+    """Return the text of a file of tuned memberships (parameters of fuzzy sets) after `change` has
+    made it invalid.
+    """
     spoiled = document()
     change(spoiled)
     return json.dumps(spoiled)

@@ -33,7 +33,7 @@ def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (n,) and covariance (n, n) after one step of the textbook Kalman filter with the
-    measurement `z`, which computes with full covariances.
+    measurement `z`. The textbook filter computes with full covariances, not with their factors.
     """
     f, q, h, noise = system
     mean = f @ mean

@@ -189,7 +189,7 @@ def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (2,) and covariance (2, 2) after one step of the cubature filter with full
-    covariances, for the pendulum below.
+    covariances, for the pendulum of `swing` and `look`.
     """
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)

@@ -168,7 +168,7 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     """Braking on dry road before a cell must not count as grip on the ice in this cell. The
     estimator reports the largest grip of the last second, and at 14 m/s a car crosses a cell in
-    less time.
+    less time, so this value may belong to the cell before.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4

@@ -1,4 +1,4 @@
-"""Tests of HTML maps of answers in a real browser, used by mouse, touch and keyboard."""
+"""Tests that HTML maps of answers work in a real browser with mouse, touch and keyboard."""
 
 from __future__ import annotations
 

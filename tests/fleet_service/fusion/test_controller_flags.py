@@ -1,5 +1,5 @@
 """Tests of slip-controller flags: they support an alert but change no belief, and count only if the
-vehicle's earlier flags agreed with values of other vehicles.
+vehicle's earlier flags agreed with friction values of other vehicles.
 """
 
 from __future__ import annotations

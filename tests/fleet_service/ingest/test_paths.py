@@ -1,5 +1,5 @@
-"""Tests that a vehicle's path is checked over rows, batches, boots and regions, in any order of
-arrival.
+"""Tests of the check for impossible positions: a vehicle's path is followed over rows, batches,
+boots (starts of its agent) and regions, in any order of arrival.
 """
 
 from __future__ import annotations

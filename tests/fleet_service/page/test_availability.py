@@ -196,7 +196,9 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
 
 
 def test_web_server_sends_each_part_of_an_answer_at_once() -> None:
-    """TCP_NODELAY must be set, else each answer waits up to 40 ms for an acknowledgement."""
+    """TCP_NODELAY must be set. Otherwise each part of an answer waits up to 40 ms for the
+    acknowledgement of the previous part.
+    """
 
     async def accept() -> int:
         accepted: asyncio.Future[int] = asyncio.get_running_loop().create_future()

@@ -127,8 +127,8 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
     """The file's picture must be visible below the map, enlarged beyond the file's deepest zoom
-    level. At low zoom levels no tile of the file may be requested, and never anything from another
-    host.
+    level. At low zoom levels the page must request no tile of the file, and at no level anything
+    from another host.
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,

@@ -31,8 +31,8 @@ DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
 
 
 def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the colours in order of danger: ice, snow, rather slippery, wet, rather not slippery,
-    good grip.
+    """Return six colours in order of danger: ice, snow, rather slippery, wet, rather not slippery,
+    good grip. The two "rather" classes come from `two`, the others from `four`.
     """
     return (four[0], four[1], two[0], four[2], two[1], four[3])
 

@@ -166,7 +166,7 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
     """The state restored from a checkpoint (saved state), or from the log alone, must equal that of
-    the running service. Reports before the checkpoint are late and unordered.
+    the running service. In the test, some reports before the checkpoint are late and out of order.
     """
     rng = np.random.default_rng(3)
     now = time.time_ns()

@@ -121,8 +121,8 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """If a vehicle passes a public cell once more, the times and counts that readers see must not
-    change; they are rounded for this purpose.
+    """If a vehicle passes a public cell (one that readers may see) once more, the times and counts
+    that readers see must not change; they are rounded for this purpose.
     """
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
@@ -207,8 +207,8 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
 
 @pytest.mark.parametrize("basis", ["checkpoint", "log"])
 def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
-    """After a restart, a lone vehicle must not appear in a public cell, and must not complete
-    another cell's count of vehicles.
+    """After a restart, a lone vehicle must not become visible in a public cell (one that readers
+    may see), and must not be the vehicle that makes another cell public.
     """
     beside: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002],

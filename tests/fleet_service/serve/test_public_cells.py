@@ -1,5 +1,5 @@
-"""Tests of privacy: a lone vehicle changes nothing that readers can see, except a change towards
-slippery.
+"""Tests of privacy: a lone vehicle changes nothing that readers can see, except that it may make a
+cell look more slippery.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that install hints name the source of this distribution, because it is not in a package
-index.
+"""Tests that hints on installing an extra name the source of this distribution. Its name alone
+would not work, because it is not in a package index.
 """
 
 from __future__ import annotations

@@ -235,8 +235,8 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
-    """An estimator computes the force from J ω̇ = T − R F_x. Therefore the integrator must not add
-    to the inertia J, even at low speed.
+    """An estimator computes the tyre force F_x from J ω̇ = T − R F_x. A larger inertia J in the
+    simulation would make this force wrong, so the integrator must not add to J, even at low speed.
     """
     vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     for speed in (4.0, 20.0):

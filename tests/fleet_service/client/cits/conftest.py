@@ -1,5 +1,5 @@
-"""Skips the tests of C-ITS if the extra `cits` is not installed: python-qpid-proton needs a C
-compiler.
+"""Skip the tests of C-ITS (interfaces for cooperative vehicles) if the extra `cits` is not
+installed. It is optional, because its package python-qpid-proton needs a C compiler.
 """
 
 from __future__ import annotations
