@@ -41,7 +41,7 @@ class LowerVertices:
     Attributes:
         feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
             [1]; 1 means up to the peak.
-        out_feet: the same for the output sets.
+        out_feet: these shares for the output sets.
         peaks: upper vertices of the sets of the mismatch [1].
         out_peaks: upper vertices of the output sets [nat].
 

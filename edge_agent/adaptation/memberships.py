@@ -7,15 +7,15 @@ Legend
     inputs      peaks of the five triangular sets: much smaller, smaller, equal, larger, much larger
                 (5,)
     outputs     ln of the multiplier on R for each set [nat] (5,)
-    ln_scales   ln of the nominal R relative to the table of constants: wheel speed rows, axle rows
-                [nat] (2,)
+    ln_scales   ln of the nominal R relative to the table of constants: for wheel speeds and for
+                axle forces [nat] (2,)
 
 Rules of the default estimator (`rule_base.py`): `far` is a ramp (foot, peak), the others are
 consequents of rules.
 
     far         mismatches at which the membership in FAR (beyond theory) begins and is complete [1]
-    consequents ln of the axles' R where steering is WIDE [nat]; rate at which offsets, slope and
-                bank return to their prior where the wheels are FAR [1/s]
+    consequents ln of the axles' R while steering is WIDE [nat]; rate at which offsets, slope and
+                bank return to their prior while the mismatch of the wheels is FAR [1/s]
     shares      ln of the share of a block's evidence on friction that is used, in the order: a
                 wheel slides (no, yes), demand (low, middle, high), forces (as before, new) [nat]
                 (12,)
@@ -156,8 +156,8 @@ class Memberships:
         """Convert the vector (30,) of an optimiser to memberships (fuzzy sets). The vector must lie
         within `bounds`.
 
-        Inputs and outputs are sorted, so that every such vector is valid. A vector (12,) contains
-        only the fields up to `ln_scales`; the other fields keep their untuned values.
+        Inputs and outputs are sorted, so every vector within the bounds is valid. A vector (12,)
+        contains only the fields up to `ln_scales`; the other fields keep their untuned values.
         """
         v = np.asarray(vector, float)
         if v.shape == (NOISE,):

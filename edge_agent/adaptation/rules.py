@@ -1,5 +1,5 @@
-"""Fuzzy inference with two inputs: a table of rules over the mismatch of the innovations and its
-rate (paper 001).
+"""Fuzzy inference with two inputs, the mismatch of the innovations and its rate, by a table of
+rules (paper 001).
 
 Legend
     alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the

@@ -21,9 +21,11 @@ from schemas.runtime.jit import compiled
 def planar_accelerations(
     row: FloatArray, force_x: FloatArray, force_y: FloatArray, delta: FloatArray
 ) -> tuple[float, float, float]:
-    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the body.
+    """Return the accelerations (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the body that the
+    wheel forces cause.
 
-    force_x and force_y [N] and delta [rad] have shape (4,).
+    The wheel forces `force_x` and `force_y` [N] and the road-wheel angles `delta` [rad] have shape
+    (4,).
     """
     total_x = total_y = moment = 0.0
     for wheel in range(4):

@@ -44,7 +44,8 @@ def _wheel_slips(
     """Return the (longitudinal, lateral) slips of a wheel.
 
     `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes; `cos` and `sin` are
-    those of the steering angle. A wheel with unknown speed (NaN) has no longitudinal slip.
+    cosine and sine of the steering angle. A wheel with unknown speed (NaN) has no longitudinal
+    slip.
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
@@ -129,8 +130,8 @@ class WheelInputs(NamedTuple):
 def planar_response(
     body: Body, motion: PlanarMotion, wheels: WheelInputs
 ) -> tuple[float, float, float]:
-    """Return (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) that result from the forces of four
-    Dugoff tyres.
+    """Return the accelerations (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the body that the
+    forces of four Dugoff tyres cause.
 
     The code is written out per wheel with scalars instead of arrays, because the papers' filters
     spend most of their time here.

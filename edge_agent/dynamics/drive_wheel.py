@@ -74,8 +74,8 @@ def blend_forces(
     share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray
 ) -> None:
     """Fill `out` (4,) with the compensated wheel forces [N] by equation (33) of paper 002:
-    share*model + (1 - share)*observed. `model` (4,) are forces of a tyre model, `observed` (4,)
-    those of an observer.
+    share*model + (1 - share)*observed. `model` (4,) are the forces of a tyre model, and `observed`
+    (4,) the forces that an observer (filter) estimates.
     """
     for wheel in range(4):
         out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

@@ -77,7 +77,7 @@ class EstimatorBank:
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
             closes: (T, N), True at the first sample of a new visit (the passage of one map cell);
                 None: the bank does not separate visits.
-            threads: number of threads that share the vehicles; changes no bit of the result.
+            threads: number of threads that share the vehicles; the result does not depend on it.
 
         Returns:
             Estimates at the same samples. Only `evidence` contains NaN, namely at all samples at

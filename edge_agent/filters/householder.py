@@ -29,8 +29,8 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 @compiled
 def triangularize(a: FloatArray, rows: int, columns: int) -> None:
-    """Replace a[:rows, :columns] by its lower-triangular factor, which has the same product a*a'
-    and no negative element on the diagonal.
+    """Replace a[:rows, :columns] in place by its lower-triangular factor L with L*L' = a*a' and no
+    negative element on the diagonal.
 
     The method is Householder reflections from the right; entries right of the diagonal become zero.
     Requires columns >= rows.
@@ -72,8 +72,8 @@ def predict(
     """Compute mean (n,) and root of the covariance, sqrt_cov (n, n), of propagated points (points,
     n). Process noise with the covariance root `sqrt_noise` (n, n) is added.
 
-    `weights` (points,) are those of the points for the mean and for the covariance. `work` is
-    scratch memory, (n, points + n) or larger.
+    `weights` are two arrays (points,): weights of the points for the mean, and for the covariance.
+    `work` is scratch memory, (n, points + n) or larger.
     """
     count, n = points.shape
     w_mean, w_cov = weights
@@ -110,13 +110,14 @@ def update(
     (measured minus predicted) is NaN are skipped.
 
     Args:
-        mean: state's mean (n,), changed. sqrt_cov: L, (n, n), root of its covariance, changed.
-        state_deviations: X, (n, points), of the sigma points from the mean. measurement: deviations
-            Z of the predicted readings, innovation nu, noise r.
+        mean: mean m (n,) of the state, changed.
+        sqrt_cov: root L (n, n) of the state's covariance, changed.
+        state_deviations: deviations X (n, points) of the sigma points from the mean.
+        measurement: deviations Z of the predicted readings, innovation nu, and noise r.
         work: scratch memory (k + n, points + k) or larger.
 
     Returns:
-        number of rows used, log-likelihood of the innovation [nat], and nu' S^-1 nu (normalised
+        number of measurements used, log-likelihood of the innovation [nat], and nu' S^-1 nu (normalised
         squared innovation).
 
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].

@@ -33,7 +33,7 @@ def write_motion(
     """Write velocity [m/s], yaw rate [rad/s] and sideslip [rad] with their standard deviations to
     `output`, the estimates of one sample.
 
-    `motion` is v_x, v_y [m/s] and yaw rate [rad/s]; `variances` are theirs.
+    `motion` is v_x, v_y [m/s] and yaw rate [rad/s]; `variances` are the variances of these three.
     """
     vx, vy, yaw_rate = motion
     var_x, var_y, var_rate = variances

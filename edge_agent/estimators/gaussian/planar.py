@@ -4,7 +4,7 @@ integrated by Heun's rule.
 State [v_x, v_y, a_x, a_y, r, z]. Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y,
 v_y' = a_y - r*v_x (004 prints the wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y
 follow from the forces. z is friction (004) or the yaw acceleration (000, 001). The papers use the
-moment itself as state; divided by I_z it has the same magnitude as the other states.
+yaw moment as state. Here it is divided by I_z, so that all states are of similar magnitude.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def propagate_points(
 ) -> None:
     """Advance the states in the columns (6, POINTS), one per cubature point, by one step, in place.
 
-    Inputs change linearly from the previous sample to this one. `step` selects the source of the
-    longitudinal forces. With `by_torque`, longitudinal forces come from the wheels' torque, z is
-    the yaw acceleration, and friction (4,) is given. The velocity is then integrated from the
+    Inputs change linearly from the previous sample to the current sample. `step` selects the source
+    of the longitudinal forces. With `by_torque`, longitudinal forces come from the wheels' torque,
+    z is the yaw acceleration, and friction (4,) is given. The velocity is then integrated from the
     states a_x and a_y alone; the measurements correct these states for drag and slopes. Without
     `by_torque`, forces come from slip and z is the friction of all wheels. With `by_motor`,
     longitudinal forces come from the torque of each axle's motor, half to each wheel; z is still
@@ -186,7 +186,7 @@ def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
 @inlined
 def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
     """Return the inputs of the wheels (steering, speed, force, friction) interpolated between the
-    previous sample (`share` 0) and this sample (`share` 1).
+    previous sample (`share` 0) and the current sample (`share` 1).
     """
     before = track.inputs_before
     use = track.inputs

@@ -131,8 +131,8 @@ def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
 
 
 def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
-    """Return a batch with `count` copies of the one drive in `batch`, to which different noise can
-    be added.
+    """Return a batch with `count` copies of the drive in `batch`, which must contain a single
+    drive. Different noise can then be added to the copies.
     """
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
     return DriveSet(

@@ -64,8 +64,8 @@ class DetectionTown(NamedTuple):
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign. Towns with short and with long drives have different seeds;
-    towns with accurate and with inaccurate cars have the same seeds.
+    """Return the towns of the campaign. Towns with short drives have other seeds than towns with
+    long drives. For both kinds of cars, accurate and inaccurate, the seeds are equal.
 
     Towns with an odd seed are winter towns.
     """

@@ -1,10 +1,10 @@
 """Best possible accuracy with these sensors for two targets of the papers, computed by an oracle
 (an ideal observer) that knows almost everything.
 
-An oracle is a Bayesian estimator that gets the same noisy readings, and the true value of
-everything that is not listed as unknown. Its unknowns are those that the vehicle file and the data
-sheet leave open. Everything is linearised around the true values, so its estimate is least squares
-with a Gaussian prior.
+An oracle is a Bayesian estimator that gets the noisy readings of the sensors, and the true value of
+everything that is not listed as unknown. Unknown are the quantities that the vehicle file and the
+sensors' data sheet leave open. The equations are linearised around the true values, so the oracle's
+estimate is least squares with a Gaussian prior.
 
 `speed`: v_x of an accelerating sine. The oracle gets the wheel speeds without noise: W = (1 + ρ) v.
 

@@ -150,7 +150,7 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 
 
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
-    """Run the filter with these tables (`design`) on the drives. Return its mean interval score of
+    """Run the filter with the tables `design` on the drives. Return the mean interval score of
     friction over all drives ("all"), and over the samples of each surface (NaN if a surface does
     not occur).
     """

@@ -55,7 +55,7 @@ class WarnedDrivers:
         self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
     def listens(self, k: int) -> bool:
-        """Return True if the driver of vehicle k belongs to those who receive warnings."""
+        """Return True if the driver of vehicle k receives warnings."""
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:

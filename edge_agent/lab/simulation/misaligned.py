@@ -85,8 +85,8 @@ class Misaligned(IntEnum):
 
 
 def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
-    """Return the sensor errors of vehicle `index`, shape (COLUMNS,), with the columns of
-    `Misaligned`.
+    """Draw the sensor errors of vehicle `index` at random from `seed`; return them as an array
+    (COLUMNS,) with the columns of `Misaligned`.
     """
     key = key_of(seed, index, MOUNT_STREAM)
     row = np.zeros(COLUMNS)

@@ -325,8 +325,8 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
     a mean road-wheel angle [rad] and a demanded longitudinal force [N].
 
     The steered wheels follow Ackermann geometry: their axes meet at one point on the line of the
-    rear axle. If the rear wheels steer too, `steer` is the angle of a car without rear steering on
-    the same circle, and the front wheels turn more or less than that.
+    rear axle. If the rear wheels steer too, `steer` is the angle that a car without rear steering
+    would need on the same circle. The front wheels then turn by another angle.
     """
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     curvature = math.tan(steer) / base

@@ -248,8 +248,8 @@ def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:
-    """Return vehicle number `index` of a fleet. The presets are used in turn, each with random
-    load, tyres and suspension.
+    """Return vehicle number `index` of a fleet. The presets are used one after the other; load,
+    tyres and suspension of each vehicle are random.
     """
     base = list(PRESETS.values())[index % len(PRESETS)]
     extra = rng.uniform(0.0, 0.12)  # passengers and luggage
@@ -275,7 +275,8 @@ def winter_equipped(truth: TrueVehicle, rng: np.random.Generator) -> TrueVehicle
     cycles, in most cases traction control and ESC, and drag torque when the accelerator is
     released.
 
-    A third of the vehicles regenerate like electric cars; the others have the drag of an engine.
+    A third of the vehicles recover energy like electric cars when the accelerator is released; the
+    others are slowed by the drag of an engine.
     """
     electric = rng.uniform() < 1.0 / 3.0
     return replace(

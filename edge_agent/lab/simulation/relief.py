@@ -110,8 +110,9 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
 def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
-    """Return ∇h (east, north) at `place` (x, y) [m], for a road that rises by `left` [1] to the
-    left of the direction `heading` (cos, sin).
+    """Return the slope of the road at `place` (x, y) [m] as the gradient of its height: rise per
+    metre east and per metre north [1]. The road rises by `left` [1] to the left of the direction
+    `heading` (cos, sin).
     """
     east = -left * heading[1]
     north = left * heading[0]

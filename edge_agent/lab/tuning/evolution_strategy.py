@@ -26,8 +26,9 @@ def optimise(
 ) -> Result:
     """Search for the vector with the largest objective, and return the best one found.
 
-    The search evaluates ants·iterations vectors one after the other. The two numbers only set this
-    total; the names are those of the ant colonies, so that all searches can be called alike.
+    The search evaluates ants·iterations vectors one after the other. It has no ants: the two
+    arguments only set this total, and have these names so that all search methods can be called
+    alike.
     """
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)

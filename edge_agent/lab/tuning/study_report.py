@@ -182,8 +182,8 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 def scores(done: Study, way: str) -> dict[str, Score]:
     """Return the scores that the file of tuned memberships (fuzzy sets) states, for the search
-    drives and for the held-out drives. They are those of the best memberships found by the kind of
-    search `way`, averaged over all conditions of the measurement noise R.
+    drives and for the held-out drives. They are the scores of the best memberships found by the
+    kind of search `way`, averaged over all conditions of the measurement noise R.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):

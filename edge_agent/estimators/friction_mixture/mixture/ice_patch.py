@@ -34,8 +34,9 @@ def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) ->
 
 @compiled
 def shrink_patches(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) -> None:
-    """Reduce the patch probabilities (PATCH_NODES,) of those ice hypotheses that explain the
-    measurements of the block (0.05 s) worse than the mixture of all nodes (K,) does.
+    """Reduce the probabilities `patch` (PATCH_NODES,) that the car is on an ice patch, for those
+    ice hypotheses that explain the measurements of the block (0.05 s) worse than the whole mixture
+    of nodes (K,) does.
     """
     usual = 0.0
     for j in range(weight.shape[0]):

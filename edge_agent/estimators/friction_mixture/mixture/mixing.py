@@ -63,8 +63,8 @@ def active_nodes(memory: MixtureMemory) -> int:
 
 @compiled
 def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Activate the nodes of split roads (different friction left and right) at the first sign of
-    such a road, and deactivate them once they are improbable.
+    """Activate the nodes of split roads (hypotheses with different friction left and right) at the
+    first sign of a split road, and deactivate them once they are improbable.
     """
     weight = memory.weight
     visit = memory.visit_weight

@@ -344,8 +344,8 @@ def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
 
 @inlined
 def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Subtract from the state covariances the part that the measurements explain: h*h'*gain for
-    each measurement, with its covariance h with the states.
+    """Subtract from the state covariances the part that the measurements explain. It is h*h'*gain
+    for each measurement, where h is the covariance of the states with it.
     """
     for i in range(STATES):
         for r in range(ROWS):
