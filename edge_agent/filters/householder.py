@@ -117,8 +117,8 @@ def update(
         work: scratch memory (k + n, points + k) or larger.
 
     Returns:
-        number of measurements used, log-likelihood of the innovation [nat], and nu' S^-1 nu (normalised
-        squared innovation).
+        number of measurements used, log-likelihood of the innovation [nat], and nu' S^-1 nu
+        (normalised squared innovation).
 
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
     """
