@@ -1,8 +1,8 @@
 """`fleet-service cits`: exchange hazard messages with cooperative ITS until a signal arrives.
 
 Alerts are sent as DENM (Decentralized Environmental Notification Messages) to an AMQP 1.0
-interchange. DENM from others count as reports of one vehicle. Messages are not signed: that is the
-gateway's task.
+interchange. DENM from others count as reports of one vehicle. Messages are not signed here; the
+operator's own gateway must sign them.
 """
 
 from __future__ import annotations

@@ -146,8 +146,8 @@ def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
 
 
 def _route_costs(arguments: argparse.Namespace) -> int:
-    """Write a file that makes a route planner avoid roads with low friction, from the live map and
-    a road network.
+    """Write a file, computed from the live map and a road network, that makes a route planner avoid
+    roads with low friction.
     """
     from fleet_service.analytics.roads.network import read_network
     from fleet_service.client import map_client, routing

@@ -279,8 +279,9 @@ class BatchIntake:
                 del known[name]
 
     def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Return a mask of batches (n,): True if the batch's time is in a time range whose data
-        were erased for all vehicles, or for this vehicle.
+        """Return a mask of batches (n,), True for a batch (message with records) that must be
+        refused because data of its time were erased: the data of all vehicles, or those of the
+        vehicle that sent the batch.
         """
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:

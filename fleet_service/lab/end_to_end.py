@@ -177,8 +177,8 @@ def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, 
 
 
 def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
-    """Return the mean of the measured values, or NaN if there are none, because a figure that was
-    not measured must miss its target.
+    """Return the mean of the measured values, or NaN if there are none. A figure that is NaN misses
+    its target.
     """
     return float(values.mean()) if len(values) else float("nan")
 

@@ -1,18 +1,18 @@
-"""Errors of the real estimator: its reports on simulated drives, resampled for the visits (passages
-of cells) of a town. Pure (no I/O).
+"""Simulated visits (passages of cells) in a town whose reports have the errors of the real
+estimator. They are drawn from its reports on simulated drives. Pure (no I/O).
 
 The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
-errors that persist in it (offsets, a tilted sensor, tyres). Each of its visits gets the report of a
-visit that this vehicle made on a road with nearly the same friction. Both visits are "excited"
-(enough grip was used to measure the friction), or neither is:
+errors that persist in this vehicle (offsets, a tilted sensor, tyres). Each visit in the town gets
+the report of a visit that the vehicle of the drives made on a road with nearly the same friction.
+Both visits are "excited" (enough grip was used to measure the friction), or neither is:
 
     μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
              forces scale with the grip; the log-likelihood ℓ(x) becomes ℓ(x/c)
 
-A pass over the border of two surfaces is drawn like any other. Each visit is drawn separately, so
-an error that all vehicles share in one place does not occur here. The evaluation of complete drives
+A visit at the border of two surfaces is drawn like any other. Each visit is drawn separately, so an
+error that all vehicles share in one place does not occur here. The evaluation of complete drives
 (`end_to_end`) includes such errors.
 """
 

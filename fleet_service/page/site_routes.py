@@ -58,7 +58,7 @@ class SiteRoutes:
         return found
 
     async def settings(self, _: Request) -> Response:
-        """Return the constants and colours that the page's scripts need as JSON."""
+        """Return, as JSON, the constants and colours that the page's scripts need."""
         base = self._of.base_map
         return JSONResponse(
             {

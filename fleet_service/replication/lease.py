@@ -174,8 +174,8 @@ class Lease:
 
     @property
     def term(self) -> Term:
-        """Return the number of the lease (1 for the first owner of the archive), and the epoch, a
-        number in this owner's file names.
+        """Return the number of the lease (1 for the first owner of the archive), and the epoch,
+        which is a number in the names of this owner's files.
         """
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 

@@ -74,7 +74,7 @@ class Answering(NamedTuple):
 
 @dataclass(order=True)
 class _QueuedQuery:
-    """Expensive map query that waits in the queue, or that has received a part of its replies.
+    """Expensive map query that waits in the queue for its first or its next reply.
 
     Attributes:
         rank: time [s] at which the query would be finished on an idle service.

@@ -164,7 +164,7 @@ def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
     """Join tables from segments (files of new rows) of several format versions.
 
     The result has the known columns, null where a segment does not have the column. Columns that
-    only a newer version knows follow, so that a downgrade loses no data.
+    only a newer version knows are added at the end, so that a downgrade loses no data.
     """
     others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
     schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])

@@ -74,7 +74,7 @@ class _AmqpEvents(MessagingHandler):
         self._send_queued()
 
     def on_send(self, _: Any) -> None:  # noqa: ANN401
-        """Send the messages that another thread queued to the interchange."""
+        """Send to the interchange the messages that another thread has queued."""
         self._link.is_waking = False
         self._send_queued()
 

@@ -1,4 +1,6 @@
-"""Running gateway between the map's alerts and an interchange of cooperative ITS."""
+"""Running gateway: it sends the map's alerts to an interchange of cooperative ITS, and receives
+hazard messages from it.
+"""
 
 from __future__ import annotations
 
