@@ -211,8 +211,8 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Return two arrays in the shape of `yaw`: the heading sector of each yaw [rad], and a second
-    sector if the yaw lies within 15° of the edge to that sector, else -1.
+    """Return two arrays in the shape of `yaw`. The first is the heading sector of each yaw [rad].
+    The second is the neighbouring sector if the yaw lies within 15° of the edge to it, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

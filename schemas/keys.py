@@ -1,8 +1,9 @@
 """Zenoh keys of the contract (common definitions of vehicles, service and clients): the topics with
 their messages and quality of service. Keys are built and parsed only here.
 
-A region's quadkey is split into chunks of 4, 3 and 3 digits, a tile's into 4, 3, 3 and 4, so that
-wildcards select areas of different size: `gripmap/v1/map/1200/320/*/*` is a zone (zoom 7).
+The quadkey (digits of a quadtree path) of a region is split into chunks of 4, 3 and 3 digits, that
+of a tile into chunks of 4, 3, 3 and 4. Therefore wildcards select areas of different size:
+`gripmap/v1/map/1200/320/*/*` is a zone (zoom 7).
 """
 
 from __future__ import annotations
@@ -166,9 +167,9 @@ class ServiceToken(NamedTuple):
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the key of the token (sign that a service is alive) with the first part `root`
-        instead of `gripmap/v1/serves`: CLAIMS for a service that serves or will soon serve the
-        region, WAITS for a standby service.
+        """Return the key of a token (sign that a service is alive) whose first part is `root`
+        instead of `gripmap/v1/serves`. The root CLAIMS means that the service serves or will soon
+        serve the region, and WAITS that it is a standby service.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 

@@ -320,8 +320,8 @@ def _vehicle_number(vehicle: str) -> int:
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return a mask of visits (passages of a map cell), (visits,): True for visits after the change
-    of the road that found clearly less grip than all visits to the same cell before the change.
+    """Return a mask of visits (passages of a map cell), (visits,). It is True for visits after the
+    change of the road that found clearly less grip than all earlier visits to the same cell.
 
     Visits to cells that were slippery before the change, such as old snow, do not count.
     """

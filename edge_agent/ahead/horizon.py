@@ -50,7 +50,7 @@ class Horizon(NamedTuple):
         slippery: True if the metre justifies a warning.
         alerted: True if an alert is active there.
         safe_speed: speed from which the car can take the bends and stop in time [m/s]; NaN where
-            the map knows nothing about the friction.
+            unknown.
     """
 
     path: Path

@@ -1,11 +1,11 @@
 """Roads visible in the map: sequences of places (cell and sector) that vehicles visited one after
 the other.
 
-Place B follows place A if B lies within about two cells in front of A, and the sector of B is a
-possible heading for a vehicle that comes from A. At a fork all roads are followed, the straightest
-first. The straightest road is extended straight on beyond its last known place. Without this
-extension the car would never request the map there, because it requests the map only along its
-path.
+Place B follows place A on two conditions: B lies within about two cells in front of A, and the
+sector of B is a possible heading for a vehicle that comes from A. At a fork all roads are followed,
+the straightest first. The straightest road is extended straight on beyond its last known place.
+Without this extension the car would never request the map there, because it requests the map only
+along its path.
 """
 
 from __future__ import annotations

@@ -135,8 +135,9 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the counts that the agent prints at its end, by name: records by result, observations
-    (a subset of the records) by result, and blocks of samples; and the largest delay of the loop.
+    """Return the numbers that the agent prints at its end, by name. They are the counts of records
+    by result, of observations (a subset of the records) by result, and of blocks of samples, and
+    the largest delay of the loop.
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

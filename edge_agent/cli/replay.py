@@ -218,8 +218,8 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Print on stderr the progress of estimating `count` recorded logs, and an error for each log
-    that could not be read; return 2 if there was one, else 0.
+    """Print the progress of estimating `count` recorded logs on stderr. Print an error for each log
+    that could not be read. Return 2 if there was such a log, else 0.
     """
     bad = 0
     samples = 0

@@ -283,8 +283,8 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 
 def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
-    """Run a random search and an ant colony for the best fuzzy sets from the same start vector,
-    with the same candidate values and budget; return the results by search.
+    """Search for the best fuzzy sets twice, by random search and by an ant colony. Both searches
+    have the same start vector, candidate values and budget. Return the results by search.
     """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}

@@ -137,9 +137,9 @@ def merge_recordings(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Return, for each channel of the signal log, a pair (index, rule): the index of the recording
-    that contains the channel's signals, and the rule of the profile for converting these signals to
-    the channel.
+    """Return a pair (index, rule) for each channel of the signal log. The index is that of the
+    recording that contains the channel's signals. The rule, from the profile, converts these
+    signals to the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.

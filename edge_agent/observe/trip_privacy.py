@@ -1,11 +1,12 @@
-"""Privacy of trip ends: observations near the beginning and the end of a trip are not published.
+"""Privacy of trip ends: records (observations and states of motion) from near the beginning and the
+end of a trip are not published.
 
-A parking place identifies the vehicle's owner. Therefore each record waits until it is far enough
-from both ends. It may be published if the beginning of the trip is at least `metres` and `seconds`
-before it, and the vehicle's present position is at least as far after it. A trip lasts as long as
-the pipeline object (one run of the agent). Records that still wait at the end of the trip are never
-published. If both limits are zero, every record is published immediately. The module is pure (no
-I/O).
+A parking place identifies the vehicle's owner. Therefore a record is published only under two
+conditions. The beginning of the trip must be at least `metres` and `seconds` before the record, and
+the vehicle's present position at least as far after it. Until then the record waits. Records that
+still wait at the end of the trip are never published. A trip lasts as long as the pipeline object
+(one run of the agent). If both limits are zero, every record is published immediately. The module
+is pure (no I/O).
 """
 
 from __future__ import annotations

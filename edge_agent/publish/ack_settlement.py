@@ -46,7 +46,8 @@ class AckSettlement:
     the outbox (store of unsent and unanswered batches).
 
     Attributes:
-        clock_behind_s: delay of the vehicle's clock relative to the last service that answered [s].
+        clock_behind_s: how far the vehicle's clock is behind the clock of the last service that
+            answered [s].
     """
 
     def __init__(

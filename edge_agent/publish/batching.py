@@ -133,8 +133,8 @@ class Batcher:
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Divide records into batches: yield the range [first, last) of each. The number of rows and
-    the time span of a batch are limited, because a replayed drive may be long.
+    """Divide the first `ready` records into batches: yield the range [first, last) of each batch. A
+    batch has at most `rows` records and a limited time span, because a replayed drive may be long.
     """
     first = 0
     for at in range(1, ready + 1):

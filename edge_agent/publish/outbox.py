@@ -47,10 +47,10 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records that the outbox (store of batches on disk) has handled in this process:
-    stored, settled (finally answered), evicted for lack of space, lost by damage of the file, or
-    given up because the service answers only later ones. `damages` is the number of times that the
-    file was found damaged.
+    """Numbers of records by what happened to them in the outbox (store of batches on disk) of this
+    process. They were stored, settled (finally answered), evicted for lack of space, lost by damage
+    of the file, or given up because the service answers only later ones. `damages` is the number of
+    times that the file was found damaged.
     """
 
     stored: int = 0

@@ -1,5 +1,6 @@
-"""SQLite file of an outbox (store of unsettled batches), opened exclusively by one process. If the
-file is damaged, it is renamed, and its readable batches are copied to a new file.
+"""SQLite file of an outbox (store of batches that no service has answered), opened exclusively by
+one process. If the file is damaged, it is renamed, and its readable batches are copied to a new
+file.
 
 Each batch has a checksum of its identifier and payload, because SQLite itself does not detect
 changed bits in its data.
@@ -50,8 +51,8 @@ Row = tuple[object, ...]
 
 
 class SpoolFile:
-    """Table of batches in the file of an outbox (store of unsettled batches). The key of a batch is
-    its row number.
+    """Table of batches in the file of an outbox (store of batches that no service has answered).
+    The key of a batch is its row number.
 
     Attributes:
         was_damaged: True if the file was found damaged when it was opened.

@@ -46,8 +46,8 @@ class LanesType(types.Type):
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
     def unify(self, typingctx: Any, other: Any) -> LanesType | None:
-        """Return this vector type for a variable that holds a single number at one place of the
-        code and a vector at another; None if `other` is not the type of a number.
+        """Return this vector type for a variable that holds a single number in one branch of the
+        code and a vector in another. Return None if `other` is not the type of a number.
         """
         return self if isinstance(other, types.Float | types.Integer) else None
 

@@ -2,9 +2,9 @@
 
 A filter bank runs the same arithmetic for many hypotheses. In a vector of LANES numbers, one per
 hypothesis, one machine instruction serves all of them (structure of arrays). In compiled code such
-a vector comes from `lanes_at` and behaves like a float: operators, `abs`, `min`, `max` and
-`math.sqrt` work on each lane separately, and a float is copied into all lanes. Therefore one source
-text works for single numbers and for vectors, and type checkers treat vectors as floats. A
+a vector comes from `lanes_at` and behaves like a float. Operators, `abs`, `min`, `max` and
+`math.sqrt` work on each lane separately, and a float is copied into all lanes. Therefore the same
+source code works for single numbers and for vectors, and type checkers treat vectors as floats. A
 comparison gives a mask; `select` replaces a branch.
 
 Multiplication and addition of vectors are fused where the processor can do so. No other part of

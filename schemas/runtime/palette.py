@@ -7,8 +7,8 @@ is the colour where too little is known for a class.
 
 The classes have an order: ice, snow, rather slippery, wet, rather not slippery, good grip. From ice
 to good grip, lightness rises on a light background and falls on a dark one, for every kind of
-colour vision and in greyscale. Therefore the most dangerous class stands out most. `GRIP` is a
-colour scale through `FOUR` at the values of `SURFACES`, in steps of equal lightness. No colour is
+colour vision and in greyscale. Therefore ice, the most dangerous class, stands out most. `GRIP` is
+a colour scale through `FOUR` at the values of `SURFACES`, in steps of equal lightness. No colour is
 green, because green would promise safety. `tests/test_palette.py` checks order and distances.
 """
 

@@ -178,8 +178,9 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Add a finding (fault) to the diagnosis for each wheel speed whose upper bits are status bits:
-    its readings jump away from the other three wheels and back.
+    """Add a finding (fault) to the diagnosis for each wheel speed whose upper bits are status bits.
+    When such a bit is set, the reading jumps away from the other three wheels, and later jumps
+    back.
 
     A wheel that spins or locks also differs from the others, but gradually and by any amount. A
     status bit changes completely from one reading to the next, and adds the same amount each time.

@@ -184,9 +184,9 @@ def is_steady(fit: Fit) -> bool:
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts in which the fitted gain of an identity (ratio of two
-    quantities that are equal by physics) has the same sign as `gain`, and differs from it in
-    logarithm by less than `within`.
+    """Return the share of a drive's parts in which the fitted gain of an identity is near `gain`:
+    it has the same sign, and its logarithm differs by less than `within`. An identity is a pair of
+    quantities that are equal by physics, and its gain is their ratio.
     """
     if not fit.parts:
         return 0.0

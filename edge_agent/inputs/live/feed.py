@@ -3,9 +3,9 @@ messages.
 
 Times are the host's: seconds since its start, by a monotonic clock. If the time stamps of a source
 are at most BELIEVED_S old on arrival, the clocks of source and host are assumed to agree, and the
-stamps are used unchanged. For any other source, the difference between the two clocks is estimated:
-the message with the smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived
-without delay (Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
+stamps are used unchanged. For any other source, the difference between the two clocks is estimated.
+The message with the smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived
+without delay (minimum of the delays, as in Cristian, Distrib. Comput. 3 (1989)).
 """
 
 from __future__ import annotations
