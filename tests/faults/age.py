@@ -135,8 +135,8 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
     """Create an archive in the folder `to` from links to the files of the archive `root`, and
-    return `to`. The new archive contains the last day and, if `old` is not 0, the other days moved
-    back by `old` times MAP_DAYS.
+    return `to`. The new archive contains the last day. If `old` is not 0, it also contains the
+    other days, moved back by `old` times MAP_DAYS so that they are expired.
     """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})

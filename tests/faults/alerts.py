@@ -136,7 +136,7 @@ def _has_alerts(session: zenoh.Session, least: int) -> bool:
 
 
 def _list_alerts(session: zenoh.Session) -> set[Place]:
-    """Return cell and sector of each active alert of the service."""
+    """Return cell and heading sector of each active alert of the service."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
     return {
         (alert.cell, alert.sector)

@@ -39,8 +39,8 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 
 class Event(NamedTuple):
-    """Event of the simulated history of several services, of one of three kinds. `serves`: a
-    service with a lease number begins to serve and knows some batches. `acknowledges`: it
+    """Event of the simulated history of several services. There are three kinds. `serves`: a
+    service with a lease number begins to serve and knows some batches. `acknowledges`: a service
     acknowledges batches. `reads`: at the end, a reader finds the batches that count.
     """
 

@@ -42,8 +42,8 @@ METRES_PER_DEGREE: Final = 111_195.0
 
 
 def run(site: Site) -> list[Figure]:
-    """Send a thousand teleports (in a quick run, a few hundred) and three drives of two cars, and
-    return the figures.
+    """Send a thousand teleports (reports of impossible places; in a quick run, a few hundred) and
+    three drives of two cars, and return the figures.
     """
     teleports = site.choose_amount(1_000, 140)
     accepted, honest_lost = _drive_teleports(site, teleports)

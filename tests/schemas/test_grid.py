@@ -1,5 +1,5 @@
-"""Tests of cells, tiles and sectors: the grid satisfies its theorems, and its borders are handled
-correctly.
+"""Tests of map cells, tiles and heading sectors: the grid satisfies its theorems, and its borders
+are handled correctly.
 """
 
 from __future__ import annotations

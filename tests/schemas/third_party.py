@@ -83,8 +83,8 @@ def protobuf_batch(now: int) -> bytes:
 
 
 def json_batch(now: int) -> bytes:
-    """Return the same observations as `protobuf_batch` in handwritten JSON without cell, sector and
-    region.
+    """Return the same observations as `protobuf_batch` in handwritten JSON without cell, heading
+    sector and region.
     """
     times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
     numbers = {

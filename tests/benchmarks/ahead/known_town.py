@@ -21,7 +21,7 @@ SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how f
 
 class KnownPlaces(NamedTuple):
     """Map places (cells with heading sector) through which the lanes of a scenario lead, each once,
-    (n,): key (cell·4 + sector), and smallest true friction.
+    (n,): key (cell·4 + heading sector), and smallest true friction.
     """
 
     key: IntArray
@@ -29,7 +29,9 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """Return the places (cells and sectors) of a scenario's lanes with their friction at t [s]."""
+    """Return the map places (cells with heading sector) of a scenario's lanes, with their friction
+    at t [s].
+    """
     points = scenario.network.points
     x = points[:, LanePoint.X]
     y = points[:, LanePoint.Y]

@@ -1,5 +1,5 @@
-"""`make country-bench`: a city on SUMO's routes, then a country of a hundred thousand vehicles for
-ten minutes.
+"""`make country-bench`: simulate a city with routes from SUMO, and then a country of a hundred
+thousand vehicles for ten minutes.
 
 Writes `.country/figures.json` and `.country/country.png`, and prints the table. `--city DIR` uses
 the observations of an earlier run of the city.

@@ -1,5 +1,5 @@
-"""Tests of warnings: each is given once, and early enough to stop with the lower end of the
-friction interval; it is then updated and ended. There are no false warnings.
+"""Tests of warnings: each is given once, and early enough to stop even if the friction is at the
+lower end of its interval. The warning is then updated and ended. There are no false warnings.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Tests of corrections in the replay of a log. The signal doctor (a check of recorded signals)
-measures delayed sensors, a locked rear axle or wrong wheel radii, the replay corrects them, and an
+finds delayed sensors, a locked rear axle or wrong wheel radii, and the replay corrects them. An
 exact drive stays unchanged.
 """
 

@@ -37,8 +37,8 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the row numbers (n,) of those cells and sectors in a `Fusion` (beliefs about all
-    cells) that a vehicle visited.
+    """Return the row numbers (n,) of those cells and heading sectors in a `Fusion` (beliefs about
+    all cells) that a vehicle visited.
     """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 

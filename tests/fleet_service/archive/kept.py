@@ -144,7 +144,7 @@ def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
 
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
     """Return the map at a time: for every cell its columns and its belief, sorted by cell and
-    sector.
+    heading sector.
     """
     fusion = engine.state.fusion
     slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))

@@ -31,8 +31,8 @@ JOIN: dict[str, Callable[..., Any]] = {
 
 
 def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
-    """Return the statistics of each (cell, sector, hour), merged from all files (parts) of the
-    hourly statistics (roll-up).
+    """Return the statistics of each (cell, heading sector, hour), merged from all files (parts) of
+    the hourly statistics (roll-up).
     """
     out: dict[tuple[int, int, int], dict[str, Any]] = {}
     for path in (root / rollup.TABLE).rglob("*.parquet"):

@@ -43,7 +43,7 @@ def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
     Args:
         found: log-likelihoods (n, 32) of the visits to a cell, by the number of steps east of CELL;
             new vehicles visit each cell.
-        sector: sector of the visits.
+        sector: heading sector of the visits.
     """
     fusion = Fusion(120.0)
     for steps, said in found.items():

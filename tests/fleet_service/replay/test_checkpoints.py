@@ -123,7 +123,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
     """Return arrays by name: the beliefs and columns from which a map is made, sorted by cell and
-    sector, the latest epoch (minute), and the time of the newest row.
+    heading sector, the latest epoch (minute), and the time of the newest row.
     """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
