@@ -55,7 +55,7 @@ _ARROW: Final = {
 
 
 def _make_field(column: message_columns.MessageColumn) -> Field:
-    """Return the column of a table that holds a column of a message."""
+    """Return the table column in which a column of a message is stored."""
     return Field(**column._asdict() | {"type": _ARROW[column.type]})
 
 

@@ -10,7 +10,7 @@ import zenoh
 
 
 def main() -> int:
-    """Query the map of a box as GeoJSON and print its first cells."""
+    """Query the map of a rectangular area as GeoJSON and print its first cells."""
     endpoint, bbox = sys.argv[1:3]
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')

@@ -156,7 +156,9 @@ class ReasonReporter:
         self._told: list[str] = []
 
     def print_if_due(self) -> None:
-        """Print the reasons if it is time for a check and they differ from those printed last."""
+        """Print the reasons why nothing is published, if it is time for a check and the reasons
+        differ from those printed last.
+        """
         now = self._clock()
         if self._due is None:
             self._due = now + FIRST_S

@@ -39,10 +39,10 @@ class Corrector:
         self._rows = np.empty((0, len(CHANNELS)))
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
-        """Return the next rows (samples) of a log, corrected for known sensor errors: times t (T,)
-        [s] and signals (T, 18).
+        """Correct the next rows (samples) of a log for known sensor errors: times t (T,) [s] and
+        signals (T, 18). Return the corrected signals (T, 18).
 
-        If there is nothing to correct, the result is the same array.
+        If there is nothing to correct, the result is the array `signals` itself.
         """
         if self._known is not None:
             signals = _correct_signals(signals, self._known)

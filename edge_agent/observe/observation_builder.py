@@ -385,10 +385,10 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 def _grip_used(ended: RecordArray) -> FloatArray:
     """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
 
-    It is the largest grip used in the last second (`mu_utilised`), limited to the grip that the
-    accelerometers show in this cell. The limit is needed because that second may include part of
-    the previous cell. If friction changed within the visit, the result is the smallest value of its
-    parts (before and after each change).
+    It is the largest value of `mu_utilised` (grip used in the last second), limited to the grip
+    that the accelerometers show in this cell. The limit is needed because that second may include
+    part of the previous cell. If friction changed within the visit, the result is the smallest
+    value of its parts (before and after each change).
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))

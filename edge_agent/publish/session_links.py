@@ -67,7 +67,9 @@ class SessionLinks:
 
     @property
     def connected_names(self) -> set[str]:
-        """Return the names whose session had a router at the last `update_connections`."""
+        """Return the names of the vehicles whose session had a router at the last
+        `update_connections`.
+        """
         return {name for name, connected in self._connected.items() if connected}
 
     def put_batch(self, batch: StoredBatch) -> bool:

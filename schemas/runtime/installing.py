@@ -12,7 +12,9 @@ NAME = "gripmap"
 
 
 def install_command(extra: str) -> str:
-    """Return a shell command that installs an extra into this environment."""
+    """Return a shell command that installs an extra (group of optional dependencies) into this
+    environment.
+    """
     try:
         text = metadata.distribution(NAME).read_text("direct_url.json")
     except metadata.PackageNotFoundError:

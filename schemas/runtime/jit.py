@@ -155,7 +155,9 @@ def native_library_path(package: str) -> Path | None:
 
 
 def _processor_digest() -> str:
-    """Return a digest of the processor's model and features, on which its machine code depends."""
+    """Return a digest of the processor's model and features, on which compiled machine code
+    depends.
+    """
     lines = {platform.machine()}
     with suppress(OSError):
         first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")

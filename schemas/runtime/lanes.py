@@ -81,7 +81,8 @@ def inverse_root_of(x: float) -> float:
     """Return 1/sqrt(x) of a positive normal x with a relative error below 4e-16; for 0 a large
     number, so that x times the result is 0.
 
-    Each step of fourth order multiplies y by the first terms of (1 - e)^(-1/2), e = 1 - x*y^2.
+    A first guess y is improved in steps of fourth order. Each step multiplies y by the first terms
+    of the series of (1 - e)^(-1/2), with e = 1 - x*y^2.
     """
     y = guess_inverse_root(x)
     for _ in range(2):

@@ -76,7 +76,9 @@ class PresenceTracker:
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record that a service's token became active (`stands` is True) or was lost (False)."""
+        """Record that a service's token (sign that it is alive) became active (`stands` is True) or
+        was lost (`stands` is False).
+        """
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)

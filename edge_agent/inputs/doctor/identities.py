@@ -331,8 +331,8 @@ def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def shift_series(x: FloatArray, seconds: float) -> FloatArray:
-    """Return an evenly sampled signal x (n,) delayed by `seconds`; a positive value corrects a
-    signal that is early.
+    """Return an evenly sampled signal x (n,) delayed by `seconds`. A positive value is the
+    correction for a signal that is early, a negative one for a signal that is late.
     """
     n = np.arange(len(x))
     good = np.isfinite(x)
