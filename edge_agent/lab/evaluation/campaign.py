@@ -1,5 +1,5 @@
-"""The evaluation campaign: runs every scenario with every suitable estimator. Figures and plots are
-computed from its results.
+"""The evaluation campaign, which runs every scenario with every suitable estimator. The reported
+numbers and plots are computed from its results.
 """
 
 from __future__ import annotations

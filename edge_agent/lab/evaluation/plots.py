@@ -174,8 +174,8 @@ def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
 
 
 def _draw_surfaces(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot the coverage of the 90 % interval by surface, for every estimator in the towns with
-    inaccurate cars.
+    """Plot the coverage of the 90 % interval by surface (ice, snow, wet, dry), for every estimator
+    in the towns with inaccurate cars.
     """
     from matplotlib import pyplot as plt
 

@@ -1,4 +1,4 @@
-"""Evaluation of the estimator on recorded drives of real cars; owners of such logs run it on their
+"""Evaluation of the estimator on recorded drives of real cars. Owners of recordings run it on their
 own files.
 
 A folder contains LOG.parquet with its vehicle file LOG.json. Optional files are LOG.truth.parquet
@@ -90,10 +90,10 @@ class LogFigures:
 def judge_folder(
     folder: Path, log_line: Callable[[str], None] = lambda _: None
 ) -> list[LogFigures]:
-    """Evaluate every log of a folder that has a vehicle file.
+    """Evaluate every log in a folder for which there is a vehicle file.
 
     Raises:
-        InputError: the folder has no such log, or a log cannot be read.
+        InputError: the folder has no log with a vehicle file, or a log cannot be read.
     """
     paths = [
         path
@@ -126,7 +126,8 @@ def judge_log(path: Path) -> LogFigures:
 
 
 def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, int | None]:
-    """Replay a log; return the estimates (T, columns), and the number of urgent observations.
+    """Replay a log; return the estimates (T, columns), and the number of urgent observations (those
+    that the agent would send immediately).
 
     The number is None if the log has no position.
     """

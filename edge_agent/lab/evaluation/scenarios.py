@@ -53,8 +53,9 @@ def steered_behind(speed: float) -> TrueVehicle:
     """Return the vehicle of papers 000 and 001 with the rear wheels steered for zero sideslip in a
     steady turn at `speed` [m/s].
 
-    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), the
-    same for both axles.
+    The rear angle over the front angle is (K*m*a*v^2 - b) / (K*m*b*v^2 + a) (paper 001, equation
+    53), with mass m and distances a, b from the centre of gravity to the axles. K = 1/(axle
+    stiffness*wheelbase) is equal for both axles.
     """
     light = LIGHT.vehicle
     a = light.cg_to_front_axle

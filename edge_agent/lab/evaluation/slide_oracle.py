@@ -55,8 +55,8 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return the log-likelihood ln L (BINS,) of a visit (passage of a map cell) on the friction
-    grid, with maximum 0.
+    """Return the oracle's evidence of a visit (passage of a map cell): the log-likelihood ln L
+    (BINS,) on the friction grid, with maximum 0. Noise is added to the true values first.
 
     Args:
         force: true force over load (T, 4) [1].

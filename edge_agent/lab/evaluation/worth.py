@@ -2,14 +2,14 @@
 that were not used for tuning.
 
 Legend of the filter variants (for all scores, less is better)
-    fuzzy        the default estimator with all its rules and the shipped vertices
+    fuzzy        the default estimator with all its rules and the shipped vertices (corners of the
+                 fuzzy sets)
     sets_off     no fuzzy sets: a product of ramps decides the share of evidence, and R is not
-                 adapted; strain (deviation of states from their prior) and the consistency test as
-                 in the default
+                 adapted to the innovations; strain (deviation of states from their prior) and the
+                 consistency test as in the default
     none         without any rule, strain and consistency test (`ckf`)
     default      all rules with untuned vertices
-    random       all rules with the vertices (corners of the fuzzy sets) found by random search,
-                 mean over the searches
+    random       all rules with the vertices found by random search, mean over the searches
     colony       all rules with the vertices found by the ant colony, mean over the searches; same
                  budget as the random search
 

@@ -131,8 +131,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
     """Cut or restore the engine torque in the vehicle's state `x` over `dt` [s], as traction
     control does.
 
-    Return True if the slip of a wheel now exceeds the limit, because it spins or because drag
-    torque slows it.
+    Return True if traction control acts now: the vehicle has it, and a wheel slips too much because
+    it spins or because drag torque slows it.
     """
     acts = drags = False
     for i in range(4):
@@ -154,8 +154,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
     """Update the stability control (ESC) in the vehicle's state `x` by `dt` [s], from the inputs
-    `u` and the parameters `p`. Return (index of the wheel that ESC brakes, or -1; its brake torque
-    divided by weight times radius).
+    `u` and the parameters `p`. Return two values: the index of the wheel that ESC brakes (-1 for
+    none), and the brake torque divided by weight times wheel radius.
     """
     vx = x[Motion.VX]
     r = x[Motion.YAW_RATE]

@@ -138,9 +138,9 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
 
 @compiled
 def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
-    """Return the position `distance` [m] ahead of the vehicle on its route, as (row of a lane
-    point, metres beyond that point). `d` is the driver's state, `g` the vehicle's place on the
-    route.
+    """Return the position `distance` [m] ahead of the vehicle on its route: the row of a lane point
+    in the table of points, and the metres beyond that point. `d` is the driver's state, `g` the
+    vehicle's place on the route.
 
     The route is decided only to the end of the next lane; beyond that, the function assumes the
     first continuation of each lane.

@@ -278,8 +278,8 @@ class SimulatedFleet:
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
         """Warn the driver of vehicle k of a slippery stretch.
 
-        `stretch` is its begin and end as distances ahead [m]; (0, 0) cancels the warning. `speed`
-        [m/s] is the advised speed and `mu` the friction to expect.
+        `stretch` is the begin and the end of the slippery stretch as distances ahead [m]; (0, 0)
+        cancels the warning. `speed` [m/s] is the advised speed and `mu` the friction to expect.
         """
         d = self._states[1][k]
         if d[Driver.WARNED_END] <= 0.0:

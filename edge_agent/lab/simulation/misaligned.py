@@ -45,8 +45,8 @@ DEVICE_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Sizes of the sensor errors of a fleet: standard deviations, or the largest value where the
-    comment says so.
+    """Sizes of the sensor errors of a fleet. Each is a standard deviation, or the largest value
+    where its comment says so.
     """
 
     tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad] θ, φ, ψ

@@ -253,8 +253,8 @@ def turn_wheels(
 
 @compiled
 def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Return True if the brakes hold a standing vehicle with state `x`, parameters `p` and inputs
-    `u`: brakes and tyres are stronger than engine and slope.
+    """Return True if a standing vehicle with state `x`, parameters `p` and inputs `u` is held by
+    its brakes. This is so if brakes and tyres can hold more force than engine and slope exert.
     """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False

@@ -90,8 +90,8 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
 
 @compiled
 def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
-    """Fill `record` with the true values of a standing vehicle that is held: brakes and tyres
-    balance the slope.
+    """Fill `record` with the true values of a standing vehicle that its brakes hold. Brakes and
+    tyres then balance the force of the slope.
     """
     along, across, share = gravity(u)
     record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across

@@ -219,10 +219,12 @@ def network_of(
     Args:
         lanes: equally spaced points of each lane, (n, 2) [m]; the first `roads` lanes are roads,
             the others connectors.
-        ways: lanes that continue from each lane; an empty list if every drive ends on the lane.
+        ways: for each lane, the numbers of the lanes that continue from its end; an empty list if
+            every drive ends on it.
         roads: number of lanes that are roads.
-        allowed: v²/q [m] that traffic permits at each point of each lane, (n,); None: only bends
-            and junctions limit the speed.
+        allowed: limit of the speed profile v²/q [m] (squared speed over the acceleration that the
+            driver accepts) at each point of each lane, (n,); None: only bends and junctions limit
+            the speed.
     """
     size = np.array([len(lane) for lane in lanes])
     spacing = np.array([_distance_along(lane)[-1] / (len(lane) - 1) for lane in lanes])

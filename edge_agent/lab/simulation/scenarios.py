@@ -47,8 +47,8 @@ DRAWN_STREAM: Final = 21
 
 @dataclass(frozen=True)
 class Scenario:
-    """A simulated area. `junctions` are name -> (x, y) [m]; `patches` lie on a road of `background`
-    friction, and the last of overlapping patches counts.
+    """A simulated area. `junctions` maps names to positions (x, y) [m]. The road has the friction
+    `background`, except on the `patches`; where patches overlap, the last one counts.
     """
 
     name: str

@@ -275,8 +275,9 @@ def sense(
     """Return the sensor readings (T, N, 18) for the records with true values (lead + T, N, 32). The
     first `lead` records only serve delayed readings.
 
-    `wander` (N, 3) is advanced. `keys` are two uint64 arrays (N,), for the noise and for the
-    dropouts; `clock` is (number of the first sample, rate [Hz], `lead`).
+    `wander` (N, 3), the slow errors of the position receivers, is advanced. `keys` are two uint64
+    arrays (N,), for the noise and for the dropouts; `clock` is (number of the first sample, rate
+    [Hz], `lead`).
     """
     white, silence = keys
     first, rate_hz, lead = clock

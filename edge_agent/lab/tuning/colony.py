@@ -76,9 +76,9 @@ def transition_probabilities(
     alpha: float,
     theta: float,
 ) -> FloatArray:
-    """Return the probabilities of equation (31) for all vertices (variables), (V, K): row v has the
-    probability of each position (possible value). It is zero where no position exists, and each row
-    sums to one.
+    """Return the probabilities (V, K) with which an ant chooses the positions (possible values) of
+    all V vertices (variables), by equation (31). A probability is zero where no position exists,
+    and each row sums to one.
     """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
@@ -119,8 +119,9 @@ def renew(
     evaporation: float,
     retrace: float,
 ) -> FloatArray:
-    """Return the pheromone after equation (32), limited to [τ_min, 1]; zero where a vertex
-    (variable) has no such position (possible value).
+    """Return the pheromone (V, K) after evaporation and the deposits `laid`, by equation (32),
+    limited to [τ_min, 1]. It is zero where a vertex (variable) has no such position (possible
+    value).
     """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
@@ -138,7 +139,7 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
     """Return the amounts of pheromone (P,) that the best ants of an iteration deposit, by rank.
-    Together with the deposit of the best path so far they sum to ρ (evaporation per iteration).
+    Together with the deposit of the best path so far, they sum to ρ (evaporation per iteration).
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)

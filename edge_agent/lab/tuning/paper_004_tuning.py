@@ -83,8 +83,8 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
     """Run paper 004's filter with the given fuzzy sets on a drive. Return the tuning objective of
-    the paper's equation (33): 1/(1 + |e|), where e is the actual minus the theoretical variance of
-    the innovations (measurement minus prediction).
+    the paper's equation (33): 1/(1 + |e|), where |e| is the mean absolute difference between actual
+    and theoretical variance of the innovations (measurement minus prediction).
     """
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)

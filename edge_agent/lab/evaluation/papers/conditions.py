@@ -3,7 +3,8 @@ manoeuvres that they drive.
 
 A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
 the paper. Only drives at constant speed have drag and rolling resistance, which the filter knows.
-They need them because without a longitudinal force the tyres give no information on friction.
+Without these there would be no longitudinal force, and the tyres would give no information on
+friction.
 """
 
 from __future__ import annotations

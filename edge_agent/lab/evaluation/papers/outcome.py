@@ -20,14 +20,15 @@ class PaperRow(NamedTuple):
     """One number of a paper's table, and our corresponding numbers for comparison.
 
     Attributes:
-        name: name of the figure, below `papers.NUMBER.`.
+        name: name of the result, to which the prefix `papers.NUMBER.` is added.
         what: the number in words, with its unit in brackets.
         printed: the printed number, or NaN if the paper prints none.
         matched: result of the paper's filter under the paper's conditions.
-        own: result of the same filter on drives simulated with the simulator's own vehicle model.
+        own: result of the paper's filter on drives simulated with the simulator's own vehicle
+            model.
         realistic: result of the paper's estimator with ordinary sensors and a vehicle file with
             errors of a few per cent.
-        default: result of the default estimator on the same drives.
+        default: result of the default estimator on the drives of `realistic`.
         bar: target for `matched`. None: the printed number is the target, if there is one. NaN:
             there is no target.
         better: "less" or "more": the side of the target on which `matched` must lie.

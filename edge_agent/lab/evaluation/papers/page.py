@@ -1,5 +1,5 @@
-"""The report of one paper as an HTML page without scripts, and as Markdown with its tables and
-elements.
+"""The report of one paper's reproduction: an HTML page without scripts, and Markdown with its
+tables and its elements (equations, tables and figures of the paper).
 """
 
 from __future__ import annotations
