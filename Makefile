@@ -14,7 +14,7 @@ export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of pro
 .DEFAULT_GOAL := help
 .PHONY: help campaigns setup demo test test-all test-shuffled check package docs lint types results figures release \
   faults faults-quick cluster-faults soak bench tune proto lock audit fuzz clean analytics-bench spark-test usability \
-  roads-bench page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
+  sensitivity roads-bench page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
 
 help:  #- print the main targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | awk -F '\t' '{printf "%-18s%s\n", $$1, $$2}'
@@ -146,6 +146,9 @@ spark-test: setup  #= Spark and DuckDB give the same answers; needs Java
 
 tune: setup  #- search the memberships; writes the shipped file
 	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json
+
+sensitivity: setup  #= effect of every constant of the default filter; half an hour
+	$(BIN)/python -m edge_agent.lab.tuning.sensitivity
 
 proto: setup  #- generate the message modules
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto

@@ -1,0 +1,223 @@
+"""Sensitivity of the default estimator to each of its constants.
+
+Each number of `Constants` and of the shipped memberships (fuzzy sets) is multiplied by .7 and by
+1.4, one at a time. The filter then runs on simulated towns, half of them in winter, and on
+manoeuvres, all with inaccurate cars. Their seeds belong to tuning and are not used for judging.
+
+Legend of the columns, each the change from the filter as it is
+    score      mean interval score of friction over the drives [%]; less is better
+    false ice  share of the samples above a friction of .6 that are called slippery [percentage
+               points]
+    found      share of the excited samples on slippery road that are called slippery [percentage
+               points]
+    time       time of the filter [%]; both are measured alternately, so that other load cancels
+
+A number that changes score, false ice and found by less than 1 in both directions can be merged
+with another one or deleted. Chance moves the score by about 1 % as well, because a small change of
+one drive can decide if a slide is noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import LENGTHS, Memberships
+from edge_agent.app.tuned_memberships import shipped_memberships
+from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators.friction_mixture.bank import mixture_bank
+from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
+from edge_agent.lab.evaluation.batch import DriveSet
+from edge_agent.lab.evaluation.real_world import SURE_GRIP, interval_score, town
+from edge_agent.lab.evaluation.worth import manoeuvres
+from schemas.errors import InputError
+from schemas.numeric import BoolArray
+from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU
+
+ESTIMATOR: Final = "aco-fckf"
+SEEDS: Final = range(8001, 8009)
+CARS: Final = 6
+TOWN_S: Final = 30.0
+DRIVE_S: Final = 6.0
+SETTLED_S: Final = 1.0  # before, the score is that of the prior
+FACTORS: Final = (0.7, 1.4)
+SMALL: Final = 1.0  # change in every column below which a number has no effect
+
+
+class JudgedDrives(NamedTuple):
+    """Simulated drives, and for each sample (T, N) if a wheel uses much of its grip."""
+
+    batch: DriveSet
+    excited: BoolArray
+
+
+class FilterMeasures(NamedTuple):
+    """Measures of one filter on all drives; the legend of the module explains them."""
+
+    score: float
+    false_ice: float
+    found: float
+
+
+class ConstantChange(NamedTuple):
+    """ConstantChange of the measures when the number `name` is multiplied by `factor`."""
+
+    name: str
+    factor: float
+    score: float  # [%]
+    false_ice: float  # [percentage points]
+    found: float  # [percentage points]
+    time: float  # [%]
+
+    @property
+    def effect(self) -> float:
+        """Return the largest change of a measure, time apart."""
+        return max(abs(self.score), abs(self.false_ice), abs(self.found))
+
+
+def simulate_drives(
+    seeds: Sequence[int], *, cars: int = CARS, town_s: float = TOWN_S, drive_s: float = DRIVE_S
+) -> list[JudgedDrives]:
+    """Simulate one town and one set of manoeuvres per seed."""
+    drives = []
+    for seed in seeds:
+        batch, used = town(seed, cars, town_s)
+        drives.append(JudgedDrives(batch, used >= EXCITED_SHARE))
+        other = manoeuvres(seed, drive_s)
+        drives.append(JudgedDrives(other, np.zeros(other.mu.shape, bool)))
+    return drives
+
+
+def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeasures:
+    """Run the filter with the tables `design` on all drives, and return its measures.
+
+    Only towns count for `found`, because a simulated manoeuvre does not report the grip in use.
+    """
+    scores = []
+    cried = grippy = warned = slippery = 0
+    for batch, excited in drives:
+        bank = mixture_bank(parameter_table(batch.vehicles), design)
+        estimates = bank.advance(batch.t, batch.signals)
+        settled = batch.t[:, 0] >= SETTLED_S
+        score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)
+        scores.append(score[settled].mean(axis=0))
+        called = estimates.p_slippery > CALLED_SHARE
+        high = batch.mu > SURE_GRIP
+        low = excited & (batch.mu < SLIPPERY_MU)
+        cried += int((called & high).sum())
+        grippy += int(high.sum())
+        warned += int((called & low).sum())
+        slippery += int(low.sum())
+    return FilterMeasures(
+        float(np.concatenate(scores).mean()), cried / max(grippy, 1), warned / max(slippery, 1)
+    )
+
+
+def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, MixtureDesign]]:
+    """Yield name, factor and tables of each filter with one number multiplied by a factor of
+    FACTORS. Zeros and numbers that would make the fuzzy sets invalid are left out.
+    """
+    usual = Constants()
+    for name, value in usual._asdict().items():
+        for factor in FACTORS:
+            changed = usual._replace(**{name: value * factor})
+            yield name, factor, design_of(memberships, adaptive=True, constants=changed)
+    for field in LENGTHS:
+        values = getattr(memberships, field)
+        for place, value in enumerate(values):
+            for factor in FACTORS if value else ():
+                document = memberships.to_json()
+                document[field][place] = value * factor
+                try:
+                    sets = Memberships.from_json(document)
+                except InputError:
+                    continue
+                yield f"{field}[{place}]", factor, design_of(sets, adaptive=True)
+
+
+def campaign(
+    drives: Sequence[JudgedDrives],
+    *,
+    only: str = "",
+    log_line: Callable[[str], None] = lambda _line: None,
+) -> list[ConstantChange]:
+    """Measure the filter with each number changed, and return the changes, the largest effect
+    first. Only numbers whose name contains `only` are changed.
+    """
+    memberships = shipped_memberships(ESTIMATOR)
+    usual = design_of(memberships, adaptive=True)
+    base = measure(usual, drives)
+    changes = []
+    for name, factor, design in vary_numbers(memberships):
+        if only not in name:
+            continue
+        started = time.perf_counter()
+        found = measure(design, drives)
+        middle = time.perf_counter()
+        measure(usual, drives[:2])
+        unit = time.perf_counter() - middle
+        changes.append(
+            ConstantChange(
+                name,
+                factor,
+                100.0 * (found.score / base.score - 1.0),
+                100.0 * (found.false_ice - base.false_ice),
+                100.0 * (found.found - base.found),
+                (middle - started) / unit,
+            )
+        )
+        log_line(f"{name} x {factor}: score {changes[-1].score:+.2f} %")
+    usual_time = float(np.median([change.time for change in changes])) if changes else 1.0
+    changes = [change._replace(time=100.0 * (change.time / usual_time - 1.0)) for change in changes]
+    return sorted(changes, key=lambda change: -change.effect)
+
+
+def list_without_effect(changes: Sequence[ConstantChange]) -> list[str]:
+    """Return the names of the numbers whose change by any factor has an effect below SMALL."""
+    largest: dict[str, float] = {}
+    for change in changes:
+        largest[change.name] = max(change.effect, largest.get(change.name, 0.0))
+    return sorted(name for name, effect in largest.items() if effect < SMALL)
+
+
+def to_markdown(changes: Sequence[ConstantChange]) -> str:
+    """Return the changes as a Markdown table, with the numbers without effect below it."""
+    lines = [
+        "| number | factor | score [%] | false ice [pp] | found [pp] | time [%] |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| `{name}` | {factor} | {score:+.2f} | {false_ice:+.3f} | {found:+.2f} | {spent:+.0f} |"
+        for name, factor, score, false_ice, found, spent in changes
+    ]
+    idle = list_without_effect(changes)
+    listed = ", ".join(f"`{name}`" for name in idle)
+    return "\n".join([*lines, "", f"No effect of 1 or more ({len(idle)}): {listed}", ""])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the campaign, print the table, and write it to a folder."""
+    parser = argparse.ArgumentParser(description="Sensitivity of the estimator to its constants")
+    parser.add_argument("--out", type=Path, default=Path(".evaluation/sensitivity"))
+    parser.add_argument("--only", default="", help="numbers whose name contains this text")
+    options = parser.parse_args(arguments)
+    changes = campaign(
+        simulate_drives(SEEDS), only=options.only, log_line=lambda line: print(line, flush=True)
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    table = to_markdown(changes)
+    (options.out / "sensitivity.md").write_text(table, encoding="utf-8")
+    rows = [change._asdict() for change in changes]
+    (options.out / "sensitivity.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    print(table)
+
+
+if __name__ == "__main__":
+    main()
