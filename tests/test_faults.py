@@ -134,7 +134,7 @@ def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
     found_bugs = (
         1064,
         1938,
-    )  # files that an interrupted compaction had renamed and not synced, then taken for safe
+    )  # files that an interrupted compaction renamed but did not sync, and then regarded as safe
     assert [
         problem for number in (*range(12), *found_bugs) for problem in run_log_history(number)
     ] == []

@@ -39,8 +39,8 @@ bank.advance(block.t[:1], block.signals[:1])
 """
 LOOK_S = 0.05
 LIVE_S = 20.0
-WARM_S = 1.0  # of a run that only fills the cache of compiled code
-START_S = 5.0  # of a run that only pays for its start
+WARM_S = 1.0  # length of a run that only fills the cache of compiled code
+START_S = 5.0  # length of a run that measures only the start
 SENT = 100_000  # samples of a live source: more than are needed
 FLEET = 100
 FLEET_RATE_HZ = 50

@@ -24,9 +24,9 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.process import trim_memory
 from tests.benchmarks.measure import ROUNDS, SEED, time_in_turn
 
-BATCH = 5_000  # rows of a turn of the service under load
+BATCH = 5_000  # rows per pass of the main loop of a service under load
 VEHICLES = 5_000
-EXCITED = 1 / 9  # visits that give a value
+EXCITED = 1 / 9  # share of visits that measure the friction
 SECOND = 10**9
 START = 1_800_000_000 * SECOND
 CELLS = 1_000_000

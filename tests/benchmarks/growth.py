@@ -33,7 +33,7 @@ RATES: Final = {
 }  # observations/s, and seconds of each that are measured
 ROWS: Final = 10
 TURN: Final = 512  # messages, as the service's worker takes them
-# short, so that the window is full and settling is paid for from the beginning
+# short, so that the window is full and settling has its full cost from the beginning
 LATENESS_S: Final = 4.0
 WARM_S: Final = 4
 SECOND: Final = 10**9

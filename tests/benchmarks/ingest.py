@@ -38,7 +38,7 @@ CELLS_ACROSS: Final = 200
 STEP_NS: Final = 200_000_000  # between two cells of 10 m
 REGION_BITS: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM)
 FLUSH: Final = 20_000  # messages between two segments
-COUNTS: Final = {10: 16_384, 1: 65_536}  # messages of a round, by records in each
+COUNTS: Final = {10: 16_384, 1: 65_536}  # messages per round, by the number of records in a message
 MESSAGE: Final = wire.MESSAGES[Kind.OBSERVATION]
 ROUNDS: Final = 3
 
@@ -178,7 +178,7 @@ def _time_ingest(sent: list[Message], records: int) -> tuple[float, float]:
     ):
         turn = turn_of(sent)
         gc.collect()
-        # as the service does when it starts: the messages of a benchmark are no garbage to look for
+        # as the service does at its start: the collector must not search the benchmark's messages
         gc.freeze()
         wall = time.perf_counter()
         cpu = time.process_time()

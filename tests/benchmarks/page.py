@@ -52,10 +52,10 @@ T = TypeVar("T")
 OUT: Final = Path(".page")
 SEED: Final = 20_319
 CHANGED_HZ: Final = 1000  # cells a second
-PUT_S: Final = 0.25  # of four tiles each is put once a second, as a service does
+PUT_S: Final = 0.25  # each of four tiles is published once a second, as by a service
 PUSHES: Final = 120
 DRAWN_S: Final = 10.0
-FIRST: Final = 100  # number of the first push: what is there before is none of them
+FIRST: Final = 100  # number of the first push; earlier content has smaller numbers
 WATCHERS: Final = (400, 300, 200, 100, 50)
 WATCHED_PUSHES: Final = 20
 VIEWPORT: Final = {"width": 1600, "height": 1100}
@@ -233,13 +233,13 @@ def pushed_ms(on: Stage) -> float:
             time.sleep(max(due - time.monotonic(), 0.0))
         with contextlib.suppress(
             TimeoutError
-        ):  # a put of the map may be dropped; what was not drawn is late for ever
+        ):  # a publication may be dropped; then it counts as infinitely late
             until(
                 lambda: seen.page.evaluate(f"numbers.some(one => one[0] === {FIRST + PUSHES - 1})"),
                 DRAWN_S,
             )
         drawn_at = {int(number): float(at) for number, at in seen.page.evaluate("numbers")}
-    # a put that the next of its tile overtook is drawn with that
+    # a publication overtaken by the next one of its tile counts as drawn with that one
     late = [
         min(
             (

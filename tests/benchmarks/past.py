@@ -29,7 +29,7 @@ from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
 WORLD = SyntheticFleet(1_000_000, days=3)
-# cells of a box's side: a thousand of them were visited
+# side of a box in cells; a thousand of its cells were visited
 SIDE = 320
 QUERIES = 15
 

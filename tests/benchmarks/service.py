@@ -30,14 +30,14 @@ from schemas.wire.tile import decode_tile
 RATE = 20_000  # observations/s of the load
 ROWS = 10  # of a message
 VEHICLES = 500
-# of the tile's cells that the load visits; the box of a query holds half of them
+# columns and lines of cells in the tile that the load visits; a query's box contains half of them
 COLUMNS = 40
 LINES = 50
 QUERIES = 200
 ALERTS = 60
 ACKS = 60
 IDLE_ACKS = 25
-APART = 4  # cells between two that freeze: further than a position's error reaches
+APART = 4  # cells between two icy cells: more than the position error
 BARE = "gripmap-bare/tile"
 BARE_BOX = "gripmap-bare/box"
 LATITUDE = 57.7

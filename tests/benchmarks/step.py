@@ -28,7 +28,7 @@ NAME = "paper-aco-fckf"
 SAMPLES = 100_000
 CALLS = 1_000  # single ones, in a round
 THREADS = 2
-AGREE = 1e-6  # how far C and Python may be apart in v_x, v_y and yaw rate over a drive
+AGREE = 1e-6  # largest accepted difference of C and Python in v_x, v_y and yaw rate over a drive
 
 
 class Drive:

@@ -51,7 +51,7 @@ TURNS = (
     3,
     2,
     1,
-)  # of a vehicle: neighbouring tiles, as no car is in two towns at once
+)  # tiles of a vehicle: neighbours, because no car is in two towns at once
 WARM_S = 8.0
 MEASURED_S = 20.0
 PATIENCE_S = 60.0

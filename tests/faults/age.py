@@ -65,7 +65,7 @@ def run(site: Site) -> list[Figure]:
         _last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2))
     )
     tries = [(_measure_process("ready", young), _measure_process("ready", old)) for _ in range(2)]
-    # the least of two: what else the machine does only adds
+    # the minimum of two runs, because other work on the machine only adds time
     alone, aged = (
         {name: min(one[name] for one in side) for name in OWN} for side in zip(*tries, strict=True)
     )

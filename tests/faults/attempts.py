@@ -234,7 +234,7 @@ def declared_publisher_on_another_key(ground: Ground) -> bool:
 @register_attempt
 def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     session = ground.open_session(ROGUE, ROUTERS[1])
-    ground.await_judgement()  # else the refusals of attacks before it are counted as its own
+    ground.await_judgement()  # otherwise refusals of earlier attacks would count for this one
     before = ground.admitted_count
     refused = ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))

@@ -34,8 +34,8 @@ STEP_S: Final = 0.5
 NS: Final = 10**9
 PLACE: Final = (57.0, 12.0)
 CELL_DEG: Final = 360.0 / 2**grid.CELL_ZOOM
-TAKEN_PER_S: Final = 20.0  # batches that a service of a thousand cars takes of each
-QUEUED: Final = 20.0  # messages of its queue for each
+TAKEN_PER_S: Final = 20.0  # batches per car that a service of a thousand cars accepts
+QUEUED: Final = 20.0  # places per car in its queue
 
 
 @dataclass

@@ -53,8 +53,8 @@ LEASE_S: Final = ServiceConfig().lease_s
 PROCESSES = 2
 VEHICLES = 6
 RATE = 25.0
-EVERY: Final = 8  # failovers; in the middle and at the end of them the region is handed over
-HOLD_S: Final = (1.0, 5.0)  # in which all goes well, between two failovers
+EVERY: Final = 8  # failovers per group; a hand-over follows in the middle and at the end of a group
+HOLD_S: Final = (1.0, 5.0)  # undisturbed time between two failovers
 # Often, so that the few seconds in which a service lives have some of each; a snapshot costs a
 # second.
 PERIODS: Final[dict[str, object]] = {

@@ -40,12 +40,12 @@ from tests.standbys import Host
 from tests.waiting import until
 
 WORLD: Final = SyntheticFleet(300_000, days=1, roads=300)  # 107 000 cells, visited in the last day
-SIDE: Final = 0.01  # degrees of the box that is asked for
-FROZEN: Final = (0.5, 1.3)  # of the lease's time; then one wakes: it is followed after .6 to 1
-AMID_S: Final = 0.3  # of a compaction or a copying job, after which it is killed at the latest
-WOKE: Final = 3.0  # of the lease's time; one that woke in time has not been followed then
-SETTLED_S: Final = 2.0  # after which all that was sent is in a segment
-PATIENCE_S: Final = 600.0  # a takeover that takes long is a figure, no hang
+SIDE: Final = 0.01  # [deg] side of the queried box
+FROZEN: Final = (0.5, 1.3)  # freeze, in lease times; a successor takes over after 0.6 to 1
+AMID_S: Final = 0.3  # latest kill after the begin of a compaction or an upload
+WOKE: Final = 3.0  # in lease times; without a takeover by then, it resumed in time
+SETTLED_S: Final = 2.0  # after this time all sent rows are in a segment
+PATIENCE_S: Final = 600.0  # long, so that a slow takeover is measured and not an error
 
 
 def write_town_archive(root: Path) -> str:

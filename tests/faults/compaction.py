@@ -33,7 +33,7 @@ from tests.faults.processes import Part
 BATCHES: Final = 50  # to a segment
 PAUSE_S: Final = 0.05  # between two segments
 ROUND_ROWS: Final = 1000
-UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a second
+UNTIL_KILL_S: Final = (0.0, 0.6)  # time from its start; a round takes a tenth of a second
 
 
 class Writing:

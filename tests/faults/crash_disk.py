@@ -50,10 +50,10 @@ class CrashDisk:
         self.operations = 0
         self._number: dict[
             int, int
-        ] = {}  # of the files that there are now, by inode; inodes come again, numbers do not
+        ] = {}  # number of each present file by inode; inodes are reused, numbers are not
         self._numbers = 0
         self._synced: dict[int, bytes] = {}
-        self._written: dict[int, bytes] = {}  # of files that have no name any more
+        self._written: dict[int, bytes] = {}  # content of files without a name
         self._names: dict[str, dict[str, int]] = {}
         self._later: dict[str, list[tuple[str, int | None]]] = defaultdict(list)
         for folder, folders, files in os.walk(live):

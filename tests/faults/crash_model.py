@@ -99,7 +99,7 @@ class History(Lives[Batch]):
         self.sent: list[Batch] = []
 
     def _run_life(self, root: Path, last: bool) -> None:
-        with suppress(OSError):  # a service that finds the disk full at its start says so and ends
+        with suppress(OSError):  # a service that starts on a full disk reports this and ends
             log: SegmentLog[Batch] = SegmentLog(root, "shard")
             streams = SequenceTrackers()
             restore_streams(root, streams)

@@ -50,13 +50,13 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, SECOND, ba
 
 STEPS: Final = 14
 START: Final = 1_698_500_000 * SECOND  # 2023-10-28: months end within the histories
-AWAY_DAYS: Final = 14  # between two lives, at the most
+AWAY_DAYS: Final = 14  # longest time between two lives
 VEHICLES: Final = ("car-a", "car-b", "car-c")
-PLACES: Final = 4  # cells in which they are
-NORTH: Final = 0.0003  # degrees from one to the next
+PLACES: Final = 4  # cells that the vehicles visit
+NORTH: Final = 0.0003  # [deg] from one cell to the next
 CONFIG: Final = ServiceConfig(name="shard")
-SAME: Final = 1e-6  # probability of a bin
-NEARLY: Final = 0.01  # likewise, of a cell that was dropped for a week's rest and visited again
+SAME: Final = 1e-6  # largest difference in the probability of a bin
+NEARLY: Final = 0.01  # the same, for a cell that was dropped after an idle week and visited again
 
 
 class Sent(NamedTuple):
@@ -97,11 +97,11 @@ class ServiceHistory(Lives[Sent]):
         self.weather: set[int] = set()  # times of reports that acted
         self.forgetting: set[tuple[str, str]] = (
             set()
-        )  # month, and vehicle or nothing, whose forgetting began
-        self.gone: set[Sent] = set()  # whose rows were forgotten
+        )  # month, and vehicle or "", whose erasure began
+        self.gone: set[Sent] = set()  # batches whose rows were erased
         self.destroyed: set[bytes] = set()  # keys
-        self._nobodys: set[Sent] = set()  # whose rows nobody can tell any more
-        self.retired = -1  # last day whose rows may be gone
+        self._nobodys: set[Sent] = set()  # batches whose rows can no longer be identified
+        self.retired = -1  # last day whose rows may have been removed
         self.done: Counter[str] = Counter()
         self._now = START
 
@@ -111,7 +111,7 @@ class ServiceHistory(Lives[Sent]):
         with (
             suppress(OSError),
             ExitStack() as held,
-        ):  # a service that finds the disk full at its start says so and ends
+        ):  # a service that starts on a full disk reports this and ends
             engine = Engine(CONFIG, root)
             held.callback(engine.holding.close)
             for _ in range(STEPS):

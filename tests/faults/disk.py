@@ -46,7 +46,7 @@ from tests.outboxes import read_batches
 SIZE_MB: Final = 24
 VEHICLES: Final = 5
 CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
-RESERVE_MB: Final = 2  # as much of this disk as 64 MB are of a real one
+RESERVE_MB: Final = 2  # the same share of this small disk as 64 MB of a real one
 RUNS: Final = ("compaction_runs", "checkpoint_runs")
 STUCK_S: Final = 60.0
 

@@ -21,7 +21,7 @@ from schemas.runtime.zenoh_session import configuration
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch, key
 
-ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the largest most at all
+ROWS = (1, 1, 1, 50)  # small messages cost most per byte, large ones most in total
 
 
 def main() -> None:

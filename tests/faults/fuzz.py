@@ -32,10 +32,10 @@ from tests.faults.frame import Site
 from tests.faults.mutants import Mutants
 from tests.fleet_service.examples import SECOND, batch, key
 
-TURN: Final = 500  # malformed messages between two turns of the service
+TURN: Final = 500  # malformed messages per pass of the service's main loop
 HONEST: Final = ("honest-0", "honest-1", "honest-2")
 ASKED_EVERY: Final = 10  # a query for so many messages
-# What a row of the archive may hold, by its column: bounds that hold for any car on any road.
+# Possible values by column of the archive: limits that hold for every car on every road.
 POSSIBLE: Final = {
     "latitude": (-85.06, 85.06),
     "longitude": (-180.0, 180.0),

@@ -29,7 +29,7 @@ from tests.faults.mutants import Mutants, changed_bytes
 from tests.faults.processes import Stage, open_stage
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION
 
-TURN: Final = 200  # malformed messages between two questions
+TURN: Final = 200  # malformed messages between two queries
 HONEST: Final = tuple(f"sim-{number:03}" for number in range(10))
 RATE: Final = 5.0  # observations/s of each
 # Malformed messages are sent until this many batches of honest vehicles are acknowledged meanwhile;

@@ -161,7 +161,7 @@ def open_ground(network: Network) -> Iterator[Ground]:
         until(lambda: any(line.startswith("ready") for line in lines))
         with ExitStack() as stack:
             found = Ground(network, service, stack)
-            # only a service is told who answers; the second router is the one further away
+            # only a service learns who answers queries; the path over the second router is longer
             querier = found.open_session(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
             matched(querier)
             querier.undeclare()

@@ -36,7 +36,7 @@ CAR: Final = "car-666"
 HONEST: Final = tuple(f"car-{k:03}" for k in range(10))
 ICE: Final = (LATITUDE + 0.01, LONGITUDE + 0.01)  # a road that nobody else drives
 MONTH_NS: Final = 29 * 86_400 * NS
-WARM_S: Final = 60  # until pools and windows are what they are
+WARM_S: Final = 60  # after this time the sizes of pools and windows are constant
 
 
 def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:

@@ -31,7 +31,7 @@ LENGTH_S: Final = 90.0  # of a history
 LEASES: Final = (2.0, 3.0, 20.0)
 # The takeover after HINT of a lease allows a ratio of 5/6 between two clocks.
 RATES: Final = (0.93, 1.07)  # of the processes' clocks
-REQUEST_S: Final = 0.6  # after which a client gives a request up
+REQUEST_S: Final = 0.6  # after this time a client gives up a request
 BATCHES_PER_S = 4
 WALL: Final = 1_700_000_000.0
 DAY_S = 86_400.0

@@ -32,8 +32,8 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
 
 Numbers = NDArray[np.floating[Any]]
 KINDS: Final = ("row", "batch", "boot", "region", "before", "between", "walk")
-FAR_M: Final = 6_000.0  # at the least, from the car's way; LEAP_M and 20 s at FASTEST are 3.4 km
-# between two places, and of two cars whose path is plausible
+FAR_M: Final = 6_000.0  # least distance from the car's path; LEAP_M and 20 s at FASTEST are 3.4 km
+# distance of two places, and speed [m/s] of two cars with a plausible path
 STEP_M = 1_900.0
 SPEED = 65.0
 PLACES: Final = 210

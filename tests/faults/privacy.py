@@ -39,8 +39,8 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, batch
 
-PUBLIC: Final = 3  # vehicles of a public cell in the secure configuration
-CUT: Final = 16  # cells of a trip's begin that the agent does not publish: 200 m
+PUBLIC: Final = 3  # vehicles needed for a public cell in the secure configuration
+CUT: Final = 16  # cells at the beginning of a trip that the agent does not publish: 200 m
 STREETS: Final = (4, 3, 3, 2, 1)  # households
 LENGTH: Final = 30  # cells of a street
 PART: Final = 40  # visits of a batch

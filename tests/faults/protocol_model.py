@@ -45,7 +45,7 @@ class Rules(NamedTuple):
     compares_lease: bool = True
     acknowledges_within_half: bool = True
     lists_after_waiting: bool = True
-    wait_share: int = 2  # halves of the lease time for which it waits before it lists
+    wait_share: int = 2  # wait before a service lists the objects, in half lease times
     has_fence: bool = True
     remembers_erasure: bool = True
     writes_turn_once: bool = True

@@ -24,7 +24,7 @@ from tests.faults.processes import Part, open_stage
 PROCESSES = 2
 VEHICLES = 20
 RATE = 50.0
-# few, so that every vehicle has soon been everywhere: a map that grows is no leak
+# small, so that soon every cell is on the map: growth by new cells is not a leak
 CELLS_ACROSS: Final = 12
 EVERY_S: Final = 5.0
 SETTLED: Final = (

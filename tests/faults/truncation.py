@@ -33,7 +33,7 @@ from tests.fleet_service.examples import SECOND, batch, key
 
 SEGMENTS: Final = 2
 BATCHES: Final = 2  # to a segment
-# every so many damages a service is started on the archive and everything is sent again
+# after this number of damages a service starts on the archive and everything is sent again
 WHOLE_WAY: Final = 200
 
 

@@ -26,10 +26,10 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 
 ALERTS: Final = 5
-BROKEN: Final = 2  # connections, before the receiver is sound
+BROKEN: Final = 2  # connections that fail before the receiver works
 TIMEOUT_S: Final = 0.5
 PATIENCE_S: Final = 30.0  # for all alerts to settle
-FEW: Final = 3  # places in the queue of the receiver that is away too long
+FEW: Final = 3  # queue places for the receiver that is absent for too long
 OK: Final = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 FOREVER: Final = frozenset({"absent", "overflow", "refuses"})
 

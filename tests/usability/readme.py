@@ -42,8 +42,8 @@ LASTING: Final = (
     "fleet-service page",
 )
 LEFT_OUT: Final = ("pip install",)
-READY: Final = {"fleet-service run": "ready: "}  # what a person waits for before the next line
-SETTLE_S: Final = 2.0  # until what says nothing is up
+READY: Final = {"fleet-service run": "ready: "}  # output for which a user waits
+SETTLE_S: Final = 2.0  # wait for programs that print nothing when they are ready
 LONGEST_S: Final = 300.0
 
 

@@ -33,7 +33,7 @@ COMMANDS: Final = (
     ["fleet-service", "analyze", "worst", "--archive", "{a}", "--out", "{d}/w.html"],
     ["fleet-service", "export", "map", "--archive", "{a}", "--out", "{d}/m.parquet"],
 )
-# what goes on until a signal, and the word with which its waiting is over
+# commands that run until a signal, and the output that ends the measured wait
 LASTING: Final = (
     (
         ["fleet-service", "run", "--config", "{d}/lasting.json", "--archive", "{d}/lasting"],

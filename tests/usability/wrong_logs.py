@@ -18,7 +18,7 @@ from schemas.signals import CHANNELS
 from tests.benchmarks.inputs.planted import PLANTED, Recorded, drives
 
 TONNES: Final = "mass in tonnes"
-WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence once, and three more
+WRONG: Final = (  # faults that once gave false ice or a wrong place unnoticed, and three more
     "steering in deg",
     "steering wheel",
     "both in g",

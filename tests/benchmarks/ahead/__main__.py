@@ -15,10 +15,10 @@ from schemas.runtime.figures import Figure, markdown, write
 from tests.benchmarks.ahead import approaches, cost, entry, latency
 
 TITLE: Final = "ahead"
-SEEDS: Final = 20  # of a campaign whose bars count
-# 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
+SEEDS: Final = 20  # towns of a campaign whose targets count
+# 24 cars drive 0.2 km/s: 20 towns are 1 200 km, enough for a target of one in 1 000 km
 APPROACHES_S: Final = 300.0
-ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
+ENTRY_TOWNS: Final = 4  # towns for the map as a prior; there the estimator itself runs
 
 
 def measure_ahead(seeds: range, quick: bool) -> list[Figure]:

@@ -35,14 +35,14 @@ from schemas.thresholds import GRAVITY, NS, REACTION_S
 from tests.benchmarks.ahead.known_town import map_of_places, places_of
 
 RATE_HZ: Final = 50.0
-AFTER_S: Final = 80.0  # of the scenario's clock: all its events have happened
-SETTLE_S: Final = 10.0  # until the cars are under way
-NEW_M: Final = 60.0  # of road that is not slippery before an approach counts as one
-ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and the service alerts
+AFTER_S: Final = 80.0  # time of the scenario by which all its events have happened
+SETTLE_S: Final = 10.0  # after this time all cars are moving
+NEW_M: Final = 60.0  # length of road without slippery places that must precede an approach
+ALERTED: Final = 0.3  # below this friction P(slippery) > 0.9 on such a map, and the service alerts
 NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
 BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
-# fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
+# with fewer, targets of 0.99 or of 1 in 1000 km could be met by chance
 LEAST_CAME = 100
 LEAST_KM = 1000.0
 START_NS: Final = 1_800_000_000 * NS
@@ -226,7 +226,7 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
     for one in track.raised.values():
         end = metre[one.at] + one.distance + one.length + 30.0
         ahead = (metre >= metre[one.at] - 10.0) & (metre <= end)
-        whole = metre[-1] >= end  # the drive went on so far
+        whole = metre[-1] >= end  # the drive lasted until here
         counts.false += bool(whole and not (beside[ahead] < NEAR_SLIPPERY).any())
 
 

@@ -36,7 +36,7 @@ BLOCK: Final = 10
 FIRST_S: Final = 1.0
 ARRIVED: Final = 0.1  # as `arrival` in the evaluation
 START_NS: Final = 1_800_000_000 * NS
-BEFORE_S: Final = 0.0  # of the scenario's clock: no event yet
+BEFORE_S: Final = 0.0  # time of the scenario before any event
 FAKE_ICE: Final = 0.15
 FAKE_M: Final = 22.0  # half of a fake stretch
 

@@ -16,7 +16,7 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import SLIPPERY_MU, Z_95
 
 VEHICLES = 4
-SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how far it is off
+SPREAD = 0.06  # standard deviation that the map states for a cell, and that of its actual error
 
 
 class KnownPlaces(NamedTuple):

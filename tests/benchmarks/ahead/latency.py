@@ -31,7 +31,7 @@ from schemas.wire.ahead import GripWarning
 from tests.benchmarks.ahead.made_up_service import MadeUpService
 
 VEHICLES: Final = 200
-APART_M: Final = 60.0  # roads, northwards of each other
+APART_M: Final = 60.0  # roads, each further north than the previous one
 AHEAD_M: Final = 45.0
 SPEED: Final = 14.0
 PATIENCE_S: Final = 10.0

@@ -31,7 +31,7 @@ from tests.benchmarks.measure import SEED, read_resident_bytes
 MANY: Final = 40_000  # messages of each part
 ROWS: Final = 10
 FEW: Final = 400  # vehicles
-REGIONS: Final = 10  # in which the cells are, where there are many
+REGIONS: Final = 10  # regions over which many cells are spread
 TURN: Final = 512
 
 

@@ -31,12 +31,12 @@ from tests.benchmarks.country.sender import EVERY_S as SAYS_S
 from tests.faults.processes import Part
 from tests.faults.soak import fit_slope, memory_mb
 
-# all have been everywhere, the window is full, and two checkpoints have given their memory back
+# by then all cells were visited, the window is full, and two checkpoints released their memory
 WARM_S: Final = 660.0
 MEASURED_S: Final = 600.0
 EVERY_S: Final = 5.0
 MEMORY_S: Final = 0.25
-COMPACT_S: Final = 240.0  # twice in the ten minutes, once before
+COMPACT_S: Final = 240.0  # happens twice in the ten minutes and once before
 SERVICES: Final = ("west", "middle", "east")
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 

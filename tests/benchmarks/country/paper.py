@@ -13,8 +13,8 @@ from schemas.runtime.figures import Figure
 from tests.benchmarks.country.replayed import ROWS
 
 VEHICLES: Final = 1_000_000
-FACTOR: Final = 10  # times the country that was measured: its vehicles, stream and cells
-USED: Final = 0.6  # of a core at the most, so that a service catches up after an outage
+FACTOR: Final = 10  # vehicles, messages and cells, divided by those of the measured country
+USED: Final = 0.6  # largest share of a core, so that a service catches up after an outage
 DAY_S: Final = 86_400.0
 
 

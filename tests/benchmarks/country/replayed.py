@@ -33,7 +33,7 @@ PERIOD_S: Final = VEHICLES * ROWS / RATE
 ZONES: Final = (17, 17, 16)  # regions in each
 TOWNS: Final = ((2, 2), (9, 2), (2, 9), (9, 9))  # tiles from a region's corner
 ALIKE: Final = 8  # vehicles that share a drive in one town
-# batches of a piece: a vehicle has soon been everywhere, and what grows afterwards is no new place
+# batches per vehicle before it repeats them, so that later growth is not due to new places
 LOOP: Final = 3
 _TILES: Final = 1 << (grid.TILE_ZOOM - grid.REGION_ZOOM)  # of a region's side
 _REGIONS: Final = 1 << (grid.REGION_ZOOM - grid.ZONE_ZOOM)  # of a zone's side

@@ -21,7 +21,7 @@ from schemas.wire import Kind
 from tests.benchmarks.country.replayed import PERIOD_S, ROWS, Country
 
 EVERY_S: Final = 10.0  # between two lines
-PATIENCE_S: Final = 30.0  # for what is not acknowledged at the end
+PATIENCE_S: Final = 30.0  # wait for the remaining acknowledgements
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
 
 

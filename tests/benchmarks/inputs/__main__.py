@@ -19,7 +19,7 @@ TITLE: Final = "inputs"
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
-CARS: Final = 5  # smooth ones, and as many rough ones
+CARS: Final = 5  # drives with accurate sensors, and the same number with inaccurate ones
 
 
 def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Figure]:

@@ -25,12 +25,12 @@ from schemas.runtime.figures import Figure
 from schemas.signals import WHEELS, S
 from tests.benchmarks.inputs.planted import RATE_HZ, drives
 
-# of each car; its road goes on from drive to drive
+# drives of each car; each drive continues on the road of the previous one
 DRIVES = 10
 DRIVE_S = 60
 CARS_AT_ONCE: Final = 5
-JUDGED_S: Final = 120  # of the drive after them that is judged
-SETTLED_S: Final = 10.0  # of it that are left out
+JUDGED_S: Final = 120  # length of the following drive, which is evaluated
+SETTLED_S: Final = 10.0  # its first seconds, which are left out
 ESTIMATOR: Final = "aco-fckf"
 
 

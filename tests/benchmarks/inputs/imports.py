@@ -29,7 +29,7 @@ from tests.benchmarks.inputs.planted import Recorded, drives
 
 MADE: Final = 200  # frames of each message
 MINUTE_FRAMES: Final = 99_000
-OTHERS: Final = 40  # identifiers of a bus that nobody asks for
+OTHERS: Final = 40  # identifiers on the bus that no profile reads
 TRIES: Final = 3
 DRIVE_S: Final = 30
 START_S: Final = 1_700_000_000

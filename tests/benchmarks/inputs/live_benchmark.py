@@ -31,9 +31,9 @@ RATE_HZ: Final = 100.0
 MULTICAST: Final = "239.74.163.2"
 COUNTED: Final = ("can", "ros2", "vss")
 PATIENCE_S: Final = 60.0
-START_S: Final = 300.0  # an agent whose kernels are compiled first
-SETTLED_S: Final = 2.0  # after the last sample: rows come late by design
-KILLS: Final = 3  # of each source while an agent drives
+START_S: Final = 300.0  # includes the compilation of kernels
+SETTLED_S: Final = 2.0  # wait after the last sample: rows are delayed by design
+KILLS: Final = 3  # kills of each source while an agent runs
 
 
 @dataclass
@@ -159,7 +159,7 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
                 break
     table = np.concatenate(parts)[:, [ALL.index(channel) for channel in CHANNELS]]
     if np.isfinite(table).all(axis=1).sum() < samples // 2:
-        return samples, samples  # heard, and yet no row: nothing came in
+        return samples, samples  # received, but no row was built
     missing = -(-(sent - heard) * samples // max(sent, 1))
     return max(missing, 0) + feeds[0].lost + rows.late, samples
 
@@ -252,7 +252,7 @@ def _shows_silence(
             and troubles
             and silent == any(source in line for line in troubles)
         ):
-            return True  # its router is away: something troubles it all the time
+            return True  # its router is absent, so that it always reports a problem
         time.sleep(0.1)
     return False
 

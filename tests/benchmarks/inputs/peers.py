@@ -157,7 +157,7 @@ def send_ros2(address: str, samples: int, rate: float) -> int:
                 publisher.put(
                     bytes(store.serialize_cdr(message, message.__msgtype__)), attachment=attachment
                 )
-        wait_for_line()  # what is under way arrives before the session closes
+        wait_for_line()  # messages in transit arrive before the session closes
     return 2 * samples
 
 

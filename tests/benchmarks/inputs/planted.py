@@ -184,7 +184,7 @@ PLANTED: Final = {
 }
 RADII_ALIKE: Final = (
     {"km/h", "radius", "mph", "kn"},
-)  # factors near one: no drive tells a unit from another tyre
+)  # factors near one: no drive can distinguish a unit from another tyre
 
 
 def drives(

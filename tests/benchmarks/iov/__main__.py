@@ -22,7 +22,7 @@ from tests.benchmarks.iov.denm import measure_denm
 from tests.benchmarks.iov.planner import measure_planner
 
 SEED: Final = 4201
-SLOWER: Final = 1.2  # of the time of the quickest route
+SLOWER: Final = 1.2  # share of the time of the quickest route
 
 
 def measure_routes(folder: Path, quick: bool) -> list[Figure]:

@@ -28,7 +28,7 @@ VERSION: Final = "3.9.1"
 STREETS: Final = 14  # in each direction
 APART_M: Final = 150.0
 ORIGIN: Final = (57.70, 11.95)
-ICY_SHARE: Final = 0.08  # of the links between two crossings
+ICY_SHARE: Final = 0.08  # share of the links between two crossings
 EDGE: Final = "edge_walk"
 NO_PATH: Final = 442  # error code of an answer without a route
 

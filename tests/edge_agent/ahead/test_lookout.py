@@ -375,7 +375,7 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
         driving(router) as car,
     ):
         later_s = 0.0
-        while liar.said < every:  # a piece is asked for again when it is old
+        while liar.said < every:  # an old part of the map is requested again
             said = liar.said
             later_s = later_s + REFRESH_S + 1.0
             car.report_pose(later_s=later_s)
@@ -384,7 +384,7 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
         assert not car.lookout.counts.total_of("cells")
         car.drive_until(
             lambda seen: seen.time < time.time_ns() + NS
-        )  # at an hour from now an alert of now is forgotten
+        )  # at a pose dated an hour ahead, an alert of now would be expired
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
         assert car.next_warning().state == "raised"
         assert not car.lookout.counts.failures

@@ -76,7 +76,7 @@ def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs
     def watch() -> None:
         until(lambda: all(is_waiting(task.vehicle) for task in tasks[:jobs]))
         under_way.append(sum(is_waiting(task.vehicle) for task in tasks))
-        for task in tasks:  # what is empty is no vehicle, and ends the drive
+        for task in tasks:  # an empty pipe is no vehicle file, which ends the drive
             until(lambda task=task: is_waiting(task.vehicle))  # type: ignore[misc]
             os.close(writers[task.vehicle])
 

@@ -29,7 +29,7 @@ def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> Non
     assert np.array_equal(reported.vx, tuned.vx)
     if (
         shipped_memberships(TUNED[name]) != Memberships()
-    ):  # the default's hand-set vertices did best
+    ):  # the default's vertices, set by hand, scored best
         assert not np.array_equal(reported.vx, untuned.vx)
 
 

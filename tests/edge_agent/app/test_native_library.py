@@ -68,7 +68,7 @@ def run_python(code: str, *words: str) -> list[str]:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # it compiles, where nothing is cached
+@pytest.mark.timeout(600)  # Numba compiles if nothing is cached
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
     bit by bit. The agent that uses the library must not load the heavy modules.

@@ -28,9 +28,9 @@ from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
 from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, drive_over_joints, join_drives
 
-SAMPLES = 400  # of the short drives
-FIRST = 100  # sample from which figures are taken
-CUT = 20  # samples between two looks into the filters
+SAMPLES = 400  # samples of the short drives
+FIRST = 100  # first sample that counts in the figures
+CUT = 20  # samples between two readings of the filters' internal states
 SHORT: dict[str, float | None] = {
     "j-turn": 0.4,
     "braking": 0.3,
@@ -49,8 +49,8 @@ class Move(NamedTuple):
 
     figure: str
     drive: str
-    ratio: float  # changed over usual: at least this where it is above 1, at most where it is below
-    times: float = 3.0  # the constant
+    ratio: float  # changed / usual value: at least this if above 1, otherwise at most
+    times: float = 3.0  # factor of the constant
 
 
 LESS = 1.0 / 3.0

@@ -52,7 +52,7 @@ def test_a_car_that_starts_after_it_stood_is_not_held_back() -> None:
     rest, still = at_rest(5.0, 0.3, 0.0)
     go = signals.copy()
     go[:, S.AX] += 0.3
-    go[:, OMEGA] -= go[:1, OMEGA]  # as from standstill
+    go[:, OMEGA] -= go[:1, OMEGA]  # like after a standstill
     said = run(
         np.concatenate([rest, t - t[0] + 5.0]), np.concatenate([still, without_torque(go)]), vehicle
     )

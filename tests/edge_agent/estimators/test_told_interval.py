@@ -133,7 +133,7 @@ def _lower_while_sliding(slides: float, used: float, lower: float) -> float:
     [
         (1.0, 0.10, 0.15, 0.95 * 0.10),  # the tyre may be at its peak: friction is the grip in use
         (1.0, 0.30, 0.15, 0.15),  # the belief is lower already
-        (0.0, 0.10, 0.15, 0.15),  # no wheel slides: the grip in use says nothing of the limit
+        (0.0, 0.10, 0.15, 0.15),  # no wheel slides: the grip in use does not show the limit
         (0.5, 0.10, 0.15, 0.5 * (0.15 + 0.95 * 0.10)),
     ],
 )

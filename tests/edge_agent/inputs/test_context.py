@@ -47,7 +47,7 @@ AIR = -3.5
 WIPES = 1.0
 ENOUGH = 0.9  # share of rows that a profile with these signals must fill
 FLAGS_AT = {"abs_active": (5.0, 7.0), "esc_active": (9.0, 10.0), "tcs_active": (12.0, 15.0)}
-OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> what it tells
+OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> its channel
     "hyundai-can": {
         "TCS11": {"ABS_ACT": "abs_active", "ESP_CTL": "esc_active", "TCS_CTL": "tcs_active"},
         "FATC11": {"CR_Fatc_OutTemp": "air_temperature"},

@@ -159,7 +159,7 @@ def test_hostile_lines_of_a_receiver_are_counted() -> None:
             until(lambda: feed.heard)
             assert feed.broken == 5
             assert set(feed.take()) == {"latitude", "longitude", "speed", "course"}
-            connection.sendall(b"x" * 200_000)  # a line without an end is no receiver
+            connection.sendall(b"x" * 200_000)  # an endless line does not come from a receiver
             until(lambda: feed.losses)
         feed.close()
 

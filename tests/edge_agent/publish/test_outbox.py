@@ -354,7 +354,7 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
         fresh = outbox.store([draft(records=2)], now)
         outbox.due_batches(now, 64)
         for batch in fresh:
-            if batch.seq != 3:  # which no service can read
+            if batch.seq != 3:  # an entry that no service can read
                 outbox.settle_ranges(stream(), [(batch.seq, batch.seq)])
         assert outbox.counts.unanswered == 0 or turn >= 42
     assert len(outbox.held) == 0

@@ -75,7 +75,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         order.append("ack")
         who = (
             ["file", "folder"] if seq == 1 else []
-        )  # which vehicle of the map this is, when it is new
+        )  # number of the vehicle on the map, if it is new
         assert order == [*who, "file", "rename", "folder", "ack"]
         assert read_settled(acks) == {"sim-001": [(seq, seq)]}
 

@@ -122,7 +122,7 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
         monkeypatch.setattr(Path, name, count_calls(name, getattr(Path, name)))
     monkeypatch.setattr(
         os, "fsync", count_calls("fsync", lambda _: None)
-    )  # a dead process needs no disk that syncs
+    )  # only the process dies here, so the disk need not sync
     monkeypatch.setattr(files, "write_table", count_calls("write", files.write_table))
     monkeypatch.setattr(compaction, "write_table", count_calls("write", files.write_table))
     return seen

@@ -104,7 +104,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
     with closing(Engine(ServiceConfig(), root)) as engine:
-        for k in range(8):  # six in one cell; and one, and another, alone
+        for k in range(8):  # six vehicles in one cell, and two others alone
             latitude = LATITUDE if k < 6 else LATITUDE - 0.001 * k
             one = batch(
                 f"car-{k:03}",

@@ -356,7 +356,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
         assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
         assert list(engine.queries.answer(past, lambda _: True, now_of(ROUNDS)))
-        heard = caplog.text + capfd.readouterr().err  # the past is read by a process of its own
+        heard = caplog.text + capfd.readouterr().err  # past maps are read in a separate process
         assert all(f"{path} is damaged and is ignored" in heard for path in harmed)
         assert all(path.exists() for path in harmed)
         assert not list(old.rglob("*.bad"))

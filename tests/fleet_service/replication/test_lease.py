@@ -38,7 +38,7 @@ from tests.standbys import Host, open_hosts, restore_archive
 from tests.waiting import until
 
 RESEND_S = 1.0
-LEASE_S = 4.0  # of who is no process: a request may take a quarter of it
+LEASE_S = 4.0  # lease time of services in threads: a request may take a quarter of it
 
 
 def freeze_host(host: Host) -> None:
@@ -78,11 +78,11 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         if how not in {
             "killed",
             "stopped",
-        }:  # cut from the bucket, it hears of its successor by the token
+        }:  # a service cut off from the bucket learns of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
             assert one.has_said("lease lost to another service")
         one.to_bucket.restore()
-        one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
+        one.part.start()  # it is now the standby, whose folder becomes a copy of the bucket
         one.part.line_with("standby: ")
         two.part.stop()
         one.part.line_with("ready: ")
@@ -218,7 +218,7 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     compact(one.root)
     with pytest.raises(CopyError):
         one.copy.sync()
-    # as if it had been frozen right behind the look at its lease
+    # as if it had been frozen just after it checked its lease
     one.copy.bucket.may_write = lambda: True
     with pytest.raises(CopyError, match="another service has the lease"):
         one.copy.sync()
@@ -230,7 +230,7 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     for root in (two.root, restore_archive(tmp_path / "new", bucket)):
         assert sorted(rows_in(root, Kind.OBSERVATION)) == sorted(before)
     two.close()
-    again = Machine(tmp_path / "two", bucket)  # its start takes away what does not count
+    again = Machine(tmp_path / "two", bucket)  # its start removes objects that do not count
     assert not [name for name in bucket.read_objects() if name.startswith("inbox/")]
     again.close()
     one.close()
@@ -279,7 +279,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     one.freeze()
     one.log.close()
     assert one.holding.lease is not None
-    one.holding.lease.lost = True  # it gives nothing free
+    one.holding.lease.lost = True  # so that it releases nothing
     one.holding.close()
     two = Machine(tmp_path / "two", bucket)
     assert len(rows_in(two.root, Kind.OBSERVATION)) == 5
@@ -359,7 +359,7 @@ def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(
     with pytest.raises(InputError, match="is served by shard-0"):
         Machine(tmp_path / "two", bucket, standby=False)
     one.close()
-    Machine(tmp_path / "two", bucket).close()  # it was given free
+    Machine(tmp_path / "two", bucket).close()  # the lease was released
 
 
 def test_a_copy_of_a_folder_is_somebody_else(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
     assert told.items() <= known.items()
     assert {cell for cell, p in known.items() if p > 0.95} <= set(
         told
-    )  # evidence below 1 nat is no witness
+    )  # evidence below 1 nat supports no alert
     assert 0 < len(told) < fusion.size
 
 
@@ -241,7 +241,7 @@ def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
     slot = np.zeros(1, np.int64)
     assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
     rng = np.random.default_rng(3)
-    for cell in range(40):  # elsewhere the first two say dry things of ice
+    for cell in range(40):  # elsewhere the first two report ice as dry
         who = rng.permutation(12)
         mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
         fusion.update(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))

@@ -135,7 +135,7 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     matched(querier)
     heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
     assert texts(session, key) == ["a tile"]
-    until(lambda: replies.hangs_s > 0.0)  # as long as it takes: who looks after the service sees it
+    until(lambda: replies.hangs_s > 0.0)  # without limit: the operator sees that the service hangs
     light_came.set()
     assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
     until(lambda: replies.hangs_s == 0.0)

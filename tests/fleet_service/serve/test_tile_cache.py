@@ -55,7 +55,7 @@ def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: Ma
     made = TileCache(state, nullcontext(), 1)
     assert vehicles(made, NOW) == [1]
     visit(state, 2)
-    assert vehicles(made, NOW + 1) == [1]  # nobody was promised the second
+    assert vehicles(made, NOW + 1) == [1]  # no reader was promised the second one
     assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [2]
     visit(state, 3)
     made.acknowledge()

@@ -27,7 +27,7 @@ from edge_agent.lab.seeds import FIGURES
 from schemas.runtime.figures import Figure
 from schemas.signals import S
 
-# the bars as they were asked for: name -> (bar, better)
+# required targets: name -> (target, better)
 ASKED = {
     **{
         f"papers.004.{kind}.mae_{name}": (bar, "less")

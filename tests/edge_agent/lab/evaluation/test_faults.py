@@ -14,7 +14,7 @@ from edge_agent.lab.evaluation.campaign import DEFAULT
 from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, apply_fault
 from schemas.signals import Health, S
 
-# what the issue asks for -> the row that shows it
+# required fault -> the row that shows it
 ASKED = {
     "dropout": "inertial-dropout",
     "stuck": "wheel-speed-stuck",

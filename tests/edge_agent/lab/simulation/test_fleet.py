@@ -81,7 +81,7 @@ def test_ideal_signals_are_those_of_the_truth(
     ground = fleet.scenario.friction(t, truth.x, truth.y)
     assert (
         np.mean(np.abs(ground - truth.mu_wheel.mean(axis=2)) < 0.01) > 0.85
-    )  # elsewhere wheels are on two surfaces
+    )  # elsewhere the wheels may be on two surfaces
 
 
 def test_everybody_stays_on_the_road(

@@ -218,7 +218,7 @@ def test_a_steady_circle_has_its_centripetal_acceleration() -> None:
     speed = np.hypot(truth["true_vx"], truth["true_vy"])
     assert truth["true_ay"].mean() == pytest.approx(
         (speed**2).mean() / 40.0, rel=0.05
-    )  # his radius is not quite 40 m
+    )  # the driven radius is not exactly 40 m
     assert truth["true_ay"].mean() == pytest.approx(
         (truth["true_yaw_rate"] * truth["true_vx"]).mean(), rel=0.01
     )

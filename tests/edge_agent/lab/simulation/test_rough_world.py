@@ -203,7 +203,7 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
         back = slope_in_body(east, north, 0.3 + np.pi)
         np.testing.assert_allclose(
             there, np.negative(back), atol=1e-15
-        )  # up one way is down the other
+        )  # uphill in one direction is downhill in the other
 
 
 def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
