@@ -28,7 +28,7 @@ except ImportError as error:
 Table: TypeAlias = Any  # an ibis.Table, whose package has no types
 ENGINES: Final = ("duckdb", "spark")
 _MAP_COLUMNS: Final = (
-    # Ibis does not know geometries with a crs; files before 1.2 give bounds a mu
+    # Ibis does not know geometries with a crs. Before format 1.2, lower bounds had a mu, too.
     "cell, sector, CASE WHEN basis = 'bound' THEN NULL ELSE mu END AS mu, mu_lower, mu_upper, "
     "basis, vehicles"
 )
@@ -65,8 +65,8 @@ class QueryEngine:
             self.connection.raw_sql("SET TimeZone = 'UTC'")
             self.connection.raw_sql(
                 "SET parquet_metadata_cache = true"
-            )  # footers once, for questions about few rows
-            if self.progress:  # in a notebook even "false" would need ipywidgets
+            )  # read each footer only once, for questions about few rows
+            if self.progress:  # in a notebook, even "false" would need ipywidgets
                 self.connection.raw_sql("SET enable_progress_bar = true")
 
     def files(self, table: str) -> list[Path]:
@@ -173,5 +173,5 @@ def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     return ~t.mu.isnan() & ~t.mu_utilised.isnan() & enough
 
 
-# far below the steps of both, so that engines that round otherwise agree where they are equal
+# far below the columns' steps, so that engines that round differently agree on equal values
 _NEARLY: Final = 1e-6

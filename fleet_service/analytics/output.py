@@ -25,15 +25,15 @@ from schemas.runtime.installing import install_command
 
 SHOWN_ROWS: Final = 20
 PLOTS: Final = (".png", ".svg", ".pdf")
-MAP_CELLS: Final = 200_000  # of a page; more make browsers slow
-PARTS: Final = "members"  # of a row that stands for several cells
+MAP_CELLS: Final = 200_000  # maximum on a page; more cells make browsers slow
+PARTS: Final = "members"  # column of rows that stand for several cells
 HIDDEN: Final = (
     "west",
     "south",
     "east",
     "north",
     "cell",
-)  # of the page: who points at a place sees where it is
+)  # not shown as text on the page, because the map shows the place
 TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 

@@ -23,7 +23,7 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
     """
     slots = np.flatnonzero(
         fusion.live.vehicles[: fusion.size] > 0
-    )  # a poor fix makes neighbours that nobody visited
+    )  # an inaccurate position creates neighbouring cells that no vehicle visited
     if box is not None:
         slots = slots[grid.touches(box, grid.bounds(fusion.cell[slots]))]
     return cell_table(fusion, slots, at)

@@ -23,13 +23,13 @@ from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
 GRIP_MAP: Final = LinearSegmentedColormap.from_list("grip", GRIP)
 MU: Final = "peak adhesion μ [1]"
-MOST_ROWS: Final = 40  # spells or vehicles of a picture that can still be read
+MOST_ROWS: Final = 40  # rows (spells or vehicles) for which a plot is still readable
 MOST_PANELS: Final = 6
-# points around each cell: a road of ten metres is seen on a map of ten kilometres
+# width [points] of the line around each cell: a road of 10 m stays visible on a map of 10 km
 EDGE: Final = 1.2
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
-PUBLISHED: Final = 0.9  # how often a published interval is to hold
-ARROWS: Final = "→↑←↓"  # of the headings
+PUBLISHED: Final = 0.9  # nominal probability of a published interval
+ARROWS: Final = "→↑←↓"  # one arrow per heading
 _DARK = GRIP[2]
 _LIGHT = GRIP[8]
 _MARK = "#d0006f"
@@ -134,7 +134,7 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
         cells = np.array(one["members"], np.int64)
         patches = paint(
             axes, cell_shapes(cells), np.full(len(cells), one["mu"])
-        )  # whole: all head the same way
+        )  # whole squares, because all cells have the same heading
         axes.set_title(
             f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} "
             f"{ARROWS[one['sector']]}\n"

@@ -25,10 +25,10 @@ START_NS: Final = 1_769_472_000 * NS  # 2026-01-27 00:00 UTC
 DAY_S: Final = 86_400
 LATITUDE = 57.70
 LONGITUDE = 11.97
-CELL_S: Final = 0.7  # in a cell, at 15 m/s
+CELL_S: Final = 0.7  # time in a cell at 15 m/s
 ICE = 0.22
 DRY = 0.85
-_EXCITED: Final = 0.35  # share of visits that tell a value
+_EXCITED: Final = 0.35  # share of visits that give a friction value
 _STD: Final = 0.05
 
 
@@ -210,7 +210,7 @@ def _make_likelihoods(
     above = 0.5 * np.square(distance / flank[1]) * (distance > 0) * excited[:, None]
     floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(
         np.float32
-    )  # contamination: nothing falls below
+    )  # contamination: no likelihood is lower
     slope = rng.uniform(0.0, 1.5, (len(mu), 1)).astype(np.float32) * np.abs(distance)
     nats = np.minimum(below + above, floor) + slope * excited[:, None]
     return np.asarray(

@@ -16,15 +16,14 @@ from typing import Final, NamedTuple
 
 from schemas.thresholds import NS
 
-JUMP_NS: Final = 60 * NS  # a step that a time server takes at once, and no report minds
+# a step that a time server corrects at once, and that is harmless for reports
+JUMP_NS: Final = 60 * NS
 NEAR_NS: Final = (
     600 * NS
-)  # of a report that tells the time: younger than that, and not from a backlog
-VOTE_NS: Final = 5 * NS  # in which every vehicle that drives has been heard
-OFF_NS: Final = (
-    86_400 * NS
-)  # longer than that a service is seldom off: its clock may as well be wrong
-ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
+)  # a report shows the time if it is younger than this and not part of a backlog
+VOTE_NS: Final = 5 * NS  # time in which every driving vehicle sends a report
+OFF_NS: Final = 86_400 * NS  # after a longer downtime, the wall clock may be wrong
+ANY: Final = 1 << 61  # [ns] possible error of a clock about which nothing is known
 
 
 class TimeNow(NamedTuple):
@@ -70,9 +69,10 @@ class SteadyClock:
         self._began = steady()
         self._confirmed = False
         self._sure = 0 <= wall() - seen <= OFF_NS
-        # since when the wall clock is elsewhere, by the steady one
+        # steady time since which the wall clock differs
         self._doubted: int | None = None
-        self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
+        # whether each vehicle's reports agree with the wall clock
+        self._votes: dict[str, bool] = {}
 
     def now(self) -> int:
         """Return the service's time [ns UTC]. It follows small forward steps of the wall clock at

@@ -62,7 +62,8 @@ class Endpoints:
             queryables.append(
                 session.declare_queryable(own, lambda query: self._hand_over(query, session))
             )
-        token = session.liveliness().declare_token(own)  # last: who sees it may ask
+        # last, because a client that sees the token may query at once
+        token = session.liveliness().declare_token(own)
         try:
             yield
         finally:
@@ -94,7 +95,7 @@ class Endpoints:
     def _enqueue_weather(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        # a longer one is refused as an empty one, where refusals are counted
+        # a longer message is replaced with an empty one, which is refused and counted
         fits = len(sample.payload) <= wire.MAX_BYTES
         payload = sample.payload.to_bytes() if fits else b""
         message = WeatherMessage(str(sample.key_expr), payload, str(sample.encoding))

@@ -60,7 +60,7 @@ class Engine:
     def __init__(self, config: ServiceConfig, root: Path, holding: Ownership | None = None) -> None:
         self._config = config
         self._root = root
-        # Ownership comes before anything is read, because it fills an empty disk from the copy.
+        # Take ownership before reading anything: this step fills an empty disk from the copy.
         self.holding = holding or open_exclusive(config, root)
         self.copy = self.holding.copy
         try:

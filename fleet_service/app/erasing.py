@@ -58,7 +58,7 @@ def handle_requests(
         except InputError as error:
             erasure_requests.answer_request(question, error)
             continue
-        if outcome is None:  # the service stops; the next one does it
+        if outcome is None:  # the service stops; after its next start it carries out the request
             break
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
@@ -142,7 +142,7 @@ def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     """
     known = weather.weather_files(
         root
-    )  # one that comes meanwhile is read again, which changes nothing
+    )  # a file that arrives meanwhile is read twice, which changes nothing
     with erase_files(root, request["vehicle"], request["month"]) as done:
         cut = Cut(*request["cut"])
         checkpoints.save_checkpoint(

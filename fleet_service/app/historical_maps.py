@@ -32,11 +32,12 @@ from schemas.errors import InputError
 from schemas.query import MapQuery
 from schemas.runtime.process import trim_memory
 
-MOST_ROWS: Final = 500_000  # that are fused: some seconds, and 100 MB
-# of row groups near the box, by the files' footers, read one at a time: half a minute
+MOST_ROWS: Final = 500_000  # maximum number of rows to fuse: some seconds, and 100 MB
+# maximum number of rows near the box, according to the files' footers: half a minute
 LOOKED_ROWS: Final = 20_000_000
-IDLE_S: Final = 60.0  # for which a process waits for the next question
-ANSWERS: Final = 100  # after which it leaves: what it holds back of memory goes with it
+IDLE_S: Final = 60.0  # time for which an idle process waits for the next query
+# number of answers after which the process ends, which frees the memory that it has kept
+ANSWERS: Final = 100
 _HEAD: Final = struct.Struct("<qQ")
 _ERROR = -1
 _END = -2
@@ -112,7 +113,7 @@ class HistoricalMaps:
         head (tile number and length) of its first reply.
         """
         if process := self._keep_process(None):
-            with suppress(BrokenPipeError, ChildProcessError):  # it has just left
+            with suppress(BrokenPipeError, ChildProcessError):  # the process has just ended
                 return process, process.ask(question)
             process.end()
         process = _Process(self._root)
@@ -238,7 +239,7 @@ def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
     have been answered.
     """
     pa.set_cpu_count(1)
-    pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
+    pa.set_io_thread_count(1)  # each thread that reads keeps 20 MB of memory of its own
     for _ in range(ANSWERS):
         if not select([asked], [], [], IDLE_S)[0] or not (line := asked.readline()):
             return

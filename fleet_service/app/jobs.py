@@ -31,19 +31,19 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 
 log = logging.getLogger(__name__)
-ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
-# Segments that may wait for compaction. A question to the archive reads each of them, in a
-# millisecond.
+ROUND_ROWS: Final = 250_000  # rows of one round of compaction: a second of work, 150 MB
+# Maximum number of segments that wait for compaction. A query to the archive reads each of
+# them in a millisecond.
 SEGMENTS_MOST: Final = 10_000
-INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
-# after which the archive's copy has what compaction, checkpoints and snapshots made
+INVENTORY_S: Final = 300.0  # a scan of thousands of files takes a tenth of a second
+# period in which results of compaction, checkpoints and snapshots are copied to the bucket
 FOLLOW_S: Final = 30.0
 DAY_S: Final = 86_400.0
-ASKED_S: Final = 2.0  # between two looks whether an erasure, or a hand-over, is asked for
-# after the start; the first turn of a job does not wait for its whole interval
+ASKED_S: Final = 2.0  # period of the checks for a requested erasure or hand-over
+# first run of a job after the start; it does not wait for its whole period
 SOON_S: Final = 60.0
 HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
-_NICE: Final = 10  # the worker goes first
+_NICE: Final = 10  # lower priority than the worker
 
 
 class Job(NamedTuple):
@@ -140,7 +140,7 @@ def archive_jobs(
             checkpoint(stop)
             following(stop)
         except BaseException:
-            holding.to = ""  # it goes on here
+            holding.to = ""  # the service stays here
             raise
         holding.leaves = True
         return f"handing over: to {holding.to}"
@@ -211,7 +211,8 @@ class BackgroundJobs:
         self._thread.join()
 
     def _keep(self) -> None:
-        with suppress(OSError):  # where it may not: the jobs matter more than their place
+        # not permitted everywhere; the jobs matter more than their priority
+        with suppress(OSError):
             os.setpriority(
                 os.PRIO_PROCESS, threading.get_native_id(), _NICE
             )  # of this thread alone, on Linux

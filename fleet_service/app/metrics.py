@@ -12,9 +12,9 @@ from schemas.config import ServiceConfig
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
-STALLED_S: Final = 5.0  # without a turn of the worker, which takes milliseconds
-CLOCK_S: Final = 60.0  # the system's clock is elsewhere by so much: a time server is missing
-FULL: Final = 0.9  # of the queue
+STALLED_S: Final = 5.0  # time without a pass of the worker's loop, which takes milliseconds
+CLOCK_S: Final = 60.0  # difference from the system's clock that shows that a time server is missing
+FULL: Final = 0.9  # share of the queue
 _FAMILIES: Final = (  # prefix of the counts, name, label, text
     ("refused.", "refused_messages", "reason", "batches that were refused, by reason"),
     ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),

@@ -38,15 +38,15 @@ from schemas.runtime.metrics import serve_metrics
 from schemas.wire import Alert
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
-# between two puts of alerts that stand: who comes back waits less than 5 s for them
+# period in which active alerts are published again: a client that returns waits less than 5 s
 REPEAT_S: Final = 2.0
-REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
-# of a segment or a tile of an answer that is being made: systemd is to start anew
+REPEATED: Final = 1000  # alerts per period, 150 kB; further ones follow in the next periods
+# time for one segment or one tile of an answer after which systemd restarts the service
 HANGS_S: Final = 60.0
-STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
-LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
-SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
-BEHIND: Final = 1000  # messages that wait; a worker that is so far behind puts one tile a turn
+STUCK_S: Final = 10.0  # a worker without progress for this time must be replaced by another service
+LEAVE_S: Final = 1.5  # part of the three seconds within which a service must end
+SURVIVED_S: Final = 20.0  # a service that runs for this time was not ended by its checkpoint
+BEHIND: Final = 1000  # waiting messages with which the worker publishes only one tile per pass
 
 
 class Service:
@@ -94,7 +94,7 @@ class Service:
         self.engine.settlement.call_when_written(self.inbox.wake)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
-        # of the worker; leaving the session after it may hang
+        # failure of the worker; closing the session after it may hang
         self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
@@ -108,7 +108,7 @@ class Service:
         self._status_line = StatusLine(self.engine, self.inbox, self._clock, log_line)
         self._began = self._stepped_at
         self._survived = False
-        self._followed = False  # by a service that has the lease now
+        self._followed = False  # another service has the lease now
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then write the waiting rows to disk, acknowledge them, and
@@ -254,7 +254,8 @@ class Service:
         """
         if self.engine.holding.is_lost:
             self._followed = True
-            stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
+            # after this, nothing that waits for a bucket or a router delays the end for long
+            stop.set()
             self._log_line(
                 "lease lost to another service; senders keep everything that was not acknowledged"
             )
@@ -269,7 +270,7 @@ class Service:
                 break
             self._take(session, messages)
         publish_acks(session, self.engine.settlement.flush())
-        if not leaves:  # else they are put by who comes, which puts all tiles
+        if not leaves:  # otherwise the next owner publishes all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status_line.write_line(time.monotonic())
 

@@ -19,15 +19,15 @@ from fleet_service.ingest.dedup import BatchId
 from fleet_service.replication.bucket import CopyError
 from fleet_service.replication.ownership import Ownership
 
-# Most rows that wait for the disk. With more, nothing is taken from the queue until a segment is
-# written.
+# Maximum number of rows that wait for the disk. At this limit, no message is taken from the
+# queue until a segment is written.
 WAITING_ROWS: Final = 1_000_000
-# the same for batches that are on disk and not yet in the copy: 100 MB
+# the same limit for batches that are on disk but not yet in the copy: 100 MB
 WAITING_BATCHES: Final = 1_000_000
-# Between the beginnings of two segments. A segment is a file, which a restart reads in 1.4 ms and a
-# write makes in 3 ms; with .1 s a restart takes 4 s for those since the last checkpoint.
+# Minimum time between the beginnings of two segments. A segment costs 1.4 ms at a restart and 3 ms
+# to write; with .1 s a restart takes 4 s for the segments since the last checkpoint.
 LEAST_S: Final = 0.25
-WRITE_SHARE: Final = 0.25  # of the time, at most, in which segments are written
+WRITE_SHARE: Final = 0.25  # maximum share of the time in which segments are written
 T = TypeVar("T")
 
 

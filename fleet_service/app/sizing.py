@@ -16,13 +16,13 @@ from schemas import grid
 from schemas.thresholds import EARTH_RADIUS_M
 
 _DAY_S: Final = 86_400.0
-_USED: Final = 0.6  # of a core, at most: a service must catch up after an outage
+_USED: Final = 0.6  # maximum load of a core: a service must be able to catch up after an outage
 _CELL_M: Final = (
     2.0 * math.pi * EARTH_RADIUS_M / (1 << grid.CELL_ZOOM)
 )  # edge of a cell at the equator
-_DIAGONAL: Final = 4.0 / math.pi  # cells that a road of any direction touches, per edge length
+_DIAGONAL: Final = 4.0 / math.pi  # cells that a road of random direction touches, per edge length
 _DIRECTIONS: Final = 2
-_EPOCH_S: Final = 60.0  # the checkpoint moves in such steps
+_EPOCH_S: Final = 60.0  # step of the checkpoint
 
 
 class Costs(NamedTuple):

@@ -27,7 +27,7 @@ class StandingAlerts:
 
     def __init__(self, shared: SharedState) -> None:
         self._shared = shared
-        self._turn = 0  # of the alerts that are repeated
+        self._turn = 0  # position of the next alert to repeat
         self._erased: list[
             Alert
         ] = []  # alerts that ended by erasure; their end is not published yet

@@ -39,12 +39,13 @@ from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 
-# After fifty-six times the mean time between changes (fusion.constants.CHANGE_S) nothing of a
-# belief is left.
+# After this time, which is 56 times the mean time between changes (fusion.constants.CHANGE_S),
+# nothing of a belief is left.
 KEPT_NS: Final = 7 * DAY_NS
-LEAST_DROPPED: Final = 0.01  # of all cells: fewer are not worth copying the others
+# minimum share of cells to drop; for fewer it is not worth copying the others
+LEAST_DROPPED: Final = 0.01
 VISITORS: Final = "visitors"  # a table of a checkpoint
-SLOTS: Final = 20_000  # at once: a lock is held for 40 ms, and little memory is needed
+SLOTS: Final = 20_000  # slots per step: the lock is held for 40 ms, and little memory is needed
 
 
 class ServiceState(NamedTuple):
@@ -153,7 +154,7 @@ def load_state(
     public = None
     if (
         config.public_vehicles > 1
-    ):  # after a checkpoint that does not have them nothing is shown until so many came
+    ):  # without public cells in the checkpoint, cells are shown only after new visits
         kept = begin.extra_tables
         known = {VISITORS, WAITING, PRESENT} <= kept.keys() and len(kept[VISITORS]["bits"])
         visitors = Visitors.of(fusion, kept[VISITORS]) if known else Visitors(fusion)
@@ -161,7 +162,8 @@ def load_state(
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)
-    used = archived_reports(root, damaged=damaged)  # before the observations, which it acts on
+    # weather first, because it affects the observations
+    used = archived_reports(root, damaged=damaged)
     fusion.update_weather(
         archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
     )
@@ -171,9 +173,8 @@ def load_state(
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
-        noting = (
-            None if begin.cut else beside.submit(noted)
-        )  # what a checkpoint knows, the replay asks
+        # after a checkpoint, the replay needs `streams` as it was then, so the update comes later
+        noting = None if begin.cut else beside.submit(noted)
         for slots in chain(restored, (updated.slots for updated in rest)):
             alerts.update(slots)
             shown.mark_changed(slots)
@@ -181,7 +182,7 @@ def load_state(
             noted()
         else:
             noting.result()
-    pa.default_memory_pool().release_unused()  # the archive went through it
+    pa.default_memory_pool().release_unused()  # memory that was needed to read the archive
     memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, public)
     memory.drop_old()
     return memory

@@ -12,7 +12,7 @@ from typing import Final
 
 from schemas.errors import InputError
 
-LOOK_S: Final = 0.1  # between two looks whether it shall stop
+LOOK_S: Final = 0.1  # period of the checks whether to stop
 
 
 def run_module(
@@ -33,7 +33,7 @@ def run_module(
                 output, errors = child.communicate(document, LOOK_S)
                 break
             except subprocess.TimeoutExpired:
-                document = None  # it is on its way
+                document = None  # the text has been passed to the process
                 if stop.is_set():
                     child.terminate()
                     return None

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import Any, Final, TypeVar
 
-WAIT_S: Final = 0.2  # between two looks whether the service stops
-MOST_S: Final = 10.0  # for a good segment; a full disk gives none, and other jobs make room
+WAIT_S: Final = 0.2  # period of the checks whether the service stops
+# wait for a written segment; with a full disk there is none, and other jobs must make room
+MOST_S: Final = 10.0
 T = TypeVar("T")
 
 

@@ -89,7 +89,7 @@ class SegmentLog(Generic[Batch]):
         self._writer = Writer(root, shard, epoch)
         self._upload = upload
         self._next: _Load[Batch] = _Load()
-        self._load: _Load[Batch] = _Load()  # what was handed over
+        self._load: _Load[Batch] = _Load()  # rows that are being written
         self._written: Future[None] | None = None
         self._began = 0.0
         self.begun_s = -math.inf
@@ -187,7 +187,8 @@ class SegmentLog(Generic[Batch]):
             OSError: the disk is full or broken; rows that are not durable wait for the next write.
         """
         durable = self.end()
-        self._next.batches[:0] = durable  # they are reported with the rest, which may fail
+        # they are returned with the other batches, whose write may fail
+        self._next.batches[:0] = durable
         self.begin()
         return self.end()
 

@@ -19,7 +19,7 @@ from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
-LIVE: Final = ("run", "watch", "page", "cits", "router")  # commands that go on until a signal
+LIVE: Final = ("run", "watch", "page", "cits", "router")  # commands that run until a signal arrives
 
 COMMANDS: Final = (
     Command(
@@ -154,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
     with (
         nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
-    ):  # what it loads takes a second
+    ):  # the import takes a second
         arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
         if arguments.verbose:
             logging.basicConfig(

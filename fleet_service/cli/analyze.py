@@ -23,7 +23,7 @@ from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
-# which questions an option is for; to the others it would be one that is passed over in silence
+# options by question; for another question an option would be ignored without a message
 FOR: Final = {
     "at": ("before-after", "replay"),
     "stations": ("weather", "change-rates"),
@@ -110,7 +110,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.roads is not None and question.name != "contract":
         from fleet_service.analytics.roads.join import read_roads
 
-        roads = read_roads(arguments.roads)  # a wrong file is an early error
+        # read early, so that a wrong file is reported before the computation
+        roads = read_roads(arguments.roads)
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*time_span(arguments), bbox)
     if not arguments.as_it_lies:

@@ -12,9 +12,9 @@ from schemas.errors import InputError
 from schemas.runtime.installing import install_command
 
 LONGEST_DAYS = 36525.0  # a century; beyond, dates end
-# names that may be revoked without a word: a list that is short by mistake must not end a fleet
+# names that may be revoked without a question: an incomplete list must not revoke a whole fleet
 ASKED = 3
-SHOWN = 8  # names of a kind
+SHOWN = 8  # names shown of each kind
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="to",
         metavar="URI",
         help="URI to which new files are copied afterwards, e.g. s3://bucket/folder",
-    )  # --to: its name until 0.2
+    )  # --to was the option's name until 0.2
     parser.add_argument(
         "--round-rows",
         metavar="N",

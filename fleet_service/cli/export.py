@@ -37,7 +37,7 @@ _LIVE: Final = ("country", "supplier", "follow", "connect", "config")
 _ROADS: Final = ("roads", "exclude_ice")
 _PART: Final = ("bbox", "since", "until", "last")
 _TABLE: Final = ("catalog", "namespace", "at")
-_NOT: Final = {  # options of another kind of export
+_NOT: Final = {  # options that belong to another kind of export
     **dict.fromkeys(WHAT, (*_LIVE, *_TABLE, *_ROADS)),
     DATEX: ("archive", *_PART, *_TABLE, *_ROADS),
     ICEBERG: (*_LIVE, *_PART, *_ROADS, "out", "snapshot"),

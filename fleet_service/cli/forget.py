@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from fleet_service.archive.identity.erasure_requests import Erasure
     from fleet_service.archive.maintenance.retention import ErasureResult
 
-ASK_S: Final = 0.5  # between two looks whether the service has answered
-LOOK_S: Final = 5.0  # ... and whether it is still there
+ASK_S: Final = 0.5  # period of the checks whether the service has answered
+LOOK_S: Final = 5.0  # period of the checks whether the service is still running
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +106,8 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
 
     question = erasure_requests.write_request(root, wanted) if is_served(root) else None
     looked = time.monotonic()
-    while question is not None:  # a service that ends meanwhile leaves it to us
+    # if the service ends meanwhile, this process carries out the erasure
+    while question is not None:
         if (answer := erasure_requests.answer_to(question)) is not None:
             return ErasureResult(
                 answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy")
@@ -150,7 +151,7 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     with closing(BucketReplica(root, url, config.archive.options)) as copy:
         copy.sync_without_lease(
             config.name
-        )  # what only the copy has comes first, or it would be found there later
+        )  # first download files that only the copy has; they may contain the vehicle's rows
         yield
         try:
             copy.sync()

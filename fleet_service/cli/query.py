@@ -11,7 +11,7 @@ from fleet_service.cli.common import add_connection, describe_covered_box
 from schemas.errors import InputError
 from schemas.runtime import commandline
 
-# The ending of a file decides what is asked for: a form of answer of the service.
+# The ending of the file selects the format in which the service answers.
 FORMS: Final = {
     ".arrow": "arrow",
     ".parquet": "arrow",
@@ -19,7 +19,7 @@ FORMS: Final = {
     ".geojson": "geojson",
     ".json": "json",
 }
-NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some of it
+NOBODY: Final = 1  # exit code if no service answers for at least a part of the area
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

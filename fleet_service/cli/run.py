@@ -23,11 +23,12 @@ if TYPE_CHECKING:
     from fleet_service.replication.ownership import Ownership
     from schemas.config import ServiceConfig
 
-PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
-# after which a busy worker lets an answer go first; ten times that is Python's own
+# data about vehicles are readable only by the service and its group, whatever the process mask
+PRIVATE = 0o027
+# time after which a busy worker lets another thread run; Python's default is ten times this
 SWITCH_S = 0.0005
-LEAVE_AT_LAST_S = 2.5  # after a signal; the process is to have ended within 3 s
-FREEING_S = 0.4  # of them, for a bucket to take a word
+LEAVE_AT_LAST_S = 2.5  # [s] after a signal; the process must end within 3 s
+FREEING_S = 0.4  # part of this time to release the lease in the bucket
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("archive", problem, "give a folder that you may read and write") from error
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
-    # what came from the archive stays: looking through it takes longer than an alert may
+    # Objects loaded from the archive stay: a garbage collection over them would delay alerts.
     gc.freeze()
     stopped = threading.Event()
     threading.Thread(
@@ -152,7 +153,7 @@ def _force_exit_when_stuck(
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):
         log_line("shutdown incomplete: a session or a job did not end in time")
-        faulthandler.dump_traceback()  # which one, and where
+        faulthandler.dump_traceback()  # shows which thread hangs, and where
         if service.failure is not None:
             traceback.print_exception(service.failure)
         code = service.exit_code

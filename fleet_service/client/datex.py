@@ -25,13 +25,13 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
-# for which an ended situation is told: who pulls every few minutes does not miss the end
+# time for which an ended situation is published, so that clients that poll every few minutes see it
 KEPT_S: Final = 3600
-INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
-# of P(slippery), from which on it is said
+INTERVAL_STD: Final = 2.0 * Z_95  # standard deviations in a 90 % interval of a normal distribution
+# P(slippery) from which on the certainty is stated
 CERTAIN = 0.97
 PROBABLE = 0.8
-DIGITS: Final = 6  # a tenth of a metre; a cell is ten
+DIGITS: Final = 6  # decimal places of a degree: a tenth of a metre, with cells of ten metres
 _XSI: Final = "http://www.w3.org/2001/XMLSchema-instance"
 _SPACES: Final = {
     "d2": "http://datex2.eu/schema/3/d2Payload",
@@ -127,7 +127,7 @@ def make_publication(
     text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
     used = (
         f'xmlns:sit="{_SPACES["sit"]}"'.encode()
-    )  # by the payload's type too, where no situation declares it
+    )  # needed for the payload's type, too, if there is no situation
     return text if used in text else text.replace(b"<d2:payload ", b"<d2:payload " + used + b" ", 1)
 
 

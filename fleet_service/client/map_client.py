@@ -24,11 +24,11 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 TIMEOUT_S: Final = 10.0
-NAMED: Final = 5  # regions that a sentence names
-PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
+NAMED: Final = 5  # maximum number of regions that a message names
+PAST_S: Final = 60.0  # a past map is rebuilt from the archive, which takes time
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
-SERVED_S: Final = 1.0  # for a router to say who answers
-# a router ends questions to a service that was killed, and tells then that its token fell
+SERVED_S: Final = 1.0  # time within which a router states who answers
+# if a service was killed, the router ends its queries and then removes its token
 FALLS_S: Final = 0.1
 SHOWN: Final = (
     "latitude",
@@ -94,8 +94,10 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         before = services.active
         payloads = sorted(query_replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)
-        after = services.refresh(session)  # who came meanwhile may not have been asked
-        # and who went may have been asked in place of who followed it, even if it is back
+        # services that came meanwhile may not have received the query
+        after = services.refresh(session)
+        # a service that ended may have received the query instead of its successor, even if it is
+        # back
         withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
         whole = {
@@ -103,15 +105,15 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         }
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
-        if not declared and services.refresh(session):  # it came while it was looked for
+        if not declared and services.refresh(session):  # a service came during the check
             declared = True
             served = bool(payloads)
         elif (
             not declared and served and not payloads
-        ):  # likewise, and its token is on the way; or it has none
+        ):  # the service came during the check and its token follows, or it has none
             payloads = sorted(query_replies(session, EVERYWHERE, parameters))
     answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
-    if not declared:  # services of a former version, or an access list of one
+    if not declared:  # services of an earlier version, or an access list of one
         return answer
     tiles = {
         regions.region_of(tile)

@@ -20,12 +20,12 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
-STEP_M: Final = 5.0  # between two looks along a link
+STEP_M: Final = 5.0  # step along a link
 # Braking distance grows with 1/mu. Squared, a way round of a fifth is worth it from mu .45 of .5
 # on, and ten times the length at mu .16.
 GOOD_GRIP: Final = 0.5  # lower bound of a wet road; above it costs nothing
 POWER: Final = 2.0
-# Valhalla refuses too great a spread, and finds no way round ice at the destination otherwise
+# Valhalla refuses larger ratios, and then finds no route to a destination on ice
 MOST: Final = 20.0
 STEPS: Final = (
     1.0,
@@ -34,12 +34,12 @@ STEPS: Final = (
     5.0,
     10.0,
     MOST,
-)  # factors that are written; neighbours of one class are one line
-SHORTEST_M: Final = 15.0  # a line that can be placed on a link
-# upper end below which, and P(slippery) from which, a cell is taken out as ice
+)  # classes of cost factors; neighbouring parts of one class become one line
+SHORTEST_M: Final = 15.0  # shortest line that can be placed on a link
+# limits of the upper end of the interval and of P(slippery), with which a cell is excluded as ice
 ICE_LOWER = 0.3
 ICE_SURE = 0.9
-HALF_WIDTH_M: Final = 8.0  # of a polygon around a road
+HALF_WIDTH_M: Final = 8.0  # half width of the polygon around a road
 
 
 class RoadLine(NamedTuple):

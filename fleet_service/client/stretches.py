@@ -24,7 +24,7 @@ from schemas.wire import Alert
 State = Literal["raised", "changed", "cleared"]
 # Cells in between that nobody drove hard enough over, or that a bend cuts: 30 to 60 m.
 LINK_CELLS: Final = 3
-ROUND: Final = 1.3  # a stretch less elongated than that has no direction
+ROUND: Final = 1.3  # a less elongated stretch has no direction
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Stretches:
             )
             while not names and (
                 name in out or name in self._known
-            ):  # a part that fell off begins with the same cell
+            ):  # a part that split off begins with the same cell
                 name += "b"
             out[name] = part
         return out
@@ -214,13 +214,13 @@ def link_cells(cell: IntArray) -> IntArray:
     """
     distinct, first, of_cell = np.unique(cell, return_index=True, return_inverse=True)
     one, other = _find_neighbours(distinct)
-    label = first.copy()  # of a cell: the first one of its stretch, as far as is known
+    label = first.copy()  # first known cell of the stretch of each cell
     while len(one):
         lower = np.minimum(label[one], label[other])
         joined = label.copy()
         np.minimum.at(joined, one, lower)
         np.minimum.at(joined, other, lower)
-        joined = joined[of_cell[joined]]  # what a cell's first one has learned
+        joined = joined[of_cell[joined]]  # use the result that a cell's first cell has obtained
         if (joined == label).all():
             break
         label = joined

@@ -26,8 +26,8 @@ from typing import Any, Final
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 
-QUESTION_BYTES: Final = 1024  # of payload and attachment; there is none
-# of a picture of the map ahead, or of the signals: ten times the largest measured
+QUESTION_BYTES: Final = 1024  # limit of payload and attachment; queries have neither
+# limit for a picture of the map ahead, or for the signals: ten times the largest measured
 PRIVATE_BYTES: Final = 256 * 1024
 PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
 WEATHER: Final = f"{keys.ROOT}/weather/**"
@@ -45,10 +45,10 @@ MESSAGES: Final = (
     "declare_liveliness_subscriber",
 )
 MAX_SESSIONS: Final = 5000  # one per vehicle; Zenoh's own limit is 1000
-# A whole tile as GeoJSON is about 50 MB; Zenoh would put together a gigabyte from fragments before
-# it looks at it.
+# A whole tile as GeoJSON is about 50 MB. Without this limit Zenoh would join fragments up to a
+# gigabyte before it checks the size.
 MAX_MESSAGE: Final = 64 * 1024 * 1024
-LEASE_MS: Final = 3000  # after which a silent peer counts as gone
+LEASE_MS: Final = 3000  # time after which a silent peer counts as disconnected
 
 Section = dict[str, Any]
 
@@ -132,8 +132,8 @@ def access_control(fleet: Enrolment) -> Section:
         | {"permission": "deny"},
         _allow_rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _allow_rule("told", ("egress",), ("put", "reply"), PUBLIC),
-        # Declared publishers and queriers send nothing, silently, until they are told that somebody
-        # listens.
+        # Declared publishers and queriers send nothing, without an error, until they are told that
+        # a subscriber exists.
         _allow_rule(
             "listened",
             ("egress",),
@@ -142,8 +142,8 @@ def access_control(fleet: Enrolment) -> Section:
         ),
         _allow_rule("weather", ("ingress",), ("put",), [WEATHER]),
         _allow_rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
-        # Who serves which region is no secret: else a region without a service looks like one
-        # without grip reports.
+        # Readers may see which services serve a region. Otherwise a region without a service looks
+        # like a region without grip reports.
         _allow_rule(
             "who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]
         ),
@@ -200,7 +200,7 @@ def _own_rules(name: str) -> list[Section]:
             ("put",),
             [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), *keys.private_keys(name)],
         ),
-        # a declared publisher sends nothing until it is told that its owner listens
+        # a declared publisher sends nothing until it is told that its owner has subscribed
         _allow_rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
         *_subscriber_rules(name, keys.private_keys(name)),
         _allow_rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),

@@ -167,7 +167,7 @@ def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> 
         InvalidSignature,
         ValueError,
         TypeError,
-    ):  # another key, another name, another kind of key
+    ):  # signed by another key, issued by another name, or another kind of key
         return False
     return True
 

@@ -20,7 +20,7 @@ from fleet_service.enrolment.access import router_configuration
 from fleet_service.enrolment.fleet import Enrolment, Step
 from schemas.errors import InputError
 
-PRIVATE: Final = 0o700  # of the authority's folder
+PRIVATE: Final = 0o700  # mode of the authority's folder
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Registry:
                 ".key",
                 ".json5",
                 ".pem",
-            ):  # the certificate last: cut off half way, it is done again
+            ):  # the certificate is moved last, so that an interrupted step is repeated
                 path = self._folder / f"{name}{ending}"
                 if path.exists():
                     path.rename(self._revoked / path.name)

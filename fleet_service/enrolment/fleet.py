@@ -16,7 +16,7 @@ from schemas.config import Settings, VehicleName
 _LABEL = r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"  # RFC 1123, section 2.1
 _HOST = re.compile(
     rf"(?:{_LABEL}\.)*{_LABEL}\.?"
-)  # one way to read each letter, so that a wrong one is seen at once
+)  # each character matches in one way only, so a wrong name is rejected without backtracking
 
 
 def _checked_host(host: str) -> str:
@@ -28,7 +28,7 @@ def _checked_host(host: str) -> str:
     return host
 
 
-Step = Literal["next", "switch", "drop"]  # of the way to another authority
+Step = Literal["next", "switch", "drop"]  # steps of the change to another authority
 Host = Annotated[str, AfterValidator(_checked_host)]
 
 

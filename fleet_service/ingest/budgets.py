@@ -14,17 +14,17 @@ import numpy as np
 
 from schemas.numeric import BoolArray, IntArray
 
-# A car on roads that are all new passes 3 cells of 10 m a second; of such a cell 1 kB is kept.
+# A car on roads that are all new passes 3 cells of 10 m per second, and a cell takes 1 kB.
 NEW_CELLS_PER_HOUR: Final = 14_000.0
-# an hour on such roads, that a service was away: its backlog reaches the map
+# an hour on such roads during an outage of the service: its backlog still reaches the map
 NEW_CELLS_AT_ONCE: Final = 11_000.0
-# Such cells are kept for a week. 1 000 km of roads that nobody else drives: 100 MB at once, and as
-# much in a week.
+# Such cells are kept for a week: 1 000 km of roads on which nobody else drives, 100 MB at
+# once, and as much per week.
 NEW_CELLS_PER_WEEK: Final = 100_000
-# A start, two kinds, and a region every quarter of an hour; after an outage a handful of starts.
+# One start, two kinds, and one region per quarter of an hour; some starts after an outage.
 STREAMS_PER_HOUR: Final = 60.0
 STREAMS_AT_ONCE: Final = 120.0
-VEHICLES: Final = 200_000  # that are remembered
+VEHICLES: Final = 200_000  # maximum number of vehicles that are remembered
 HOUR: Final = 3600.0
 WEEK_HOURS: Final = 168.0
 

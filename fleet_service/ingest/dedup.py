@@ -20,8 +20,8 @@ from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
-# Batches above the first that is missing: an agent sends old ones first, so that it has some
-# hundreds after an outage.
+# Maximum number of batches above the first missing one: an agent sends old ones first, so some
+# hundreds are missing after an outage.
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
@@ -83,7 +83,7 @@ class SequenceTracker:
         """
         if (
             seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
-        ):  # as most often: a run that goes on
+        ):  # the most frequent case: consecutive numbers
             self.raise_to(seqs[-1] + 1)
         else:
             for seq in seqs:
@@ -244,7 +244,7 @@ class SequenceTrackers:
         for stream, least, last in zip(streams, held, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)
-        # few: senders hold little
+        # few, because senders store little
         above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])
         above = above[np.lexsort((seq[above], group[above]))]
         starts = np.flatnonzero(np.diff(group[above], prepend=-1))

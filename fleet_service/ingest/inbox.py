@@ -41,22 +41,22 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 
-# Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than
-# a moment. Most of the work is by the record, of which 160 bytes are one.
+# Work per step of the worker, so that a flood delays alerts, answers and segments only briefly.
+# The cost is mainly per record; 160 bytes count as one record.
 STEP_MESSAGES: Final = 4096
 STEP_BYTES: Final = 768 * 1024
-# A step costs as much as a hundred records even if it brings one. So what comes within a moment of
-# the first message is taken with it, unless enough waits already: at 2 000 messages a second that
-# is a fifth of the processor time, and the interpreter is free for answers.
+# A step costs as much as a hundred records even for one message. Therefore messages that arrive
+# shortly after the first are processed with it, unless enough are waiting. At 2 000 messages per
+# second this takes a fifth of the processor time, and the interpreter is free for answers.
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
 QUEUE_BYTES: Final = (
     64 << 20
-)  # that wait at the most: half a minute's work, whatever the number of messages
-FORGET_NS: Final = 600 * NS  # between two looks for streams too old to matter
+)  # maximum work that waits: half a minute, whatever the number of messages
+FORGET_NS: Final = 600 * NS  # period of the checks for streams that are too old
 KNOWN_NS: Final = (
     MAP_DAYS + 2
-) * DAY_NS  # a restart reads whole days again, and asks which of them it knows
+) * DAY_NS  # a restart reads whole days again, and then checks which batches are known
 
 
 class Message(NamedTuple):
@@ -79,7 +79,7 @@ class Inbox:
     """
 
     def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
-        # without locks in Python, a fifth of the cost; None only wakes the thread that drains
+        # without Python locks: a fifth of the cost; None only wakes the thread in `drain`
         self._queue: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._capacity = capacity
         self._counts = counts
@@ -182,7 +182,8 @@ class BatchIntake:
         }
         self._forgot = 0
         self._now = 0.0
-        self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
+        # newest time that each vehicle reported in the last call [ns]
+        self.times: dict[str, int] = {}
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
         """Return the rows of valid, new batches (messages with records), by kind (observations or
@@ -248,7 +249,7 @@ class BatchIntake:
                 and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt
             ):
                 self._counts["clock_doubted"] += (
-                    1  # neither let in nor refused: its sender keeps it
+                    1  # neither accepted nor refused; the sender keeps it
                 )
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
@@ -286,7 +287,7 @@ class BatchIntake:
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():
-                with suppress(OSError):  # without its month's key it is not let in either
+                with suppress(OSError):  # without the month's key the batch is not accepted
                     pseudonym = self._pseudonyms.of(str(owners[place].name), int(time[place]))
                     out[place] = int(time[place]) < self._erased.vehicles.get(
                         pseudonym_number(pseudonym), 0
@@ -345,9 +346,7 @@ class BatchIntake:
             self._counts["key_failures"] += 1
             return None
         key = (pseudonym, boot, kind, region)
-        if (
-            key not in self._streams
-        ):  # else its archive is older, and keeps starts as they were sent
+        if key not in self._streams:  # older archives contain start numbers as they were sent
             key = (pseudonym, boot_pseudonym, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
             self._counts["too_many_streams"] += 1
@@ -371,7 +370,7 @@ class BatchIntake:
         owner = np.repeat(np.arange(len(batches)), sizes)
         for index in np.flatnonzero(
             broken >= 0
-        ).tolist():  # only refused rows are visited one by one
+        ).tolist():  # only refused rows are processed one by one
             place = int(owner[index])
             if good[place]:
                 good[place] = False
@@ -385,7 +384,7 @@ class BatchIntake:
             stream, seq = batches[place]
             if not stream.accept(
                 seq, at
-            ):  # no room to remember it: older ones must come first, it is no rejection
+            ):  # no space to record it: older batches must come first, so this is no rejection
                 self._counts["too_many_gaps"] += 1
                 good[place] = False
         if not good.all():
@@ -399,7 +398,7 @@ class BatchIntake:
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
         if (
             refusal.rule != "vehicle"
-        ):  # else the name in the batch is not the sender's, and nor is the stream
+        ):  # otherwise neither the name in the batch nor the stream belongs to the sender
             self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 

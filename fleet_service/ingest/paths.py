@@ -23,16 +23,16 @@ from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
-FASTEST: Final = 70.0  # m/s; no road vehicle, and no error of a clock
-LEAP_M: Final = 2_000.0  # of positions that come back after a tunnel or a ferry's hold
-LEAP_M_PER_S: Final = 0.5  # by which this budget fills
+FASTEST: Final = 70.0  # m/s; faster than any road vehicle and than the effect of clock errors
+LEAP_M: Final = 2_000.0  # budget for position jumps after a tunnel or a ferry
+LEAP_M_PER_S: Final = 0.5  # rate at which the budget for jumps refills
 ANCHORS: Final = 16  # 280 bytes a vehicle
-VEHICLES: Final = 200_000  # that are remembered
+VEHICLES: Final = 200_000  # maximum number of vehicles that are remembered
 _RECENT_NS: Final = (
     10 * NS
-)  # is added to an anchor's age, so that the newest are not treated as infinitely dense
-_DETOUR_M: Final = 2_000.0  # of a way through a gap, compared with the straight one
-_START: Final = 64  # vehicles for which there is room at first
+)  # added to an anchor's age, so that the newest anchors are not treated as infinitely dense
+_DETOUR_M: Final = 2_000.0  # detour between two anchors, compared with the straight line
+_START: Final = 64  # vehicles for which there is space at first
 
 
 class VehiclePaths:

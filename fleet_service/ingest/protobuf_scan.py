@@ -255,7 +255,7 @@ def _copy_bytes(
     for k in range(len(begins)):
         sent = data[begins[k] : begins[k] + lengths[k]]
         written = into[to : to + lengths[k]]
-        for position in range(len(written)):  # of slices, so that many bytes are copied at once
+        for position in range(len(written)):  # in slices, so that many bytes are copied at once
             written[position] = sent[position]
         to += lengths_out[k]
 

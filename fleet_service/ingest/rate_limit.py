@@ -13,12 +13,12 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Final
 
-# Reading, checking and refusing the smallest message costs as much as a few dozen records.
+# Cost of the smallest message, which must be read, checked and refused: a few dozen records.
 LEAST_BYTES: Final = 1024
 JSON: Final = "application/json"
-JSON_COST: Final = 10  # times a byte of protobuf: 64 kB take 23 ms of the worker
-# Names that have a bucket of their own. More are sent by nobody but who makes them up: they share
-# one.
+JSON_COST: Final = 10  # factor per byte compared with protobuf: 64 kB take the worker 23 ms
+# Names with a bucket of their own. A larger number can only come from invented names, which share
+# one bucket.
 MOST_NAMES: Final = 100_000
 _OTHERS: Final = ""
 
@@ -47,7 +47,8 @@ class RateLimiter:
         self._known = known
         self._counts = counts
         self._clock = clock
-        self._buckets: dict[str, tuple[float, float]] = {}  # what is left, and when that was [s]
+        # remaining amount, and time of this state [s]
+        self._buckets: dict[str, tuple[float, float]] = {}
         self._swept = -float("inf")
 
     def allows(self, key: str, size: int, encoding: str = "") -> bool:

@@ -28,15 +28,15 @@ from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
-# of a batch; agents cut at ten minutes, and flush each second
+# limit for a batch; agents end batches after ten minutes, and send each second
 MAX_SPAN_NS: Final = 3_600_000_000_000
 YAW_TOLERANCE: Final = np.radians(
     75.0
-)  # between yaw and the sector's axis: 45° and what a bend turns in one visit
+)  # between yaw and the sector's axis: 45° and the angle of a bend within one visit
 ESTIMATOR_PATTERN: Final = r"[a-z0-9][a-z0-9-]{0,63}"
 KEYS_REMEMBERED: Final = (
     1 << 16
-)  # a vehicle has two; reading one costs as much as all else that is asked of a message
+)  # a vehicle has two; reading one costs as much as all other checks of a message
 _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
@@ -77,8 +77,8 @@ class Clock(NamedTuple):
     now: int
     ahead: int
     oldest: int
-    doubt: int = 0  # beyond `ahead`: neither accepted nor refused
-    least: int | None = None  # the true time is not before; None: it is `now`
+    doubt: int = 0  # range after `ahead` in which a record is neither accepted nor refused
+    least: int | None = None  # lower bound of the true time; None if it is `now`
 
     @property
     def horizon(self) -> int:

@@ -37,12 +37,13 @@ from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
-# reports that wait at the most: a whole continent's regions; the oldest go first
+# maximum number of waiting reports: the regions of a continent; the oldest are dropped
 WAITING: Final = 10_000
-MOST_BYTES: Final = 4096  # of a report; one with a prior as text has a thousand
-AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
+MOST_BYTES: Final = 4096  # limit of a report; a report with a prior as text has a thousand bytes
+# tomorrow's forecast is accepted; a report for next year comes from a wrong clock
+AHEAD_NS: Final = 86_400 * NS
 _DIGITS: Final = 20  # of the time in a file's name [ns]
-_TURNS: Final = 100  # a reader that is overtaken so often has another trouble
+_TURNS: Final = 100  # after so many restarts there must be another problem
 COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 
@@ -113,7 +114,8 @@ class WeatherInbox:
         try:
             make_folder(self._folder)
             write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet", SEGMENT)
-        except OSError:  # what is not archived must not act; the next report comes within the hour
+        # a report that is not archived must not take effect; the next one comes within the hour
+        except OSError:
             self._counts["weather_failures"] += 1
             return None
         return _read_reports(table)
@@ -176,7 +178,7 @@ def archived_reports(
                 load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths
             ]
             break
-        except FileNotFoundError:  # gathered meanwhile
+        except FileNotFoundError:  # joined into a daily file meanwhile
             continue
     else:
         raise OSError(f"the weather of {root} changes faster than it can be read")

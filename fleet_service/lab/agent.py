@@ -33,19 +33,19 @@ from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
-# What all vehicles of a place share, relative; more than half of it is the manoeuvre's. In six
-# end-to-end drives (real estimator) cells of 20 and more excited vehicles erred about the mean of
-# their surface by .059 dry, .046 wet and .044 snow (robust standard deviations; plain ones were
-# .088, .088 and .066).
+# Relative error that all vehicles of a place share; the manoeuvre causes more than half of it. In
+# six end-to-end drives (real estimator), the mean error of cells with 20 and more excited vehicles
+# differed from the mean of their surface by .059 dry, .046 wet and .044 snow (robust standard
+# deviations; plain ones were .088, .088 and .066).
 COMMON: Final = 0.05  # hypot(common, by_manoeuvre) of CLEAN
 NOISE_ABSOLUTE: Final = 0.02
 NOISE_AT_LIMIT: Final = 0.05  # relative
-NOISE_PER_SHARE: Final = 0.10  # ... more for each share that was left: .09 at EXCITED_SHARE
-CORRELATION: Final = 0.5  # of e between a vehicle's visits to neighbouring cells
+NOISE_PER_SHARE: Final = 0.10  # increase per share of unused grip: .09 at EXCITED_SHARE
+CORRELATION: Final = 0.5  # correlation of e between a vehicle's visits to neighbouring cells
 SLOPE_NATS: Final = 0.5
 USED_STD: Final = 0.02
-OVERCONFIDENT_STD: Final = 0.02  # of a liar
-BOUND_STD: Final = 0.05  # what the agent admits
+OVERCONFIDENT_STD: Final = 0.02  # standard deviation that a lying vehicle states
+BOUND_STD: Final = 0.05  # error of the grip used that the agent assumes
 
 
 class ErrorModel(NamedTuple):

@@ -27,9 +27,11 @@ class MapBar(NamedTuple):
     unit: str
 
 
-COUNTS: Final = (1, 2, 3, 5, 10, 30)  # excited vehicles per cell; each class reaches to the next
+# excited vehicles per cell; each class extends to the next number
+COUNTS: Final = (1, 2, 3, 5, 10, 30)
 ATTACKS: Final = ("replayed", "random", "shifted_pose", "flood_one_cell", "newcomers")
-EXCITED: Final = (10, 30, 100)  # percent of the visits of a third party's changing road
+# percent of visits that are excited on the changing road of another maker's fleet
+EXCITED: Final = (10, 30, 100)
 _ICE: Final = "excited passes over new ice"
 _SHARE: Final = "of cells and snapshots"
 _MINUTES: Final = "of cell-minutes"

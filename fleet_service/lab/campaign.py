@@ -29,8 +29,8 @@ from fleet_service.lab import (
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
-# Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those
-# below.
+# Seeds from JUDGING on draw towns, drives and errors for the figures; constants are chosen on
+# smaller seeds.
 JUDGING: Final = 20_000
 SEEDS = 10
 QUICK_SEEDS = 1
@@ -40,8 +40,8 @@ LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)}
 END_TO_END: Final = (
     "fusion.whole_way",
     "fusion.resampled",
-)  # prefixes of what is measured end to end
-# drives of 20 minutes; nothing random is averaged there, the largest difference counts
+)  # prefixes of the end-to-end figures
+# drives of 20 minutes; the largest difference counts, so no averaging is needed
 EXACT_SEEDS: Final = 8
 END_TO_END_PART: Final = "end-to-end"
 

@@ -21,12 +21,12 @@ from schemas.numeric import FloatArray, IntArray
 
 DRY = 0.85
 ICE = 0.20
-# the road changes after so many minutes
+# minutes after which the road changes
 VEHICLES = 60
 MINUTES = 40
 CHANGE = 22
-EXCITEMENT: Final = 0.3  # of a pass over the road
-UNREACHED: Final = 99  # passes, where the drive ended before the map had seen it
+EXCITEMENT: Final = 0.3  # probability that a pass over the road is excited
+UNREACHED: Final = 99  # value if the drive ended before the map showed the change
 
 
 def changing_town(rng: Generator, before: float, after: float) -> Town:

@@ -31,11 +31,12 @@ from schemas.wire import Alert
 
 OBSERVATIONS = "observations.parquet"
 TRUTH = "truth.parquet"
-# vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
+# minimum number of vehicles of a judged cell: one vehicle's report is not a map
 SEVERAL: Final = 2
-SAME: Final = 0.02  # of friction within a cell of one surface
+SAME: Final = 0.02  # largest difference of friction within a cell of one surface
 
-Drive = Callable[[Path], None]  # drives and writes both files into a folder
+# function that simulates a drive and writes both files into a folder
+Drive = Callable[[Path], None]
 
 
 class World(NamedTuple):
@@ -50,7 +51,7 @@ class World(NamedTuple):
 
     scenario: str
     rough: float
-    prefix: str  # of the figures
+    prefix: str  # of the figures' names
     seed: int = 20_000  # of the vehicles
 
 
@@ -58,10 +59,10 @@ WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the figures
 LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
 HILLS: Final = World(
     "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
-)  # frictions and hills that nobody tuned on
-# Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without
-# a further name, see `moments.ask_moments`. All cells of a way have the same snow,
-# so that P(slippery) needs many ways.
+)  # frictions and hills that were not used for tuning
+# Half of the vehicles have the errors of real cars, on ten towns with their own frictions and
+# hills (figures without a further name, see `moments.ask_moments`). All cells of a drive have the
+# same snow, so P(slippery) needs many drives.
 WAYS: Final = tuple(
     World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
 )

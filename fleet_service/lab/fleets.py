@@ -28,11 +28,11 @@ from fleet_service.lab.score import (
 from schemas.numeric import BoolArray
 
 VEHICLES: Final = 60
-CHANGING: Final = 0.1  # share of roads that get another surface during the drive
-# truths that count as dry and as ice
+CHANGING: Final = 0.1  # share of roads whose surface changes during the drive
+# true friction above which road counts as dry, and below which as ice
 DRY = 0.7
 ICY = 0.25
-# excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
+# minimum excited vehicles of a judged cell and minute, and minimum earlier visits per vehicle
 ENOUGH = 5
 EARLIER = 20
 

@@ -17,7 +17,7 @@ from schemas.numeric import IntArray
 from schemas.thresholds import NS
 from schemas.wire import Batch, Kind, decode
 
-BATCH_ROWS = 12  # the cells of one road
+BATCH_ROWS = 12  # number of cells of one road
 
 
 class SentMessage(NamedTuple):

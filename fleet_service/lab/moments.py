@@ -36,7 +36,8 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.thresholds import NS
 
 MOMENTS: Final = (60.0, 360.0, 1800.0)  # [s] after the first observation
-MIDDLE: Final = 0.91  # of the bar on coverage: the worst is the farthest from it
+# middle of the target range of the coverage; the worst drive is the farthest from it
+MIDDLE: Final = 0.91
 
 
 class AskedWay(NamedTuple):

@@ -32,8 +32,8 @@ from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
-NEAREST: Final = 8  # visits, by friction, of which one is drawn
-# |ln c|; beyond it another vehicle's visit is drawn: surfaces of one kind lie closer
+NEAREST: Final = 8  # number of visits with the most similar friction, of which one is drawn
+# largest |ln c|, else another vehicle's visit is drawn: surfaces of one kind are closer
 FARTHEST: Final = 0.35
 
 

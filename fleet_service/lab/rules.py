@@ -39,14 +39,14 @@ RULES: Final = (
     "federated reset",
     "median",
 )
-MEDIAN_MIN: Final = 60  # minutes that the median looks back
-# relative standard deviations of the median's interval: of all, and of one
+MEDIAN_MIN: Final = 60  # minutes before the reading that the median includes
+# relative standard deviations of the median's interval: shared by all vehicles, and per vehicle
 MEDIAN_COMMON = 0.06
 MEDIAN_OWN = 0.12
 SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
 PRIOR_MEAN: Final = 0.5 * (mugrid.LOWER + mugrid.UPPER)
 PRIOR_VAR: Final = (mugrid.UPPER - mugrid.LOWER) ** 2 / 12.0
-ROAD_VAR: Final = 0.05**2  # per cell driven: surfaces change every few cells
+ROAD_VAR: Final = 0.05**2  # per cell driven, because surfaces change every few cells
 DRIFT_VAR: Final = 0.04**2 / 3600.0  # per second
 _KALMAN: Final = 5  # rules that carry a mean and a variance
 _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)

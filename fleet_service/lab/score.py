@@ -18,11 +18,11 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
-ENOUGH: Final = 3  # excited vehicles, for an error to count
-# of P(slippery): slippery road below it is missed, grip above it is called slippery
+ENOUGH: Final = 3  # minimum excited vehicles for an error to count
+# P(slippery) below which slippery road is missed, and above which road with grip is called slippery
 MISSED = 0.3
 RAISED = 0.5
-SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
+SURE_GRIP: Final = 0.45  # friction of snow and ice is lower, of wet and dry road higher
 BINS: Final = 10  # of P(slippery)
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
 

@@ -46,12 +46,12 @@ VEHICLES: Final = 60
 CELLS: Final = 300
 STRETCH: Final = 3
 FRICTIONS: Final = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
-ICE: Final = 0.25  # truths below it count as ice
+ICE: Final = 0.25  # lower true friction counts as ice
 MINUTES: Final = 40
 VISITS: Final = 15  # per cell
-HARD_VISITS: Final = 0.5  # share of the visits
-SHARE: Final = (0.75, 0.97)  # of the grip, used in an excited visit
-GENTLE: Final = (0.03, 0.12)  # ... and in any other
+HARD_VISITS: Final = 0.5  # share of visits that are excited
+SHARE: Final = (0.75, 0.97)  # share of the grip used in an excited visit
+GENTLE: Final = (0.03, 0.12)  # share of the grip used in any other visit
 NOISE: Final = 0.08
 GAINS: Final = {"third_party": 0.05, "third_party.gain_common": 0.10}  # standard deviations of g
 
@@ -59,12 +59,12 @@ CHANGE_CELLS: Final = 30
 CHANGE_STRETCH: Final = 6  # no cell has a neighbour of another road
 DRY = 0.85
 WHITE = 0.15
-CHANGE_VISITS: Final = 240  # per cell and road
-STEP_S: Final = 10.0  # the alerts are read so often
+CHANGE_VISITS: Final = 240  # visits per cell and phase
+STEP_S: Final = 10.0  # period of the readings of the alerts
 NEVER: Final = 999
 CHANGE_SEEDS: Final = 3
 
-COLD_SEEDS: Final = 30  # fleets that a service of two minutes does not know
+COLD_SEEDS: Final = 30  # fleets that a new service does not know yet
 COLD_GAP_S: Final = 5.0
 
 

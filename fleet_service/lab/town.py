@@ -23,22 +23,22 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import NS
 
 START: Final = 1_800_000_000 * NS
-# cells of a road
+# number of roads, and of cells per road
 ROADS = 10
 LENGTH = 12
 CELLS: Final = ROADS * LENGTH
-STRETCH: Final = 4  # cells of one surface
+STRETCH: Final = 4  # number of cells of one surface
 SURFACES: Final = {
     "dry": (0.85, 0.08, 0.45),
     "wet": (0.55, 0.07, 0.25),
     "snow": (0.30, 0.04, 0.15),
     "ice": (0.15, 0.03, 0.15),
-}  # mean, spread, share
-# of any road
+}  # surface: mean, spread, share of the roads
+# limits of the friction of any road
 LEAST = 0.08
 MOST = 1.10
 DRIFT: Final = 0.03  # per square root of an hour
-ZONE: Final = 6  # cells of one EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
+ZONE: Final = 6  # cells with equal EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
 EXCITEMENT: Final = (
     (0.40, 0.2),
     (0.08, 0.4),
@@ -111,7 +111,7 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
     classes, weights = zip(*EXCITEMENT, strict=True)
     excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
     mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
-    own = rng.spawn(1)[0]  # the same towns whatever the errors
+    own = rng.spawn(1)[0]  # the towns are the same for all error models
     zones = CELLS // ZONE
     common = model.common * own.normal(size=(zones, 1)) + model.by_manoeuvre * own.normal(
         size=(zones, MANOEUVRES)

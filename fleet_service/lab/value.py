@@ -38,14 +38,15 @@ from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
 VEHICLES: Final = 60
 MINUTES: Final = 360
-BEGIN: Final = 90  # minute from which it counts
+BEGIN: Final = 90  # minute from which results count
 STEP: Final = 2  # minutes between two readings
-CHANGING: Final = 0.5  # share of roads that get another surface
-DEMAND: Final = {0.40: 0.25, 0.08: 0.15, 0.02: 0.10}  # [g], by the town's excitement of the place
-DEMAND_SPREAD: Final = 0.5  # standard deviation of its logarithm
-GENTLE: Final = 0.6  # of the demand, on gentle roads
+CHANGING: Final = 0.5  # share of roads whose surface changes
+# [g], by the excitement of the place in the town
+DEMAND: Final = {0.40: 0.25, 0.08: 0.15, 0.02: 0.10}
+DEMAND_SPREAD: Final = 0.5  # standard deviation of the demand's logarithm
+GENTLE: Final = 0.6  # factor of the demand on gentle roads
 NARROW: Final = 0.3
-UNNOTICED_MOST: Final = 90.0  # minutes; later or never counts as this
+UNNOTICED_MOST: Final = 90.0  # minutes; also stands for a later warning or none
 HOUR_S: Final = 3600.0
 CARS: Final = (5, 20)  # per hour and road
 SEEDS: Final = 3

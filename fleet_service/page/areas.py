@@ -15,7 +15,7 @@ from fleet_service.page.map_mirror import MapMirror
 from schemas import grid
 from schemas.thresholds import METRES_PER_DEGREE
 
-NEAR_M: Final = 30_000.0  # from a place's centre: its name is said of the area
+NEAR_M: Final = 30_000.0  # largest distance from a place whose name is given to the area
 MOST: Final = 100
 
 

@@ -19,7 +19,7 @@ from schemas.errors import InputError
 
 MBTILES = ".mbtiles"
 PMTILES = ".pmtiles"
-OWN: Final = "/base/{z}/{x}/{y}"  # address of the tiles of a file
+OWN: Final = "/base/{z}/{x}/{y}"  # address of tiles that this server reads from a file
 VECTOR: Final = "pbf"
 KINDS: Final = {
     "png": "image/png",
@@ -28,11 +28,11 @@ KINDS: Final = {
     "webp": "image/webp",
     VECTOR: "application/vnd.mapbox-vector-tile",
 }
-ZOOMS: Final = (0, 19)  # that an address answers: as far as the public ones go
+ZOOMS: Final = (0, 19)  # zooms of tiles at an address, as at public servers
 DEEPEST: Final = 30
-MOST_BYTES: Final = 4 << 20  # of a tile
-STEP: Final = 10_000  # instructions of SQLite between two looks
-MOST_STEPS: Final = 100  # looks; a tile by its index takes a fraction of one
+MOST_BYTES: Final = 4 << 20  # largest tile
+STEP: Final = 10_000  # SQLite instructions between two checks
+MOST_STEPS: Final = 100  # checks; a tile that is found by index takes a fraction of one
 _TAG: Final = re.compile(r"<[^>]*>")
 
 

@@ -25,7 +25,7 @@ LOG_S: Final = 60.0
 class BoundedProtocol(H11Protocol):
     """Connection of one browser to the web server, under the limit on connections."""
 
-    _head_timer: asyncio.TimerHandle | None = None  # None: not accepted
+    _head_timer: asyncio.TimerHandle | None = None  # None if the connection was not accepted
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept a connection if the limit allows it, and wait for its first request."""

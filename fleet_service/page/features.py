@@ -24,7 +24,7 @@ CRS84: Final = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 CONFORMANCE: Final = tuple(
     f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "geojson")
 )
-# features in an answer: unless asked otherwise, and at the most
+# features in an answer: default, and maximum
 FEW = 1000
 MOST = 10_000
 TITLE: Final = "Grip of the road, measured by vehicles"
@@ -37,7 +37,7 @@ ABOUT: Final = (
     "instant is the map as it was then; an interval is the map as it was at its end, restricted to "
     "cells observed since its begin."
 )
-# Columns that are not told: the geometry says them.
+# Columns that are left out, because they repeat the geometry.
 _PLACE: Final = ("latitude", "longitude", "west", "south", "east", "north")
 COLUMNS: Final = tuple(field for field in tables.MAP_CELL if field.name not in _PLACE)
 _TYPES: Final[dict[pa.DataType, dict[str, str]]] = {

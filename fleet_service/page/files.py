@@ -17,7 +17,7 @@ from fleet_service.page.module_bundle import bundle_modules
 
 LEVEL: Final = 9
 ENGLISH: Final = "texts.en.json"
-SCRIPT: Final = "page.js"  # all modules, from main.js on
+SCRIPT: Final = "page.js"  # bundle of all modules, beginning with main.js
 
 
 class _File(NamedTuple):

@@ -13,7 +13,8 @@ from typing import Any, Final
 from schemas.runtime.metrics import PREFIX
 
 READ_S: Final = 2.0
-KEPT_S: Final = 2.0  # many browsers ask, a service is asked once
+# time [s] for which an answer is reused, so that many browsers cause one request
+KEPT_S: Final = 2.0
 MOST_BYTES: Final = 1 << 20
 _LINE: Final = re.compile(rf'{PREFIX}(\w+?)(_total)?(?:\{{\w+="([^"]*)"\}})? (\S+)')
 

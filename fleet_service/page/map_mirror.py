@@ -50,7 +50,8 @@ class MapMirror:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._tiles: dict[int, MirroredTile] = {}
-        self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
+        # tiles that changed since the last call of `changes`, as they were before
+        self._before: dict[int, _Before] = {}
         self.recent = RecentMoments()
         self._heard = 0.0
         self.alerts = AlertMirror()

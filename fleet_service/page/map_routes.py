@@ -66,7 +66,8 @@ class MapRoutes:
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
     def _borrowed_cells(self, tile: int) -> bytes:
-        version = self._of.world.version(tile)  # a page ignores cells that are older than its own
+        # a page ignores cells of an older version than its own
+        version = self._of.world.version(tile)
         found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
         return b"".join(
             records.TileBlock(

@@ -27,9 +27,10 @@ from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
-KEPT: Final = 8  # snapshots in memory
-MOST: Final = 3000  # moments that the slider is told of: four months of hours
-HISTORY: Final = 200  # snapshots that a history looks at, the newest
+KEPT: Final = 8  # number of snapshots in memory
+# maximum number of moments that the slider shows: four months of hourly snapshots
+MOST: Final = 3000
+HISTORY: Final = 200  # number of newest snapshots from which a history is read
 _COLUMNS: Final = (
     "cell",
     "sector",
@@ -93,7 +94,7 @@ class Moments:
                 table = pq.read_table(
                     files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None
                 )
-            except FileNotFoundError:  # retention was quicker
+            except FileNotFoundError:  # retention has removed the file
                 continue
             for row in table.to_pylist()[:1]:
                 known = row["basis"] == "measured" or row["p_slippery"] > KNOWN_SLIPPERY

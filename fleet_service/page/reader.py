@@ -28,10 +28,10 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
-AGAIN_S: Final = 5.0  # between two questions to a service of which nothing is known
-# a tile is put when it changes; that its intervals widen with time must be asked for
+AGAIN_S: Final = 5.0  # period of the queries to a service about which nothing is known
+# tiles are published when they change; wider intervals because of age must be queried
 REFRESH_S: Final = 60.0
-# tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
+# tiles per round: 40 per second, 2 400 per minute; with more tiles a renewal takes longer
 REFRESHED: Final = 20
 
 
@@ -71,7 +71,7 @@ class Reader:
                 served = bool(self._sees_services())
                 if (
                     served and not self._served
-                ):  # at the start, and when a service came back: what was missed
+                ):  # at the start, and after the return of a service: query what was missed
                     self._ask_all(session)
                 elif served and time.monotonic() >= self._stood + REFRESH_S:
                     self._ask_standing(session)
@@ -176,7 +176,7 @@ class Reader:
             if self._regions.is_answered(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
                 self._world.take_tile(
                     tile, tables.MAP_SCHEMA.empty_table(), now
-                )  # fewer vehicles than are shown
+                )  # readers may not see cells with fewer vehicles
             else:
                 self._world.touch(tile, now)
 

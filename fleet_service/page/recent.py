@@ -13,7 +13,7 @@ from fleet_service.page.records import Records
 
 STEP_S: Final = 10
 MOST: Final = 180  # half an hour in steps of STEP_S
-THIN: Final = 60  # moments; older ones are kept in steps of THINNED_S
+THIN: Final = 60  # number of moments after which older ones are kept only in steps of THINNED_S
 THINNED_S: Final = 60
 
 

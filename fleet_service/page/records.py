@@ -97,9 +97,9 @@ def of_table(table: pa.Table) -> Records:
     found["upper"] = _to_steps(np.ceil, table["mu_upper"], MU_STEPS)
     found["slippery"] = _to_steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
-    # whoever sent it: a bound has no number to colour by
+    # lower bounds have no value to colour, whoever sent them
     found["mu"][basis == "bound"] = NO_NUMBER
-    # snapshots of older versions call known ice a bound
+    # older snapshots mark known ice as a lower bound
     known = (basis == "measured") | (
         (basis == "bound") & (found["slippery"] > KNOWN_SLIPPERY * SHARE_STEPS)
     )
@@ -148,7 +148,7 @@ def aggregate_worst(records: Records, level: int) -> Records:
     some = np.repeat(share < 1.0, count)
     spoken = (
         known | ~some
-    )  # a place that was only passed speaks where nothing was measured beside it
+    )  # a cell with only a lower bound counts if no cell of the square was measured
     found = np.zeros(len(first), RECORD)
     found["place"] = place[first]
     for name in ("mu", "lower", "upper"):

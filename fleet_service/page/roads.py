@@ -19,17 +19,18 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
-# cells to the next one of a learned line, and between two of one lane: no report in between
+# cells between neighbours of a line, and between cells of one lane, without a report in between
 AHEAD: Final = 3
-SMOOTHED: Final = 5  # cells, centred: two lanes and a receiver's error make the raw line zigzag
-LEAST_CELLS: Final = 3  # of a learned line; fewer have no direction
+# window of the moving average [cells]: lanes and position errors make the unsmoothed line zigzag
+SMOOTHED: Final = 5
+LEAST_CELLS: Final = 3  # minimum number of cells of a derived line; fewer have no direction
 MOST_LINES: Final = 50_000
 _STEP: Final = (
     (1, 0),
     (0, -1),
     (-1, 0),
     (0, 1),
-)  # column and row of the next cell, by sector: east, north, …
+)  # column and row of the next cell, by heading sector: east, north, …
 
 
 class Line(NamedTuple):

@@ -130,12 +130,12 @@ def update_publication(
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.is_served or (world.alerts.heard_count == seen and not file.is_due):
-            # where no service speaks nothing ends, and the publication's time says how old it is
+            # without a service nothing is ended; the publication's time shows its age
             continue
         seen = world.alerts.heard_count
         try:
             file.keep_up(world.alerts.stretches(), reader.is_heard)
-        except InputError as error:  # it is served all the same
+        except InputError as error:  # the publication is served nevertheless
             log.warning("%s", error)
 
 
@@ -195,7 +195,7 @@ def open_socket(host: str, port: int) -> socket.socket:
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((host, port))
-    except (OSError, OverflowError) as error:  # the latter: no port has so high a number
+    except (OSError, OverflowError) as error:  # OverflowError: the port number is too large
         found.close()
         fix = "give another with --port, or 0 for a free one"
         raise InputError(

@@ -21,10 +21,10 @@ from fleet_service.page.map_mirror import MapMirror, box_of
 from fleet_service.page.records import CELL_LEVEL, TileBlock
 from schemas import grid
 
-FLUSH_S: Final = 0.1  # changes of so long are one event
+FLUSH_S: Final = 0.1  # changes within this time are sent as one event
 BEAT_S: Final = 2.0
-WAITING: Final = 64  # events in a watcher's queue: six seconds of a busy map
-MOST: Final = 400  # watchers
+WAITING: Final = 64  # events in a browser's queue: six seconds of a busy map
+MOST: Final = 400  # maximum number of watching browsers
 Box = tuple[float, float, float, float]
 _RELOAD: Final = b"event: reload\ndata: {}\n\n"
 
@@ -63,7 +63,7 @@ class Watchers:
         self._world = world
         self._state = state
         self._most = most
-        self._watchers: dict[asyncio.Queue[bytes | None], _OpenPage] = {}  # the oldest first
+        self._watchers: dict[asyncio.Queue[bytes | None], _OpenPage] = {}  # oldest first
         self.reloads = 0
 
     def __len__(self) -> int:
@@ -126,7 +126,8 @@ class Watchers:
 
     def push(self, changes: list[TileBlock]) -> None:
         """Send changed blocks (encoded cells of tiles) to the browsers whose view they touch."""
-        lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
+        # by (tile, level), encoded once for all browsers that show it
+        lines: dict[tuple[int, int], bytes] = {}
         for watcher in list(self._watchers.values()):
             found = []
             for block in changes:

@@ -16,7 +16,8 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.image import LAYOUT, fusion_of, image_of
 from schemas.errors import InputError
 
-VERSION: Final = f"5-{LAYOUT}"  # what is not this is not read: the archive is replayed
+# tables of another version are not used; the archive is replayed instead
+VERSION: Final = f"5-{LAYOUT}"
 _KEY: Final = b"gripmap.checkpoint"
 
 
@@ -45,7 +46,7 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
     """
     whole = (
         column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
-    )  # which copies what is one piece
+    )  # copies the chunks into one piece
     values = cast("pa.LargeListArray[Any]", whole).flatten()
     if pa.types.is_boolean(values.type):
         return np.asarray(values)

@@ -30,8 +30,8 @@ from fleet_service.archive.format.version import KEY, VERSION
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory
 
-KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
-# a service that is killed again and again, by whatever, begins from the log at last
+KEPT: Final = 2  # the newest, and the one before it if the newest is damaged
+# after so many failed starts, a service starts from the archived rows, without the checkpoint
 TRIES: Final = 4
 _DRAFT: Final = ".draft"
 _MANIFEST: Final = "manifest.json"
@@ -124,7 +124,7 @@ def mark_begun(path: Path) -> None:
     """Record that a service is starting from a checkpoint (saved state); `mark_survived` removes
     the record.
     """
-    with suppress(OSError):  # a full disk does not keep a service from its start
+    with suppress(OSError):  # a full disk must not prevent the start
         (path / _TRIED).write_text(str(_count_tries(path) + 1))
 
 

@@ -49,16 +49,16 @@ COLUMNS: Final = [
     ),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
     *("used_longitudinal", "used_lateral", "late_by", *FLAGS),
-]  # of what the fusion takes
-FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
+]  # columns that the fusion needs
+FILTERED: Final = ("longitude", "received_at")  # additional columns, if only some rows are selected
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
-# of a day that are held at once, 200 MB; twice, while the next are read
+# rows of a day in memory at once: 200 MB, doubled while the next part is read
 PART_ROWS: Final = 4_000_000
-# that are fused at once: what is made of them on the way takes four times their memory
+# rows that are fused at once: intermediate results take four times their memory
 CHUNK_ROWS: Final = 100_000
 _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
-SEGMENT_ROW_BYTES: Final = 60  # in the inbox, at the least
-# around a box: over 100 m, more than a visit's position error moves what it tells
+SEGMENT_ROW_BYTES: Final = 60  # minimum size of a row in the inbox
+# margin around a box: over 100 m, more than the position error of a visit
 MARGIN_DEG: Final = 0.002
 
 
@@ -74,7 +74,7 @@ class Begin(NamedTuple):
 
     day: int | None = None
     after: layout.Cut | None = None
-    until: layout.Cut | None = None  # of the log's segments
+    until: layout.Cut | None = None  # position in the sequence of segments
 
 
 def restore_streams(
@@ -219,7 +219,7 @@ def past_fusion(
     wanted = Since(begin, until=until, box=box, most=most)
     heard = ignore_observations if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
-        pass  # the alerts of then are history
+        pass  # past alerts are not needed
     return fusion
 
 
@@ -356,7 +356,7 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
         else _prefetch_parts(_split_parts(listing, most))
     ):
         yield from held.chunks()
-        pa.default_memory_pool().release_unused()  # before the next is used
+        pa.default_memory_pool().release_unused()  # before the next part is read
         trim_memory()
 
 
@@ -428,7 +428,7 @@ class _Held:
         self._name = name
         self._borders = borders
         self._kept: list[list[pa.Buffer]] = [[] for _ in borders[1:]]
-        self._taken: list[tuple[int, int, pa.Buffer]] = []  # chunk and rows
+        self._taken: list[tuple[int, int, pa.Buffer]] = []  # chunk number and rows
         self.rows = 0
 
     def take(self, table: pa.Table) -> None:

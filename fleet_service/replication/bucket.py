@@ -22,12 +22,12 @@ from schemas.runtime.installing import install_command
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-# a folder of this machine is no second place: it is for trials
+# a folder on this machine is not a second place; it is for trials
 SCHEMES: Final = re.compile(r"(s3|gs|az|abfss?)://[^/]+|file:///.")
 CONNECT_S: Final = 2.0
 _ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _TOOK: Final = re.compile(r" in [\d.]+[^\s\d.]*s\b")
-_TEXT: Final = 160  # characters of an error; what the server says as XML may name keys
+_TEXT: Final = 160  # longest error text [characters]; the server's XML may contain key names
 
 
 class CopyError(OSError):
@@ -82,7 +82,7 @@ class ObjectBucket:
         client: Any = {
             **seconds,
             **({"allow_http": True} if plain else {}),
-        }  # else the environment decides
+        }  # otherwise the environment decides
         retry: Any = {"max_retries": retries, "retry_timeout": timedelta(seconds=timeout_s)}
         given: Any = dict(options)
         try:
@@ -137,7 +137,7 @@ class ObjectBucket:
             try:
                 self._do.put(self._store, name, content, mode="create")
             except self._known:
-                return self.get(name) == content  # a put that timed out had landed
+                return self.get(name) == content  # an upload that timed out had succeeded
         return True
 
     def list_names(self, folder: str) -> list[str]:
@@ -205,7 +205,7 @@ class ObjectBucket:
             raise
         except FileNotFoundError as error:
             if error.filename is not None:
-                raise  # the file to be put
+                raise  # the file to upload does not exist
             raise CopyError(f"{name}: {error_summary(error)}") from None
         except self._failed as error:
             raise CopyError(f"{name}: {error_summary(error)}") from None

@@ -49,7 +49,7 @@ class FileTransfer:
         elif is_new and name.endswith(".key"):
             self._bucket.create_key(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
-            # who the vehicles are grows meanwhile, and is then put again
+            # the file of vehicle identities grows meanwhile, and is then uploaded again
             bucket.put(name, path.read_bytes())
         else:
             bucket.put(name, path)
@@ -88,7 +88,7 @@ class FileTransfer:
         list(self._pool.map(self._download_file, wanted))
         paths = [self._files.path_of(name) for name in wanted]
         sync_tree(self._files.root, {path.parent for path in paths})
-        # only now: power loss would else make them look deleted
+        # only now; otherwise, after a power loss, the files would look deleted
         for name, path in zip(wanted, paths, strict=True):
             self._journal.add(name, stamp_of(path))
             self._files.set_aside_path(name).unlink(missing_ok=True)

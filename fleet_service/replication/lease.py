@@ -73,15 +73,17 @@ from schemas.runtime.durable import open_durably
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
-HOLDER: Final = "holder.json"  # of an archive: who it is, over restarts
-TURNS: Final = 6  # in the time of a lease
-# of it, after which one whose token fell is followed: more than the half in which it acknowledges
+# file in the archive with the identity of its folder, kept over restarts
+HOLDER: Final = "holder.json"
+TURNS: Final = 6  # renewals per lease time
+# Share of `lease_s` after which a holder without a token may be replaced. It is more than one half,
+# because a holder acknowledges for `lease_s / 2` after its last renewal.
 HINT: Final = 0.6
-# between two times that a standby gets what is new, so that little is left when it must
+# period of a standby's downloads, so that little remains to be downloaded at a take-over
 AHEAD_S: Final = 10.0
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 UNKNOWN: Final = "unknown"  # the service of a damaged lease object
-LOOK_S: Final = 0.25  # between two looks of who waits
+LOOK_S: Final = 0.25  # period of the checks while waiting
 
 
 class LeaseRecord(NamedTuple):
@@ -134,10 +136,10 @@ class Standby(NamedTuple):
         get_ahead: downloads new objects from the bucket in advance.
     """
 
-    may: Callable[[], bool]  # whether it would be heard if it took over now
-    stands: Callable[[str], bool]  # whether a service's token stands
-    alive: Callable[[], None]  # is called at each look
-    get_ahead: Callable[[], None]  # gets what is new in the bucket
+    may: Callable[[], bool]  # True if the standby reaches a router
+    stands: Callable[[str], bool]  # True if the named service has a token
+    alive: Callable[[], None]  # called at each check
+    get_ahead: Callable[[], None]  # downloads new objects from the bucket
 
 
 class Lease:
@@ -387,7 +389,7 @@ class Lease:
         self._renewed = began
         self.succeeds = found is not None and found.holder != self._holder
         if found is not None and self._bucket.get(found.name) != found.content:
-            # it was renewed in between, and may acknowledge for half of that by its own clock
+            # the lease was renewed in between, and its holder may acknowledge for half of `lease_s`
             stop.wait(self._lease_s)
         return True
 

@@ -22,8 +22,8 @@ from fleet_service.replication.replica_files import FOLDERS
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
-AGAIN_S: Final = 1.0  # between two tries to reach the bucket
-REQUESTS: Final = 4  # of a lease that fit into its time
+AGAIN_S: Final = 1.0  # pause between attempts to reach the bucket
+REQUESTS: Final = 4  # requests that fit into one lease time
 
 
 class Ownership:
@@ -120,7 +120,7 @@ def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
 
 Signs = tuple[
     Callable[[], bool], Callable[[str], bool], Callable[[], None]
-]  # as of `serving.standby_signs`
+]  # as returned by `serving.standby_signs`
 
 
 def acquire_archive(

@@ -30,11 +30,11 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
 OWNER: Final = "service.json"
-# of one request that an acknowledgement waits for; the service's worker may wait as long
+# time limit of a request on which an acknowledgement depends; the worker may wait as long
 QUICK_S: Final = 5.0
-SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
-TURN_S: Final = 20.0  # of `upload_segments`, which then says that it has come so far
-_AT_ONCE: Final = 8  # requests
+SLOW_S: Final = 300.0  # time limit of other requests: a compacted file has tens of megabytes
+TURN_S: Final = 20.0  # time of one call of `upload_segments`, after which it reports its progress
+_AT_ONCE: Final = 8  # concurrent requests
 
 
 class BucketReplica:
@@ -194,7 +194,8 @@ class BucketReplica:
                     self._upload_quickly(some[0])
                 else:
                     list(self._pool.map(self._upload_quickly, some))
-            except FileNotFoundError:  # compacted meanwhile: the rows are in files that follow
+            # compacted meanwhile; its rows are in files that are uploaded later
+            except FileNotFoundError:
                 self._upload_changes(with_log=True)
                 return
 
@@ -207,7 +208,7 @@ class BucketReplica:
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being uploaded")
         try:
-            # before the files: what comes meanwhile is not taken for gone
+            # listed before the files, so that a new file does not count as deleted
             known = self._journal.copy_stamps()
             local = self._files.list_files()
             new = [
@@ -225,8 +226,8 @@ class BucketReplica:
             removed.sort(key=lambda name: not name.endswith(MANIFEST))
             self.bucket.admit_objects(new)
             if removed:
-                # then whoever comes next finds all that was put until now, and misses none of what
-                # goes
+                # the next owner then finds everything that was uploaded until now, and nothing that
+                # it needs is deleted
                 self.bucket.require_lease()
             for name in removed:
                 self._slow.delete(name)

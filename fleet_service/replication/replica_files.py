@@ -13,9 +13,9 @@ from fleet_service.replication.upload_journal import Stamp, stamp_of
 
 LOG: Final = "inbox/"
 KEYS: Final = "keys/"
-# In this order they are looked through: compaction adds to the later ones before it takes from the
-# log, and retention rolls up before it takes from the observations, so that what has gone from one
-# is found in the next.
+# Order in which folders are listed: compaction adds to the later ones before it deletes from the
+# inbox, and retention computes roll-ups before it deletes observations. So a row that has been
+# moved is found in a later folder.
 FOLDERS: Final = (
     "inbox",
     "observations",
@@ -26,8 +26,8 @@ FOLDERS: Final = (
     CHECKPOINTS,
     "keys",
 )
-MANIFEST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
-_PRIVATE: Final = ("tried",)  # notes of this disk
+MANIFEST: Final = "manifest.json"  # file that makes a folder a valid checkpoint
+_PRIVATE: Final = ("tried",)  # notes that concern only this disk
 
 
 class ReplicaFiles:

@@ -58,7 +58,7 @@ class UploadJournal:
         self._stamps: dict[str, Stamp] = {}
         lines = path.read_text(errors="replace").splitlines() if path.exists() else []
         for line in lines[1:] if lines[:1] == [head] else []:
-            with suppress(ValueError, TypeError, KeyError):  # of a line that power loss cut
+            with suppress(ValueError, TypeError, KeyError):  # incomplete line after a power loss
                 name, *stamp = json.loads(line)
                 self._stamps.pop(name, None)
                 if stamp:

@@ -26,21 +26,23 @@ from schemas.wire import Alert
 RAISE_ABOVE: Final = CALLED_SHARE
 # ... and by its own reports alone no less than without any
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
-CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error
+# grip must be as certain as ice was, because clearing too early is the more serious error
+CLEAR_BELOW: Final = 0.05
 # an alert without confirmation ends as soon as ice is less likely than grip
 FADE_BELOW: Final = 0.5
-# Distinct vehicles that reported ice, here or, unless a source of grip opposes, on the stretch: one
-# liar, or one bad sensor, moves nothing. Of the slippery cell-minutes of eight tuning towns .926
-# are under alert with the stretch, .907 without.
+# Minimum number of vehicles that reported ice in the cell or, unless a source of grip opposes, on
+# the stretch: one lying vehicle or one bad sensor raises no alert. Of the slippery cell-minutes of
+# eight tuning towns, .926 are under alert with the stretch, .907 without.
 LEAST_SOURCES: Final = 2
-# ... and MOST_SOURCES here where a source of grip is not older than they are by this: a road
-# changes, so that earlier visits do not contradict it. With one minute instead of ten, three
-# trusted vehicles that flood a dry cell raised an alert in two of six tuning towns.
+# MOST_SOURCES in this cell are needed unless each source of grip is older than those of ice by more
+# than this: a road changes, so earlier visits do not contradict ice. With one minute instead of
+# ten, three trusted vehicles that flood a dry cell raised an alert in two of six tuning towns.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
-SOURCE_NS: Final = 3600 * NS  # sources count for an hour; older ice belongs to an older road
-TIME_STEP_NS: Final = 60 * NS  # of alerts where persons are kept private
-QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long may fade
+# sources count for an hour; older reports of ice concern an older state of the road
+SOURCE_NS: Final = 3600 * NS
+TIME_STEP_NS: Final = 60 * NS  # rounding of alert times if persons are kept private
+QUIET_NS: Final = 1800 * NS  # an alert may end if nobody has confirmed ice for this time
 
 
 class Alerts:
@@ -98,7 +100,8 @@ class Alerts:
         likely = self._suspects(slots[slippery > LIKELY])
         likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
-        now = time.max(initial=0)  # of an alert to which an update beside its cell led
+        # time of an alert that was caused by an update of a neighbouring cell
+        now = time.max(initial=0)
         raised = np.where(np.isin(likely, slots), self._fusion.live.time[likely], now)
         out = []
         for slot, when, probability in zip(

@@ -21,7 +21,7 @@ _BASES: Final = pa.array(["bound", "measured", "borrowed"])
 _BOUND = 0
 _BORROWED = 2
 _SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
-_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end
+_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head ends the stream
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:

@@ -18,11 +18,12 @@ from schemas import grid
 from schemas.numeric import FloatArray
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
-OTHERS_NEEDED: Final = 3  # distinct vehicles ever heard on a road that is not idle
+OTHERS_NEEDED: Final = 3  # distinct vehicles that have ever reported a road that is not idle
 MOST_AREAS: Final = 2
-AREA_M: Final = 1_000.0  # around the first alert of an area
-AREA_NS: Final = 3 * 3600 * NS  # while roads change seldom; see fusion.constants.CHANGE_S
-VEHICLES: Final = 100_000  # that are remembered
+AREA_M: Final = 1_000.0  # radius of an area around its first alert
+# time for which an area counts, in which roads rarely change (fusion.constants.CHANGE_S)
+AREA_NS: Final = 3 * 3600 * NS
+VEHICLES: Final = 100_000  # maximum number of vehicles that are remembered
 
 
 class IdleRoads:

@@ -13,7 +13,8 @@ from fleet_service.fusion.store.store import distinct_values
 from schemas import grid
 from schemas.numeric import IntArray
 
-PARTS: Final = 32  # of a tile's index before they are joined: each costs as much as thirty slots
+# parts of a tile's index before they are joined; each costs as much as thirty slots
+PARTS: Final = 32
 
 
 class MapState:
@@ -25,12 +26,12 @@ class MapState:
 
     def __init__(self, fusion: Fusion) -> None:
         self.fusion = fusion
-        # In parts, which are joined when they are asked for.
+        # In parts, which are joined when the slots are requested.
         self._slots: dict[int, list[NDArray[np.int32]]] = defaultdict(list)
         self._indexed = 0
         self._dirty: set[int] = set()
         self._changed: dict[int, int] = {}
-        self.change = 0  # how often anything changed
+        self.change = 0  # counter of changes
 
     def mark_changed(self, slots: IntArray) -> None:
         """Record that slots (cells with heading sectors) were updated, so that their tiles count as

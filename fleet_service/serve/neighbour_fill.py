@@ -21,8 +21,8 @@ from schemas.numeric import FloatArray, IntArray
 
 PRIOR_SHARE: Final = 0.5
 REACH: Final = 10  # cells, some 130 m
-# What is left of a neighbour's share for each further cell: on drawn towns a surface is some five
-# to ten cells long.
+# Factor of a neighbour's share per further cell: in the drawn towns, a surface is five to ten
+# cells long.
 KEPT: Final = 0.8
 
 

@@ -34,10 +34,10 @@ from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
-PERIOD_NS: Final = 300 * NS  # of the time grid of publications
-WINDOW_NS: Final = 3600 * NS  # in which enough vehicles must be in a tile
-# A change towards slippery is published at once: P(slippery) grew, or the median fell, by as much.
-# Values of visits to one surface scatter less.
+PERIOD_NS: Final = 300 * NS  # step of the publication times
+WINDOW_NS: Final = 3600 * NS  # time within which enough vehicles must be in a tile
+# Increase of P(slippery), or decrease of the median, that is published at once. Values of visits
+# to one surface differ less.
 MORE_SLIPPERY: Final = 0.05
 LESS_MU: Final = 0.1
 # names of tables of `columns`
@@ -166,7 +166,7 @@ class PublicCells:
             del self._present[tile]
         if is_new_hour:
             self._present.clear()
-            slots = np.flatnonzero(self._shown)  # the window of the visitors moves
+            slots = np.flatnonzero(self._shown)  # the time window of the visitors advances
             self._shown[slots] = self.visitors.count(slots, now) >= self._least
         if ready:
             slots = np.flatnonzero(self._pending)
@@ -252,7 +252,7 @@ class PublicCells:
         live = self._fusion.store.state.live.cells[new]
         self._rows.belief[new] = FULL
         self._rows.cells["key"][new] = live["key"]
-        self._rows.cells["time"][new] = live["time"]  # for its age; it has no vehicles
+        self._rows.cells["time"][new] = live["time"]  # only for its age; the cell has no vehicles
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:

@@ -38,21 +38,24 @@ from schemas.query import Format, MapQuery
 
 log = logging.getLogger(__name__)
 TEXT: Final = "text/plain"
-# Cells times what one costs in its form: a tile of text is light, a city of it is not.
+# Factor of the cost per cell for each format: one tile as text is cheap, a city is not.
 COST: Final = {Format.ARROW: 1, Format.JSON: 20, Format.GEOJSON: 20}
-TILE_COST: Final = 750  # cells: half a millisecond, that a tile takes however few it has
-LIGHT: Final = 30_000  # 20 ms of an Arrow answer
-MOST: Final = 10_000_000  # ten million cells of Arrow, 700 MB; half a million as text, 250 MB
-PER_S: Final = 1_500_000  # cost that is answered in a second
+TILE_COST: Final = 750  # cost of a tile in addition to its cells: half a millisecond
+LIGHT: Final = 30_000  # limit of a cheap answer: 20 ms in Arrow format
+# limit of an answer: ten million cells in Arrow (700 MB), or half a million as text (250 MB)
+MOST: Final = 10_000_000
+PER_S: Final = 1_500_000  # cost of the answers per second
 LIGHT_PER_S: Final = (
     PER_S / 2
-)  # ... by Zenoh's thread, which answers one light question after the other
-WAITING: Final = 64  # questions; more are told to come again
-# after a tile of a heavy answer, by the time it took: light ones find the interpreter free
+)  # the same for cheap answers in Zenoh's thread, which come one after the other
+# maximum number of waiting queries; further ones get an error that asks for a retry
+WAITING: Final = 64
+# pause after a tile of an expensive answer, as a multiple of its time, for cheap answers
 REST: Final = 1.0
 LONGEST_REST_S: Final = 0.05
-PAST_WAITING: Final = 8  # questions about the past, with the one that is answered
-PAST_WAIT_S: Final = 4.0  # for their turn; a reader waits longer
+# maximum number of queries about the past, including the one being answered
+PAST_WAITING: Final = 8
+PAST_WAIT_S: Final = 4.0  # longest wait of such a query for its turn; clients wait longer
 
 
 def _past_is_busy() -> InputError:
@@ -138,7 +141,7 @@ class MapQueryable:
         self._heavy: list[_QueuedQuery] = []  # a heap
         self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
-        self._busy_since: float | None = None  # with one tile of a heavy answer
+        self._busy_since: float | None = None  # start of the current tile of an expensive answer
         self._some = threading.Condition()
 
     @property
@@ -157,7 +160,7 @@ class MapQueryable:
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
             wanted = query.parse(
                 {name: value for name, value in pairs if not name.startswith("_")}
-            )  # Zenoh's own
+            )  # Zenoh's own parameters
             if wanted.at is None:
                 asked = self._answering.size(wanted, *_key_filter(request))
                 cost = asked.cells * COST[wanted.format]
@@ -274,7 +277,7 @@ class MapQueryable:
         except InputError as error:
             answered.whole = True
             self._refuse(request, error)
-        except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
+        except zenoh.ZError:  # the session was closed meanwhile; nobody receives the reply
             answered.whole = True
         except (
             Exception
@@ -293,7 +296,7 @@ class MapQueryable:
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
         field = (
             error.field if error.field in MapQuery.model_fields else "query"
-        )  # else the asker's own word
+        )  # otherwise the text of the client's own error
         self._counts[f"bad_queries.{field}"] += 1
         with request:
             request.reply_err(str(error), encoding=TEXT)

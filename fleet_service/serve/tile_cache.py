@@ -24,7 +24,7 @@ from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
-SHOWN_NS: Final = NS  # as old as a tile that is put once a second may be
+SHOWN_NS: Final = NS  # the age that a tile published once a second may have
 KEPT_BYTES: Final = 32 << 20
 SELECTED_BY: Final = (
     "vehicles",
@@ -84,7 +84,7 @@ class TileCache:
         self._public = public
         self._kept: dict[int, ShownTile] = {}
         self._held = 0  # bytes
-        self._acknowledged = 0  # change up to which all must be seen
+        self._acknowledged = 0  # number of the newest change that every reader must see
 
     def acknowledge(self) -> None:
         """Record that everything in the map has been acknowledged or alerted. Cached tiles made

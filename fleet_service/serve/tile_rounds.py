@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
-# of a turn of the worker; with what comes in meanwhile, a segment is late by as much
+# time per pass of the worker's loop; a segment is delayed by about as much
 SHARE_S: Final = 0.02
 
 

@@ -20,13 +20,13 @@ LOWER = 0.05
 UPPER = 0.95
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
-# A cell is `measured` when a value brought its upper end down by more than numerics and forgetting
-# move it, or halved the interval, or when it is more likely slippery than not; else all that is
-# known is a lower bound.
+# A cell is `measured` in three cases: a value has lowered its upper end by more than numerical
+# errors and ageing do, or has halved the interval, or the cell is more likely slippery than not.
+# Otherwise only a lower bound is known.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
 KNOWN_SLIPPERY: Final = 0.5
-TIME_STEP_NS: Final = 900 * NS  # a quarter of an hour, in which a street has had several cars
+TIME_STEP_NS: Final = 900 * NS  # a quarter of an hour, in which several cars pass on a street
 COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) for m in (1, 2, 5))])
 
 

@@ -19,11 +19,11 @@ from schemas.thresholds import NS
 
 PART_NS: Final = (
     12 * 3600 * NS
-)  # the window is the part of a day that runs, and the one before: 12 to 24 hours
+)  # the window is the current part of a day and the one before: 12 to 24 hours
 PARTS: Final = 2
 _FIBONACCI: Final = np.uint64(
     0x9E3779B97F4A7C15
-)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+)  # 2⁶⁴ divided by the golden ratio: its multiples are far apart
 _SHIFT: Final = np.uint64(58)
 
 
@@ -38,7 +38,7 @@ class Visitors:
     def __init__(self, fusion: Fusion) -> None:
         self._fusion = fusion
         self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
-        self._part = 0  # the newest that was heard of
+        self._part = 0  # number of the newest part of the window
 
     def add(self, o: Observations) -> None:
         """Record, for each cell that the observations `o` report, the vehicles that report it."""

@@ -18,10 +18,10 @@ from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import presence, zenoh_session
 
-# in which the token of a service that froze or lost its host falls: its lease is 3 s
+# time after which the token of a frozen or lost service disappears: its lease is 3 s
 GONE_S: Final = 5.0
 LOOK_S: Final = 0.1
-_TRIES: Final = 5  # of services that start at the same moment
+_TRIES: Final = 5  # attempts if several services start at the same moment
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def _claim_regions(
         held = _declare_tokens(session, mine, CLAIMS)
         if not others_there():
             return held
-        for token in held:  # both began at once: the one that comes back first has it
+        for token in held:  # both began at once; the first that tries again takes the region
             token.undeclare()
         stop.wait(secrets.randbelow(1000) * 1e-3)
     raise InputError(

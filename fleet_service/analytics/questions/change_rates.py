@@ -36,20 +36,20 @@ from fleet_service.fusion.weather import AIR_ABOVE_ROAD_C, FREEZING_C, STEADY_C
 from schemas.numeric import FloatArray
 from schemas.thresholds import SLIPPERY_MU
 
-LONGEST_S: Final = 3 * 3600  # beyond, more than one change may lie between two values
+LONGEST_S: Final = 3 * 3600  # after a longer time, more than one change may lie between two values
 BINS_PER_OCTAVE: Final = 1
 LEAST_DAYS: Final = 5
 DRAWS: Final = 200
 ENDS: Final = (5.0, 95.0)
-HOURS: Final = 6  # of the day in a class
-LEAST_PAIRS: Final = 50  # of a class that is answered
+HOURS: Final = 6  # hours of the day in one class
+LEAST_PAIRS: Final = 50  # minimum number of pairs of a class for an answer
 UNKNOWN: Final = "unknown"
 BANDS: Final = (
     (f"below {FREEZING_C[0]:.0f}", -np.inf, FREEZING_C[0]),
     (f"{FREEZING_C[0]:.0f} to {FREEZING_C[1]:.0f}", *FREEZING_C),
     (f"{FREEZING_C[1]:.0f} to {STEADY_C:.0f}", FREEZING_C[1], STEADY_C),
     (f"above {STEADY_C:.0f}", STEADY_C, np.inf),
-)  # of the road [°C], those of the fusion's weather
+)  # road temperature [°C], with the limits of the fusion's weather
 
 
 def expression(t: Table) -> Table:

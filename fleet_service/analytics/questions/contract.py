@@ -29,12 +29,12 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import Z_95
 
 SLOT_S: Final = 1800
-PIECE_M: Final = 50.0  # as long as what a driver slides over before the car stands, in a town
-LEAST_SHARE: Final = 0.8  # of a link's length measured, below which nobody can say that it was kept
-# two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
+PIECE_M: Final = 50.0  # about the distance in which a sliding car stops in a town
+LEAST_SHARE: Final = 0.8  # minimum measured share of a link's length for the verdict "kept"
+# slots below the level that are farther apart count as two breaches: the road may have been salted
 GAP_S: Final = 7200
-INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
-# of one vehicle's error that its own interval does not know: its tyres, its calibration
+INTERVAL_STD: Final = 2.0 * Z_95  # standard deviations in a 90 % interval of a normal distribution
+# part of a vehicle's error that its interval does not cover: tyres, calibration
 LEAST_STD: Final = 0.05
 KEPT = "kept"
 BROKEN = "broken"

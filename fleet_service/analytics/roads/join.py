@@ -23,16 +23,17 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
-# from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
+# distance from a cell's centre to a road: half a cell, lanes beyond the drawn line, position error
 REACH_M: Final = 25.0
-# per radian between the road and the sector's axis: a parallel road a lane away is nearer
+# cost per radian of heading difference: a parallel road one lane away must stay nearer
 TURN_M: Final = 8.0
 MOST_TURN: Final = np.radians(
     60.0
 )  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both
-SERVICE_M: Final = 6.0  # a yard's entrance beside a street is driven far less
+# penalty of service roads, because they have far less traffic than the street next to them
+SERVICE_M: Final = 6.0
 STEP_M: Final = 2.0
-PIECE: Final = 4096  # cells at once
+PIECE: Final = 4096  # number of cells that are processed at once
 _TYPES: Final[dict[str, pa.DataType]] = {
     "cell": pa.int64(),
     "sector": pa.int8(),

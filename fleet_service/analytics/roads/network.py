@@ -31,7 +31,7 @@ CLASSES: Final = (
     "residential",
     "living_street",
     "service",
-)  # of OpenStreetMap's highways, those that cars may drive
+)  # values of OpenStreetMap's tag `highway` on which cars may drive
 FORWARD = "forward"
 BACKWARD = "backward"
 _ONLY_FORWARD: Final = frozenset({"yes", "true", "1", FORWARD})
@@ -141,7 +141,7 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
         frame: Any = (
             geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
         )
-    except Exception as error:  # each of its readers raises its own
+    except Exception as error:  # each reader raises errors of its own
         problem = (
             f"{path.name} cannot be read "
             f"({(str(error) or 'no reason given').splitlines()[0][:100]})"

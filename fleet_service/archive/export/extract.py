@@ -28,7 +28,8 @@ from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
-_OF_MU: Final = ("mu_sum", "mu_sum_squares", "mu_min", "mu_max", "value_sum")  # of the roll-up
+# columns of the roll-up about mu
+_OF_MU: Final = ("mu_sum", "mu_sum_squares", "mu_min", "mu_max", "value_sum")
 Box = tuple[float, float, float, float]
 
 
@@ -94,7 +95,7 @@ def map_then(root: Path, part: Extract) -> pa.Table:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
     table = mask_unmeasured(
         table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound"
-    )  # files before 1.2 say one
+    )  # files before 1.2 state a value here
     return geo.with_cells(_cells_in_box(table, part.bbox))
 
 

@@ -33,15 +33,15 @@ TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
 TIME: Final = {
     Kind.OBSERVATION: "leave_time",
     Kind.STATE: "time",
-}  # of the measurement, by which rows are kept
+}  # time of the measurement, which decides how long rows are kept
 FIRST_TIME: Final = {
     Kind.OBSERVATION: "enter_time",
     Kind.STATE: "time",
-}  # by which a batch is too old, and its month
+}  # time that decides whether a batch is too old, and its month
 CHECKPOINTS: Final = "checkpoints"  # a folder
-EPOCH_FILE: Final = "term"  # holds the epoch of the service that owns the folder
+EPOCH_FILE: Final = "term"  # file that contains the epoch of the service that owns the folder
 DAY_NS: Final = 86_400_000_000_000
-# Days of observations that show in the map, and of batches that may come again
+# Days of observations that affect the map, and of batches that may be sent again
 # (ServiceConfig.oldest_s is 30 days).
 MAP_DAYS: Final = 31
 _EPOCH: Final = date(1970, 1, 1)
@@ -54,7 +54,7 @@ _OF_A_TERM: Final = {
 }
 _DAY: Final = re.compile(
     r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])"
-)  # and no copy that somebody made of one
+)  # the expression does not match copies of folders made by a person
 
 
 class Cut(NamedTuple):
@@ -83,7 +83,7 @@ class Partition(NamedTuple):
         return root / table / f"date={date_of(self.day)}" / zone
 
 
-# What a service makes when it starts, and what compaction leaves: one of them is in every archive.
+# Files of a started service, and results of compaction: every archive has at least one of them.
 MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 

@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 BAD: Final = ".bad"
 BATCH_ROWS: Final = (
     1 << 14
-)  # that are held at once where a file is gone through: a row group takes ten times as much
-BUFFER_BYTES: Final = 1 << 16  # of a column's file then
+)  # rows in memory while a file is read in parts; a row group takes ten times as much
+BUFFER_BYTES: Final = 1 << 16  # read buffer per column in this case
 
-# Without them a row is none, whatever version wrote it.
+# Columns without which a row is not valid in any version.
 NEEDED: Final = frozenset(
     {
         "leave_time",
@@ -70,7 +70,8 @@ def set_aside(path: Path, problem: str) -> None:
     writes the archive may do this.
     """
     log.warning("%s is damaged and was set aside: %s", path, problem)
-    with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
+    # another reader in this process found the damage at the same time
+    with suppress(FileNotFoundError):
         path.rename(path.with_name(path.name + BAD))
 
 
@@ -121,7 +122,7 @@ def load(
         names = None if whole else [name for name in known.names if name in file.schema_arrow.names]
         if where is not None and file.metadata.num_row_groups > 1:
             return _read_row_groups(file, names, where)
-        return file.read(names)  # for small files half of read_table
+        return file.read(names)  # half the time of read_table for small files
 
     found = _read_verified(path, read_rows, damaged)
     if found is None:
@@ -165,7 +166,7 @@ def load_groups(
                 filter_table(conform_columns(part, known), where)
                 for part in _read_batches(file, group, names)
             ]
-            if parts:  # none, of a file whose only vehicle was forgotten
+            if parts:  # empty if the file's only vehicle was erased
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
 
@@ -218,12 +219,12 @@ def _read_verified(
             entries = entries_of(file.metadata.metadata)
             if is_newer(
                 entries
-            ):  # before it is read: it may be written in a way that is not known here
+            ):  # checked before reading, because a newer version may store the columns differently
                 check_version(path, file.schema_arrow, entries)
             table = read(file)
             whole = (
                 table.num_columns == file.metadata.num_columns
-            )  # then its schema is at hand, in a third of the time
+            )  # the schema is then available in a third of the time
             version = check_version(path, table.schema if whole else file.schema_arrow, entries)
         table.validate(full=True)
         return Content(table, version, entries)
@@ -231,7 +232,7 @@ def _read_verified(
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError, DamagedError) as error:
         if isinstance(error, OSError) and error.errno is not None:
-            raise  # the system's trouble, not the file's
+            raise  # an error of the system, not of the file
         damaged(path, (str(error).splitlines() or [""])[0][:200])
         return None
 

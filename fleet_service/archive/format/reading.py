@@ -30,7 +30,7 @@ from schemas.wire import Kind
 # Key in the footer: the segments that the rows come from, as JSON [[SHARD-EPOCH, first number, last
 # number], …].
 SOURCES: Final = b"gripmap.sources"
-_TURNS: Final = 100  # a reader that is overtaken by so many compactions has another trouble
+_TURNS: Final = 100  # after so many restarts by compactions there must be another problem
 
 
 class Wanted(NamedTuple):

@@ -32,7 +32,7 @@ _FOLDERS: Final = {Kind.OBSERVATION: "inbox", Kind.STATE: "inbox/states"}
 _TIMES: Final = ("enter_time", "leave_time", "time", "received_at")
 _STEPS: Final = {f.name: f.step for f in (*tables.OBSERVATION, *tables.STATE) if f.step}
 
-NEARLY: Final = 1e-6  # far below the steps of both, so that rounding decides nothing
+NEARLY: Final = 1e-6  # far below the columns' steps, so that rounding decides nothing
 Rows = dict[str, NDArray[Any]]
 
 
@@ -69,17 +69,17 @@ class Writer:
             inbox.mkdir(parents=True, exist_ok=True)
             for draft in inbox.glob(
                 f"*{ENDING}"
-            ):  # of a run that died while writing: never acknowledged
+            ):  # drafts of an interrupted run; their rows were never acknowledged
                 draft.unlink()
         for parent in {
             root.parent,
             root,
             *folders,
-        }:  # a folder that power loss forgets takes its segments along
+        }:  # if a power loss removes a folder, its segments are lost too
             sync_directory(parent)
         self._unsynced: set[Path] = set()
-        # Compacted rows are known by the names of their segments, so that these may not be used
-        # again either.
+        # Compacted rows are identified by the names of their segments, so these names must not be
+        # used again either.
         named = [
             path
             for kind in SCHEMAS

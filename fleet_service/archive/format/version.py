@@ -39,7 +39,7 @@ class Version(NamedTuple):
 
 
 VERSION: Final = Version(1, 4)
-OLDEST: Final = Version(1, 0)  # of a file that says none
+OLDEST: Final = Version(1, 0)  # version of files that state none
 PREFIX: Final = "gripmap."
 KEY: Final = PREFIX + "version"
 DIGEST: Final = PREFIX + "digest"

@@ -24,8 +24,8 @@ from schemas.runtime.durable import open_durably
 
 FOLDER: Final = "requests"
 _ANSWER: Final = ".answer.json"
-_SECRET: Final = 0o600  # a vehicle's name stands there until the question is answered
-_KEPT_S: Final = 86_400.0  # an answer that nobody takes
+_SECRET: Final = 0o600  # the file contains a vehicle's name until the request is answered
+_KEPT_S: Final = 86_400.0  # time for which an answer that nobody collects is kept
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,7 @@ def write_request(root: Path, wanted: Erasure) -> Path:
         file.write(json.dumps(asdict(wanted)).encode())
     owner = root.stat()
     for place in (folder, path):
-        with suppress(
-            PermissionError
-        ):  # an administrator asks for the user that the service runs as
+        with suppress(PermissionError):  # an administrator makes the request for the service's user
             os.chown(place, owner.st_uid, owner.st_gid)
     return path
 

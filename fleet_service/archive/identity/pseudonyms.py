@@ -105,7 +105,7 @@ def load_or_create_key(path: Path) -> bytes:
             file.write(key + _key_digest(key))
         sync_directory(
             path.parent.parent
-        )  # else power loss forgets the key, and acknowledged batches with it
+        )  # otherwise a power loss could remove the key, and with it acknowledged batches
     return _read_key(path)
 
 

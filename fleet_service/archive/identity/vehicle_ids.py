@@ -69,7 +69,7 @@ class VehicleIds:
             with path.open("r+b", buffering=0) as file:
                 file.seek(
                     file.seek(0, os.SEEK_END) // _LINE * _LINE
-                )  # over what a full disk left of a line
+                )  # overwrite an incomplete line that a full disk has left
                 if file.write(_encode_line(pseudonym, number)) != _LINE:
                     raise OSError(errno.ENOSPC, "no space for another line", str(path))
             self._known.add(pseudonym)
@@ -95,7 +95,7 @@ class VehicleIds:
             OSError: the disk is full or broken; the next call tries again.
         """
         for path in sorted(self._unsynced):
-            if path.exists():  # else the month was forgotten meanwhile
+            if path.exists():  # otherwise the month was erased meanwhile
                 with path.open("rb") as file:
                     os.fsync(file.fileno())
                 sync_directory(self._folder)

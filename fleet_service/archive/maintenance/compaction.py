@@ -30,7 +30,7 @@ from fleet_service.archive.format.version import KEY, VERSION
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
-# Rows of one round at the most: half a gigabyte while it runs, and files of several row groups.
+# Maximum rows of one round: half a gigabyte of memory, and files of several row groups.
 ROUND_ROWS: Final = 1_000_000
 
 
@@ -70,7 +70,7 @@ def hold_compaction_lock(root: Path) -> Iterator[None]:
     with lock_compacted(root):
         drafts = root / "drafts"
         drafts.mkdir(exist_ok=True)
-        for draft in drafts.iterdir():  # of a run that died
+        for draft in drafts.iterdir():  # drafts of an interrupted run
             draft.unlink()
         yield
 
@@ -98,9 +98,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
             done = reading.compacted_partitions(
                 layout.compacted_files(root, kind), {path.name for path in waiting}
             )
-            # A run that died, or found the disk full, may have left its files in place with their
-            # names not yet synced: the segments that they stand for may only be deleted when power
-            # loss can no longer forget them.
+            # An interrupted run, or one with a full disk, may have placed files whose names are not
+            # synced yet. Their segments must not be deleted before a power loss can no longer
+            # remove these names.
             sync_tree(
                 root,
                 {

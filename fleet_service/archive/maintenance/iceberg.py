@@ -24,17 +24,17 @@ from schemas.runtime.durable import open_durably
 from schemas.runtime.installing import install_command
 from schemas.wire import Kind
 
-Catalog: TypeAlias = Any  # of pyiceberg, which an archive without tables does not need
+Catalog: TypeAlias = Any  # class of pyiceberg, which is not needed for archives without tables
 Table: TypeAlias = Any
 
-RECORD: Final = "iceberg.json"  # in the archive: where its files are registered
+RECORD: Final = "iceberg.json"  # file in the archive that states where its files are registered
 NAMESPACE: Final = "gripmap"
 PROPERTIES: Final = {
-    # no pseudonym stays in the table's own files
+    # the tables' own files then contain no pseudonym
     "write.metadata.metrics.column.vehicle": "counts",
     "write.metadata.delete-after-commit.enabled": "true",
     "write.metadata.previous-versions-max": "20",
-    "commit.retry.num-retries": "10",  # of several registrars, each of an archive of its own
+    "commit.retry.num-retries": "10",  # several archives may be registered at the same time
 }
 
 
@@ -75,7 +75,7 @@ def register(root: Path, place: Place) -> RegistrationResult:
         OSError: the archive cannot be read or written.
     """
     total = RegistrationResult(0, 0, 0)
-    with hold_compaction_lock(root):  # nobody removes or rewrites files meanwhile
+    with hold_compaction_lock(root):  # no other process removes or rewrites files meanwhile
         _record_registration(root, place)
         with _one_line_errors(place):
             catalog = _open_catalog(place)
@@ -134,7 +134,7 @@ def _record_registration(root: Path, place: Place) -> None:
     path = root / RECORD
     try:
         before = place_of(root)
-    except InputError:  # a damaged one is written anew
+    except InputError:  # a damaged record is written again
         before = None
     if before is not None and before != place:
         problem = (
@@ -159,11 +159,13 @@ def _open_catalog(place: Place) -> Catalog:
     if not place.catalog.startswith(("sqlite://", "postgresql")):
         return load_catalog(place.catalog)
     catalog_properties = {"type": "sql", "uri": place.catalog}
-    if place.catalog.startswith("sqlite:///"):  # the tables' own files beside the catalogue
+    # the tables' own files are stored next to the catalogue
+    if place.catalog.startswith("sqlite:///"):
         catalog_properties["warehouse"] = (
             Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
         )
-    return load_catalog("gripmap", **catalog_properties)  # by this name others find the tables
+    # the name under which other programs find the tables
+    return load_catalog("gripmap", **catalog_properties)
 
 
 def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
@@ -178,7 +180,7 @@ def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
         new = catalog.create_table_transaction(
             name, schema=_plain_schema(schema), properties=PROPERTIES
         )
-        with new, new.update_spec() as spec:  # a compacted file holds one date
+        with new, new.update_spec() as spec:  # a compacted file contains one date
             spec.add_field(layout.TIME[kind], DayTransform(), "date")
     table = catalog.load_table(name)
     if set(schema.names) - {field.name for field in table.schema().fields}:
@@ -201,7 +203,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
         for name, file in _files_by_name(table).items()
         if name.startswith(_folder_url(place))
     }
-    # one that was rewritten elsewhere is known by its size
+    # a file that was rewritten elsewhere is recognised by its size
     stale = [
         n
         for n, file in mine.items()
@@ -225,7 +227,8 @@ def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
                 for file in removed:
                     without.delete_data_file(file)
         if added:
-            change.add_files(added, check_duplicate_files=False)  # `_files_by_name` has looked
+            # `_files_by_name` has already checked this
+            change.add_files(added, check_duplicate_files=False)
 
 
 def _files_by_name(table: Table) -> dict[str, Any]:
@@ -250,7 +253,7 @@ def _one_line_errors(place: Place) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:  # every catalogue has errors of its own
+    except Exception as error:  # every catalogue raises errors of its own
         fix = "check that the catalog can be reached, then run the command again"
         raise InputError(
             "catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix

@@ -20,9 +20,9 @@ except ImportError as _missing:
     _fix = "pip install 'gripmap[cits]'"
     raise InputError("cits", "the package python-qpid-proton is missing", _fix) from _missing
 
-CREDIT: Final = 200  # messages that the other side may send ahead
+CREDIT: Final = 200  # messages that the other side may send in advance
 HEARTBEAT_S: Final = 10.0
-RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)  # between two tries to connect
+RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)  # pauses between attempts to connect
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class _AmqpEvents(MessagingHandler):
                 parcel.name,
                 event.delivery.remote.condition,
             )
-            self._link.on_accepted(parcel.name)  # the same content would be refused again
+            self._link.on_accepted(parcel.name)  # a refused message would be refused again
 
     def on_released(self, event: Any) -> None:  # noqa: ANN401
         parcel = self._flying.pop(event.delivery, None)

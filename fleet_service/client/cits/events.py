@@ -18,13 +18,13 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS
 
-VALID_NS: Final = 1800 * NS  # as long as the service keeps an alert that nobody confirms
+VALID_NS: Final = 1800 * NS  # the time for which the service keeps an alert without confirmation
 RENEW_NS: Final = VALID_NS // 2
-ICE_MU: Final = 0.2  # of the road materials that a DENM names, only ice is below
+ICE_MU: Final = 0.2  # friction below which the only road material in a DENM is ice
 SEQUENCES: Final = 1 << 16
 SURE: Final = 0.97  # P(slippery) that raises the quality of the information by one
-CELL_STD: Final = 5.0  # [m] of a place within its cell
-TERMINATED_NS: Final = VALID_NS  # for which the number of an ended event is not used again
+CELL_STD: Final = 5.0  # [m] position error within a cell
+TERMINATED_NS: Final = VALID_NS  # time for which the number of an ended event is not used again
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class EventBook:
         self.station = station
         self._next = 0
         self._events: dict[str, OpenEvent] = {}
-        self._used: set[int] = set()  # numbers of the events in the book
+        self._used: set[int] = set()  # event numbers in use
         if content is not None:
             self._restore_content(content)
 

@@ -27,11 +27,11 @@ GRIP: Final = {
     BLACK_ICE: (0.12, 0.05, 0.2),
 }
 UNKNOWN: Final = (0.35, 0.15, 0.6)
-USED: Final = 0.6  # of the middle: with less, a report would say only "at least"
-WORST_STD: Final = 12.0  # [m] of a position that names a cell at all
-MOST_CELLS: Final = 24  # in both directions they fit into one batch
+USED: Final = 0.6  # share of the middle; with less, a report would be only a lower bound
+WORST_STD: Final = 12.0  # [m] largest position error with which a cell can be identified
+MOST_CELLS: Final = 24  # with both directions they fit into one batch
 QUARTERS: Final = (0.0, 90.0, 180.0, 270.0)  # [deg] headings of the four sectors
-POSITION_STD: Final = 10.0  # [m] where a message does not say
+POSITION_STD: Final = 10.0  # [m] used if the message states no accuracy
 
 
 def encode_reports(
