@@ -49,7 +49,8 @@ class Campaign(NamedTuple):
     Attributes:
         command: the command as typed in a shell.
         output: folder in which the command writes `figures.json`.
-        title: name of a complete run in the header of that file; a quick run has another name.
+        title: name of a complete run in the header of that file; a quick run (a short form) has
+            another name.
     """
 
     command: str

@@ -118,7 +118,7 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """Answer a query about the archive, called `name`, with a new query engine."""
+    """Answer a query about the archive, called `name`, with a new instance of the query program."""
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 

@@ -40,8 +40,8 @@ SECOND: Final = 10**9
 
 
 def growth() -> list[Figure]:
-    """Measure the engine's processor time for one second of messages at 10³ to 10⁵ observations per
-    second.
+    """Measure the processor time of the engine (service without network) for one second of messages
+    at 10³ to 10⁵ observations per second.
     """
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])

@@ -52,9 +52,8 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local_marker(self, tile: int) -> int:
-        """Return the index of a tile's marker cell. The number of each publication is stored as the
-        vehicle count of this cell, so that a test that reads the tile can recognise the
-        publication.
+        """Return the index of a tile's marker cell. The vehicle count of this cell states the
+        number of the publication, so that a test that reads the tile can recognise the publication.
         """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 

@@ -116,8 +116,8 @@ def load(endpoint: str) -> None:
 
 
 def bare(endpoint: str, folder: str) -> None:
-    """Run a bare Zenoh queryable, for comparison: answer every query with the bytes of one of two
-    files in `folder`, until this process is ended.
+    """Run a bare Zenoh queryable (program that only answers queries), for comparison: answer every
+    query with the bytes of one of two files in `folder`, until this process is ended.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None

@@ -83,7 +83,8 @@ def main(vehicles: int, messages: int) -> None:
 
 def make_message(vehicle: int, number: int, area: int, end: int) -> Message:
     """Return message `number` of a vehicle that drives straight east, one cell per second, in one
-    of the areas; its last visit ends at `end` [ns]. One visit in seven measures the friction.
+    of the areas; its last visit (pass through a cell) ends at `end` [ns]. One visit in seven
+    measures the friction.
     """
     group, lane = divmod(vehicle // AREAS, LANES)
     x, y = corner_of_region(area)

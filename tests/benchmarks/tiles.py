@@ -1,8 +1,8 @@
 """Benchmark of sparse traffic over many map tiles: delay of acknowledgements, and age of a tile for
 a client that queries all tiles.
 
-1 600 vehicles each drive to and fro in their own row of five tiles, and send a visit every 1.07 s.
-Router, service, vehicles and readers run in separate processes.
+1 600 vehicles each drive to and fro in their own row of five tiles, and report a visit (pass
+through a cell) every 1.07 s. Router, service, vehicles and readers run in separate processes.
 """
 
 from __future__ import annotations

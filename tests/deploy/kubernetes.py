@@ -50,8 +50,8 @@ Manifest = dict[str, Any]
 
 
 def build_overlay(overlay: str) -> list[Manifest]:
-    """Return the Kubernetes objects of an overlay that `kubectl apply -k` would send to a
-    cluster.
+    """Return the Kubernetes objects of an overlay (variant of the manifests) that `kubectl apply
+    -k` would send to a cluster.
     """
     words = ["kubectl", "kustomize", str(FOLDER / overlay)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
@@ -369,8 +369,8 @@ def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
 
 @contextmanager
 def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
-    """Yield a simulated cluster in which the pods of an overlay run, with a bucket if the pods need
-    one.
+    """Yield a simulated cluster in which the pods of an overlay (variant of the manifests) run,
+    with a bucket if the pods need one.
     """
     made = Cluster(overlay, root)
     wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
@@ -381,8 +381,8 @@ def open_cluster(overlay: str, root: Path) -> Iterator[Cluster]:
 
 
 def main() -> int:
-    """Validate the manifests of every overlay, and start its pods. Return 1 if a figure misses its
-    target, otherwise 0.
+    """Validate every overlay (variant of the manifests), and start its pods. Return 1 if a figure
+    misses its target, otherwise 0.
     """
     wrong = list[str]()
     failed = list[str]()

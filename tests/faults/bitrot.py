@@ -3,8 +3,8 @@ or has no effect.
 
 For each error, one bit in a copy of an archive is changed, and a service starts from the copy. Its
 map and its rows are compared with those of the undamaged archive. Every difference must have been
-counted as damage. The outbox files of agents are tested in the same way: an agent must send exactly
-the stored bytes.
+counted as damage. The outbox files of agents (their stores of unacknowledged messages) are tested
+in the same way: an agent must send exactly the stored bytes.
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ def _is_same(found: dict[str, Any], right: dict[str, Any]) -> bool:
 
 
 def _damage_spool(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
-    """Change bits of an outbox file. Return the number of changes, and the errors that were not
-    detected.
+    """Change bits of an outbox file (store of unacknowledged messages). Return the number of
+    changes, and the errors that were not detected.
     """
     path = site.folder / "whole.sqlite"
     wrong = []

@@ -66,8 +66,8 @@ def write_town_archive(root: Path) -> str:
 
 
 class Journals:
-    """Reader of the load generators' journals: times of acknowledged batches, updated as
-    acknowledgements arrive.
+    """Reader of the load generators' journals (lists of stored and acknowledged batches): times of
+    acknowledged batches, updated as acknowledgements arrive.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -325,7 +325,9 @@ class Machines:
         return Failover(name if hit else "kill", seconds)
 
     def _count_leases(self) -> int:
-        """Return the number of leases of the region that services have taken so far."""
+        """Return how many times a service has so far taken the lease (exclusive ownership) of the
+        region.
+        """
         return sum(1 for _ in self._leases.glob("*.json"))
 
     def _await_takeover(self) -> None:

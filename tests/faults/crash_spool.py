@@ -28,7 +28,9 @@ CAPACITY: Final = 10**9
 
 
 class Files(NamedTuple):
-    """Bytes of the outbox's SQLite file and of its write-ahead log."""
+    """Bytes of the SQLite file of the outbox (store of unacknowledged messages) and of its
+    write-ahead log.
+    """
 
     database: bytes
     log: bytes

@@ -212,7 +212,9 @@ def _count_rows(root: Path) -> int:
 
 
 def _room_made(engine: Engine, folder: Path) -> int:
-    """Fill the disk, run the retention job, and return the number of days that it deleted."""
+    """Fill the disk, run the job that deletes old days (retention), and return the number of days
+    that it deleted.
+    """
     root = folder / "archive"
     begin_with_old_rows(root)
     with patch.multiple(disk_reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):
@@ -227,8 +229,8 @@ def _room_made(engine: Engine, folder: Path) -> int:
 
 
 def _outbox_recovers(folder: Path, mounted: bool) -> bool:
-    """Return True if an outbox refuses batches on a full disk, keeps those that it accepted before,
-    and continues when there is space again.
+    """Return True if an outbox (store of unacknowledged messages) refuses batches on a full disk,
+    keeps those that it accepted before, and continues when there is space again.
     """
     outbox = Outbox(folder / "spool.sqlite", boot=5)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))

@@ -106,8 +106,8 @@ class Honest:
         self._put_batch(one)
 
     def resend(self) -> None:
-        """Send again this vehicle's batches that wait for longer than RESEND_S, as an
-        outbox does.
+        """Send again this vehicle's batches that wait for longer than RESEND_S, as an agent's
+        outbox (store of unacknowledged messages) does.
         """
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:

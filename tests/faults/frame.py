@@ -37,7 +37,7 @@ class Site:
     """Environment of a campaign.
 
     Attributes:
-        folder: the campaign's own empty folder; it is not deleted if a figure misses its bar.
+        folder: the campaign's own empty folder; it is not deleted if a figure misses its target.
         quick: True for a run of seconds instead of minutes.
         seed: seed of all random numbers.
         say: function that prints a line of progress.

@@ -1,9 +1,9 @@
 """Environment of the attacks: two routers with TLS and access list, a running service, honest
 vehicles and readers, and listeners.
 
-No step waits by sleeping. Messages of one priority keep their order on each path. So if a marker is
-sent after an attack and received, no message of the attack is still in transit. Messages that
-reached the service wait for its worker thread, which processes them in order. So only the
+No step waits by sleeping. Messages of one priority keep their order on each path. So if a marker
+message is sent after an attack and received, no message of the attack is still in transit. Messages
+that reached the service wait for its worker thread, which processes them in order. So only the
 acknowledgement of a later batch shows that the service has processed and counted the messages of
 the attack.
 """

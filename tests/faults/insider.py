@@ -160,7 +160,7 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
-    """Return a batch of the insider with visits to fifty random cells within `degrees` of the road.
+    """Return a batch of the insider that reports fifty random cells within `degrees` of the road.
     The region of the batch is that of its first cell.
     """
     spread = random_.uniform(-degrees, degrees, (2, 50))

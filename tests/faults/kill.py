@@ -3,8 +3,9 @@ once, under load.
 
 The kills run in rounds, each with its own archive, so that a restarted service has to read back
 minutes and not hours. The archive also has old rows, which a retention process removes meanwhile;
-this process is killed too. At the end of a round everything runs until all batches are settled.
-Then the archive is compared with the agents' journals (lists of stored and acknowledged batches).
+this process is killed too. At the end of a round everything runs until all batches are settled
+(finally answered). Then the archive is compared with the agents' journals (lists of stored and
+acknowledged batches).
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ def begin_with_old_rows(archive: Path) -> None:
 
 
 def old_days(archive: Path) -> list[Path]:
-    """Return the folders of the days that retention removes."""
+    """Return the folders of the days that retention (deletion of old rows) removes."""
     return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 

@@ -40,8 +40,9 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 class Event(NamedTuple):
     """Event of the simulated history of several services. There are three kinds. `serves`: a
-    service with a lease number begins to serve and knows some batches. `acknowledges`: a service
-    acknowledges batches. `reads`: at the end, a reader finds the batches that count.
+    service with a lease (ownership of the archive) of some number begins to serve and knows some
+    batches. `acknowledges`: a service acknowledges batches. `reads`: at the end, a reader finds the
+    batches that count.
     """
 
     kind: str
@@ -51,7 +52,8 @@ class Event(NamedTuple):
 
 class Verdict(NamedTuple):
     """Result of the check of a simulated history: number of acknowledgements by an earlier holder
-    of the lease after its successor began to serve, and violations of the promises to agents.
+    of the lease (ownership of the archive) after its successor began to serve, and violations of
+    the promises to agents.
     """
 
     acknowledged_by_two: int
@@ -59,9 +61,9 @@ class Verdict(NamedTuple):
 
 
 def judge_history(events: list[Event]) -> Verdict:
-    """Return the number of acknowledgements by a holder of the lease after its successor began to
-    serve, and the batches that break a promise: acknowledged but unknown to a later owner or to the
-    reader, or counted twice.
+    """Return the number of acknowledgements by a holder of the lease (ownership of the archive)
+    after its successor began to serve, and the batches that break a promise: acknowledged but
+    unknown to a later owner or to the reader, or counted twice.
     """
     served = 0
     by_two = 0
@@ -298,8 +300,8 @@ class ServiceHistory:
         self.events.append(Event("reads", max(self._fences, default=0), read))
 
     def _start_process(self, name: str, after: float) -> None:
-        """Start a simulated service process. Half of the processes have a lease time that may
-        differ from the common one.
+        """Start a simulated service process. Half of the processes have a lease time (validity of
+        the ownership of the archive) that may differ from the common one.
         """
         common = LEASES[0]
         own = self._random.choice(LEASES) if self._random.random() < 0.5 else common
@@ -377,7 +379,7 @@ class ServiceHistory:
 
     def _accept_batch(self, lease: Lease, known: set[int]) -> None:
         """Upload to the bucket a batch that a simulated vehicle offers, and acknowledge it if the
-        service's lease allows this.
+        service's lease (ownership of the archive) allows this.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         offered = range(int(self._world.now * BATCHES_PER_S) + 1)

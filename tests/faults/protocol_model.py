@@ -138,8 +138,8 @@ class Checked(NamedTuple):
 
 
 def explore_states(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Checked:
-    """Visit all reachable states of the model with at most `most_number` lease numbers and
-    `most_turn` renewals per lease. Stop at the first violation.
+    """Visit all reachable states of the model with at most `most_number` leases (ownerships of the
+    archive) and `most_turn` renewals of each. Stop at the first violation.
     """
     start = World((Service(), Service()))
     came: dict[World, tuple[World, str] | None] = {start: None}
@@ -306,8 +306,8 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
 
 def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
     """Return the state after a tick: the clocks of all running services advance, except that of the
-    service `slow`. A clock is used for the age of a lease, for the wait for a lease, or for the
-    wait before a service reads the bucket's objects.
+    service `slow`. The clocks measure the age of a lease (ownership of the archive), the wait for a
+    lease, and the wait before a service reads the bucket's objects.
     """
     out = []
     for me, one in enumerate(world.services):

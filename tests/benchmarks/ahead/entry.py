@@ -43,9 +43,9 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """Records of N filters at T instants: place (map cell with heading sector) (T, N); friction
-    belief of the filter, `own`, and log-likelihood of the measurements in the current visit
-    (passage of the place), `visit`, (T, N, 32); true friction (T, N).
+    """Records of N filters at T instants. `place` (T, N): map cell with heading sector; `own` (T,
+    N, 32): friction belief of the filter; `visit` (T, N, 32): log-likelihood of the measurements
+    since the vehicle entered the place; also the true friction (T, N).
     """
 
     place: IntArray
@@ -137,7 +137,7 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     alone = _median_friction(np.exp(trace.own))
     since = _since_entry(trace.place)
     first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
-    first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
+    first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the drive's start is not an entry
     return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 

@@ -105,7 +105,7 @@ class Country:
 
     def list_expressions(self) -> list[str]:
         """Return, for each service, the Zenoh key expression of the regions that it serves: those
-        of one zone.
+        of one zone (map square of zoom 7).
         """
         first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
         parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]

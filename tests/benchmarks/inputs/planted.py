@@ -213,8 +213,8 @@ def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return two shares for accurate and inaccurate cars: added faults that the signal doctor
-    finds, and drives that it declares free of faults.
+    """Return two shares for accurate and inaccurate cars: added faults that the signal doctor (a
+    check of recorded signals) finds, and drives that it declares free of faults.
 
     The second share, on drives without a fault, shows the false alarms. The same shares are
     measured in a winter town.
@@ -258,7 +258,9 @@ def _share_of(held: Iterable[bool]) -> float:
 
 
 def _accused_share(clean: Sequence[Diagnosis]) -> float:
-    """Return the share of all channels of faultless drives in which the doctor reports a fault."""
+    """Return the share of all channels of faultless drives in which the signal doctor (a check of
+    recorded signals) reports a fault.
+    """
     channels = sum(
         len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings)
         for diagnosis in clean

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
 pytest.importorskip("pyspark", reason="pip install 'gripmap[spark]'")
 
 DRIVES = 3
-ESTIMATOR = "aco-fckf"  # `make setup` has compiled it; another one takes minutes at its first drive
+ESTIMATOR = "aco-fckf"  # compiled by `make setup`; others take minutes at first
 
 
 @pytest.fixture(scope="module")

@@ -75,8 +75,8 @@ def told_at(t: float) -> dict[str, float]:
 
 
 def frames_of(name: str) -> list[can.Message]:
-    """Return the CAN frames of a drive of the car that the shipped profile `name` describes, with
-    all messages of its CAN database.
+    """Return the CAN frames of a drive of the car that the shipped profile `name` (assignment of
+    signals to channels) describes, with all messages of its CAN database.
     """
     cantools = pytest.importorskip("cantools")
     database = cantools.database.load_file(FOLDER / f"{name}.dbc", strict=False)

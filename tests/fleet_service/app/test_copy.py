@@ -292,7 +292,7 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
         process.terminate()
         assert process.wait(20) == 0
     if not beside:
-        assert main(words) == 2  # it has a copy, and it is not told how to reach it
+        assert main(words) == 2  # the archive has a copy, but the service does not know its address
         assert main([*words, "--config", str(tmp_path / "service.json")]) == 0
     new = tmp_path / "new"
     with closing(Engine(settings(bucket), new)):

@@ -180,7 +180,8 @@ def rows_kept(root: Path) -> int:
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """A batch of an erased month must be refused, also after restarts. The archive no longer has
-    the batch, but a vehicle's outbox may still send it if its acknowledgement was lost.
+    the batch, but a vehicle's outbox (store of unacknowledged messages) may still send it if its
+    acknowledgement was lost.
     """
     old = batch("car-001", 1, NOON, [0.8])
     away = batch("car-002", 1, NOON - DAY, [0.8])
@@ -207,8 +208,8 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
 
 
 def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """Erased rows of a vehicle must be refused, also after restarts. An outbox restored from a
-    backup may send rows that were acknowledged long ago.
+    """Erased rows of a vehicle must be refused, also after restarts. A vehicle's outbox (store of
+    unacknowledged messages) restored from a backup may send rows that were acknowledged long ago.
     """
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)

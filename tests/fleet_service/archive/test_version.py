@@ -279,7 +279,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
     archive = ["--archive", str(old), "--out", str(old / "out.csv")]
     for what, encoding in (("observations", COMPACTED), ("rollup", ROLLUP), ("map", MAP)):
         rewrite_file(next((old / what).rglob("*.parquet")), lambda table: table, "2.0", encoding)
-        more = ["--snapshot"] if what == "map" else []  # a replay of now reads the last month only
+        more = ["--snapshot"] if what == "map" else []  # replays read the last month only
         assert cli.main(["export", what, *archive, *more]) == 2
         assert "is of version 2.0" in capsys.readouterr().err
     rewrite_file(segments.list_segments(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")

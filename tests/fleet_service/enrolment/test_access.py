@@ -133,7 +133,7 @@ def is_heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool
     with listener.declare_subscriber(
         f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())
     ):
-        publisher = listener.declare_publisher(key(name))  # only a service is told who hears
+        publisher = listener.declare_publisher(key(name))  # only a service learns who subscribes
 
         def has_arrived() -> bool:
             vehicle.put(key(name), b"here")
