@@ -53,7 +53,7 @@ ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's
 
 
 class AdaptiveMemory(FederatedMemory):
-    """State of paper 001's filter for one vehicle that is kept between samples."""
+    """State of paper 001's filter for one vehicle, kept from one sample to the next."""
 
     actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
     expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances

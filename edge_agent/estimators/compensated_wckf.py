@@ -89,8 +89,8 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """State of paper 002's filters, WCKF-A and WCKF-B, for one vehicle that is kept between
-    samples.
+    """State of paper 002's filters, WCKF-A and WCKF-B, for one vehicle, kept from one sample to the
+    next.
     """
 
     mean: Annotated[FloatArray, A_STATES]

@@ -81,7 +81,7 @@ AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 
 class JointMemory(FederatedMemory):
-    """State of paper 000's joint filter for one vehicle that is kept between samples."""
+    """State of paper 000's joint filter for one vehicle, kept from one sample to the next."""
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]

@@ -106,7 +106,7 @@ printed tables.
 
 
 class FuzzyMemory(PaperMemory):
-    """State of paper 004's filter for one vehicle that is kept between samples."""
+    """State of paper 004's filter for one vehicle, kept from one sample to the next."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]

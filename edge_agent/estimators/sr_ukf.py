@@ -110,7 +110,7 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """State of the filter `sr-ukf` for one vehicle that is kept between samples."""
+    """State of the filter `sr-ukf` for one vehicle, kept from one sample to the next."""
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]

@@ -26,7 +26,9 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """Fields that the records of all papers' filters have in common; one record per vehicle."""
+    """Fields that the filter records of all papers share. Each vehicle has one record, which keeps
+    the state of its filter between samples.
+    """
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack

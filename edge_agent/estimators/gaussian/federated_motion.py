@@ -96,7 +96,9 @@ class FederatedMotion:
 
 
 class FederatedMemory(PaperMemory):
-    """Fields that the memory records of the filters of papers 000 and 001 have in common."""
+    """Fields that the filter records of papers 000 and 001 share. A record keeps the state of one
+    vehicle's filter between samples.
+    """
 
     motion: FederatedMotion
 

@@ -68,7 +68,9 @@ def worth_of(name: str) -> Callable[[Results], float]:
 
 
 def mean(values: FloatArray | None) -> float:
-    """Return the mean of the values of a measure, one per drive; NaN if there are no values."""
+    """Return the mean of a measure over drives (`values` has one value per drive); NaN if there are
+    no values.
+    """
     return math.nan if values is None or not len(values) else float(np.mean(values))
 
 

@@ -289,9 +289,9 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins:
-    once for slides on slippery road and once for all other times. Also add the time [s] without
-    this flag in both cases.
+    """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins,
+    separately for slides on slippery road and for all other times. For both, also add the time [s]
+    without this flag.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)

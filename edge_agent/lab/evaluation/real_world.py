@@ -85,9 +85,10 @@ class Tally:
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Return the mean of the added values by name; NaN without values.
+        """Return the mean of the values added under each name; NaN without values.
 
-        A name that ends in "_squared" is returned as the root of its mean, without that suffix.
+        For a name that ends in "_squared", the root of the mean is returned, under the name without
+        this suffix.
         """
         found = {
             name: total / self.count[name] if self.count[name] else np.nan

@@ -36,7 +36,7 @@ class Origin:
     def from_latlon(
         self, latitude: FloatArray, longitude: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return (x, y) [m] of the points given in degrees."""
+        """Return the coordinates (x, y) [m] of points given by latitude and longitude [deg]."""
         north, east = self.per_metre
         return (np.asarray(longitude) - self.longitude) / east, (
             np.asarray(latitude) - self.latitude

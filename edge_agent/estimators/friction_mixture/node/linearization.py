@@ -233,13 +233,14 @@ def slope_along(slope: float, ratio: float, square: float, whole: float) -> floa
 
 @inlined
 def slip_noise_correction(slope: float) -> float:
-    """Return one half minus the share of the slip noise variance that enters a residual, for a
-    given slope of the tyre curve.
+    """Return by how much the noise variance of a residual must be reduced, as a share of the slip
+    noise variance, for a given slope of the tyre curve.
 
     A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
-    the slip noise enters it (errors in variables); at slope 1 this is one half, which
-    features.noise_std already contains. A constant share would be too large on the flat part of the
-    curve, where hardly any slip noise enters. It would favour nodes (friction hypotheses) by which
-    the wheels slide.
+    the slip noise enters it (errors in variables). features.noise_std contains one half, the share
+    at slope 1; the result is one half minus the actual share.
+
+    Without the correction, the noise would be too large on the flat part of the curve, where hardly
+    any slip noise enters. This would favour nodes (friction hypotheses) by which the wheels slide.
     """
     return 0.5 - slope * slope * inverse_of(1.0 + slope * slope)

@@ -149,8 +149,8 @@ class Quantiles:
 
 
 class MixtureMemory:
-    """State of the default estimator (friction mixture) for one vehicle that is kept between
-    samples.
+    """State of the default estimator (friction mixture) for one vehicle, kept from one sample to
+    the next.
     """
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
@@ -205,8 +205,8 @@ class MixtureMemory:
 def new_filters(
     rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray
 ) -> RecordArray:
-    """Return new filter records for vehicles with the parameters `rows` (N, 15); no sample has been
-    processed.
+    """Return the filter records of vehicles with the parameters `rows` (N, 15), before the first
+    sample.
 
     `means` and `spreads` (N, STATES) are the means and standard deviations of the state priors; the
     times within which states return to the prior are those of `nominal`.
