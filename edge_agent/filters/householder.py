@@ -6,7 +6,7 @@ Legend
     L           sqrt_cov, lower triangular, covariance P = L*L'             (n, n)
     X           weighted centred deviations of state points                 (n, points)
     Z           weighted centred deviations of measurement points           (k, points)
-    nu          innovation, measured minus predicted; NaN for a missing row  (k,)
+    nu          innovation, measured minus predicted; NaN if missing         (k,)
     r           standard deviations of the measurement noise, independent    (k,)
     S           innovation covariance Z*Z' + diag(r^2)                       (k, k)
 

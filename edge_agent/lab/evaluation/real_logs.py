@@ -69,8 +69,8 @@ HEAD: Final = (
 
 @dataclass(frozen=True)
 class LogFigures:
-    """Results for one log, as listed in the module's docstring; NaN where the log does not
-    determine a result.
+    """Results for one log, such as the share of time with an informative interval; the module's
+    docstring lists them. A result is NaN where the log does not determine it.
     """
 
     name: str

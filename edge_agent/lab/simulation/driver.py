@@ -319,8 +319,8 @@ def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
     """Return the longitudinal force [N] that a driver demands from a vehicle with the parameters
-    `p` for an acceleration [m/s^2] while gravity acts with `along` [m/s^2] along the road. It is
-    limited by tyres and engine.
+    `p` for an `acceleration` [m/s^2]. `along` [m/s^2] is the acceleration by gravity along the
+    road. The force is limited by tyres and engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(

@@ -1,5 +1,5 @@
-"""Simulation of one manoeuvre of one vehicle: it gives a signal log with the true values, and a
-vehicle file.
+"""Simulation of one manoeuvre of one vehicle. The result is a signal log with the true values, and
+a vehicle file.
 """
 
 from __future__ import annotations

@@ -116,8 +116,8 @@ class Graph:
 @dataclass
 class Ledger:
     """Record of a search: all evaluated paths with their objectives, the best path, and the
-    iterations. A path is an array of V indices that selects one value per variable. Its objective
-    is computed only once.
+    iterations. A path is an array of V indices that selects one value per variable. The objective
+    of each path is computed only once.
     """
 
     objective: Objective

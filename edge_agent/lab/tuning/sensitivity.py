@@ -1,20 +1,22 @@
-"""Sensitivity of the default estimator to each of its constants.
+"""Sensitivity analysis: how much the default estimator's results change with each of its constants.
 
 Each number of `Constants` and of the shipped memberships (fuzzy sets) is multiplied by .7 and by
 1.4, one at a time. The filter then runs on simulated towns, half of them in winter, and on
-manoeuvres, all with inaccurate cars. Their seeds belong to tuning and are not used for judging.
+manoeuvres, all with inaccurate cars. Their seeds belong to tuning and are not used for published
+results.
 
 Legend of the columns, each the change from the filter as it is
     score      mean interval score of friction over the drives [%]; less is better
     false ice  share of the samples above a friction of .6 that are called slippery [percentage
                points]
-    found      share of the excited samples on slippery road that are called slippery [percentage
-               points]
-    time       time of the filter [%]; both are measured alternately, so that other load cancels
+    found      share of the excited samples (a wheel uses much of its grip) on slippery road that
+               are called slippery [percentage points]
+    time       time of the filter [%]; the changed and the usual filter are measured alternately, so
+               that other load on the computer cancels
 
 A number that changes score, false ice and found by less than 1 in both directions can be merged
-with another one or deleted. Chance moves the score by about 1 % as well, because a small change of
-one drive can decide if a slide is noticed.
+with another one or deleted. Chance also moves the score by about 1 %, because a small change of one
+drive can decide whether a slide is noticed.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ SMALL: Final = 1.0  # change in every column below which a number has no effect
 
 
 class JudgedDrives(NamedTuple):
-    """Simulated drives, and for each sample (T, N) if a wheel uses much of its grip."""
+    """Simulated drives, and a mask (T, N) of the samples in which a wheel uses much of its grip."""
 
     batch: DriveSet
     excited: BoolArray
@@ -67,7 +69,7 @@ class FilterMeasures(NamedTuple):
 
 
 class ConstantChange(NamedTuple):
-    """ConstantChange of the measures when the number `name` is multiplied by `factor`."""
+    """Change of each measure when the constant `name` is multiplied by `factor`."""
 
     name: str
     factor: float
@@ -78,14 +80,16 @@ class ConstantChange(NamedTuple):
 
     @property
     def effect(self) -> float:
-        """Return the largest change of a measure, time apart."""
+        """Return the largest absolute change of score, false ice and found; the computing time is
+        not included.
+        """
         return max(abs(self.score), abs(self.false_ice), abs(self.found))
 
 
 def simulate_drives(
     seeds: Sequence[int], *, cars: int = CARS, town_s: float = TOWN_S, drive_s: float = DRIVE_S
 ) -> list[JudgedDrives]:
-    """Simulate one town and one set of manoeuvres per seed."""
+    """Simulate, for each seed, cars in one town and one set of manoeuvres."""
     drives = []
     for seed in seeds:
         batch, used = town(seed, cars, town_s)
@@ -121,8 +125,9 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
 
 
 def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, MixtureDesign]]:
-    """Yield name, factor and tables of each filter with one number multiplied by a factor of
-    FACTORS. Zeros and numbers that would make the fuzzy sets invalid are left out.
+    """Yield, for each constant and each factor of FACTORS, the name, the factor and the tables of a
+    filter with this constant multiplied by it. Zeros, and values that would make the fuzzy sets
+    invalid, are left out.
     """
     usual = Constants()
     for name, value in usual._asdict().items():
@@ -148,8 +153,8 @@ def campaign(
     only: str = "",
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[ConstantChange]:
-    """Measure the filter with each number changed, and return the changes, the largest effect
-    first. Only numbers whose name contains `only` are changed.
+    """Run the filter with each constant changed, and return the changes of its measures, the
+    largest effect first. Only constants whose name contains `only` are changed.
     """
     memberships = shipped_memberships(ESTIMATOR)
     usual = design_of(memberships, adaptive=True)
@@ -180,7 +185,7 @@ def campaign(
 
 
 def list_without_effect(changes: Sequence[ConstantChange]) -> list[str]:
-    """Return the names of the numbers whose change by any factor has an effect below SMALL."""
+    """Return the names of the constants whose effect is below SMALL for all factors."""
     largest: dict[str, float] = {}
     for change in changes:
         largest[change.name] = max(change.effect, largest.get(change.name, 0.0))
@@ -188,7 +193,9 @@ def list_without_effect(changes: Sequence[ConstantChange]) -> list[str]:
 
 
 def to_markdown(changes: Sequence[ConstantChange]) -> str:
-    """Return the changes as a Markdown table, with the numbers without effect below it."""
+    """Return the changes as a Markdown table, followed by the names of the constants without
+    effect.
+    """
     lines = [
         "| number | factor | score [%] | false ice [pp] | found [pp] | time [%] |",
         "|---|---|---|---|---|---|",
@@ -203,7 +210,9 @@ def to_markdown(changes: Sequence[ConstantChange]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the campaign, print the table, and write it to a folder."""
+    """Run the sensitivity analysis, print its table, and write the table and the numbers to the
+    folder `--out`.
+    """
     parser = argparse.ArgumentParser(description="Sensitivity of the estimator to its constants")
     parser.add_argument("--out", type=Path, default=Path(".evaluation/sensitivity"))
     parser.add_argument("--only", default="", help="numbers whose name contains this text")
