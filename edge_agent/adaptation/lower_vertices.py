@@ -1,5 +1,5 @@
-"""Triangular fuzzy sets with free lower vertices: the sets that paper 004 tunes (section III.C,
-figures 2 and 3).
+"""Triangular fuzzy sets whose lower vertices (feet) can be chosen freely: the sets that paper 004
+tunes (section III.C, figures 2 and 3).
 
 Legend
     peaks       upper vertices of the five sets of the mismatch [1] (5,)

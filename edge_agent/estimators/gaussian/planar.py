@@ -239,8 +239,8 @@ def _half_axle_force(row: FloatArray, track: InputTrack, first: int, dt: float) 
 
 @inlined
 def _torque_forces(row: FloatArray, track: InputTrack, dt: float) -> Four:
-    """Return the longitudinal forces [N] of the four wheels, computed from their torques and the
-    change of their speeds over `dt` [s].
+    """Return the longitudinal forces [N] of the four wheels, computed from the wheels' torques and
+    from the change of their speeds over `dt` [s].
     """
     return (
         wheel_force(row, track, 0, dt),

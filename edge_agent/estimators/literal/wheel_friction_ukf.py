@@ -130,7 +130,9 @@ class _Model:
         return np.concatenate([mean[None], mean + spread, mean - spread])
 
     def predicted_measurements(self, k: int, points: FloatArray) -> FloatArray:
-        """Return the predicted measurements (9, rows) of the points (9, 4) at sample `k`."""
+        """Return the measurements at sample `k` that the states `points` (9, 4) predict, (9, number
+        of measurements).
+        """
         force = self.forces.tyre_forces(k, points)
         felt = self.forces.body_accelerations(k, force)
         if not self.setting.torque_rows:

@@ -272,8 +272,8 @@ def moderate_braking(now: Moment) -> tuple[float, float]:
 
 
 def pulses(now: Moment) -> tuple[float, float]:
-    """Return the controls (road-wheel angle, acceleration) for two seconds of acceleration and two
-    seconds of braking in turn, while weaving slightly, as in town traffic.
+    """Return the controls (road-wheel angle, acceleration) that alternate two seconds of
+    acceleration with two seconds of braking, while weaving slightly, as in town traffic.
     """
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(
@@ -304,7 +304,7 @@ def throttle(_now: Moment) -> tuple[float, float]:
 
 
 def kmh(speed: float) -> float:
-    """Return a speed given in km/h in m/s."""
+    """Convert a speed from km/h to m/s."""
     return speed / 3.6
 
 

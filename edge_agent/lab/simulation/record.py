@@ -1,5 +1,5 @@
-"""Records with the true values of one sample of one vehicle. Sensors are simulated from them, and
-estimates are compared with them.
+"""Record of the true values of one vehicle at one sample. The sensors are simulated from these
+records, and estimates are compared with them.
 """
 
 from __future__ import annotations

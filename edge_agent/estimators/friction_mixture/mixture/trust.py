@@ -120,7 +120,9 @@ def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float
 
 @compiled
 def slippery_probability(memory: MixtureMemory, design: MixtureDesign) -> float:
-    """Return the probability that the mean friction of the two sides lies below SLIPPERY_MU."""
+    """Return the probability that the friction, averaged over the left and right side of the car,
+    lies below SLIPPERY_MU.
+    """
     total = 0.0
     for j in range(ALL_NODES if memory.split else NODES):
         if 0.5 * (design.sides.mu[j, 0] + design.sides.mu[j, 1]) < SLIPPERY_MU:

@@ -279,8 +279,8 @@ def correct_forces(
 def _share_forces(
     row: FloatArray, features: BlockFeatures, node: NodeWorkspace, out: NodeForces
 ) -> float:
-    """Compute out.force of the four wheels; return the lateral force of the front axle [N] that
-    balances the moment of unequal forces left and right.
+    """Compute out.force, the longitudinal force over load of the four wheels. Return the lateral
+    force of the front axle [N] that balances the yaw moment of unequal forces left and right.
     """
     gain = lanes_at(node.point, NodeState.GAIN)
     bias_x = lanes_at(node.point, NodeState.BIAS_X)

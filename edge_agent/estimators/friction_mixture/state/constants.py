@@ -1,5 +1,5 @@
-"""All constants of the friction mixture with unit and reason: a record that people read and that
-the compiled functions use.
+"""All constants of the friction mixture (default estimator), each with unit and reason, in a record
+that the compiled functions read.
 
 Values marked (vehicle) follow from typical uncertainty of a vehicle and its sensors: mass 3 %,
 inertia 5 %, stiffness 10 to 12 %, torque 3 %, and white noise and offsets of ordinary inertial
