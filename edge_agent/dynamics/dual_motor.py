@@ -33,8 +33,8 @@ def midpoint_speed(left: float, right: float) -> float:
 
 @inlined
 def axle_force(torque: float, turning: float, inertia: float, radius: float) -> float:
-    """Return the longitudinal force F_x [N] of an axle from the sum of its wheel torques [N m] and
-    `turning`, the acceleration of the speed at its midpoint [rad/s^2].
+    """Return the longitudinal force F_x [N] of an axle from the sum of its wheel torques, `torque`
+    [N m], and from the rotational acceleration at its midpoint, `turning` [rad/s^2].
     """
     return (torque - 2.0 * inertia * turning) / radius
 

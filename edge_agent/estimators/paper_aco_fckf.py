@@ -212,8 +212,8 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
 
 @compiled
 def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
-    """Compute the measurement noise R of this sample (context.adapted), and the fuzzy factors on R
-    for the next sample from the innovations (measurement minus prediction).
+    """Compute the measurement noise R of this sample (context.adapted). Then compute the fuzzy
+    factors on R for the next sample from the innovations (measurement minus prediction).
     """
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]

@@ -49,8 +49,8 @@ MOST_WAYS: Final = 3
 
 @dataclass(frozen=True)
 class Road:
-    """A road between two junctions: straight between its bends, and each bend is an arc of `radius`
-    [m].
+    """A road between two junctions. It is straight between its bends, and each bend is an arc of
+    `radius` [m].
     """
 
     start: str
