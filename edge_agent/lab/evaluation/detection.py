@@ -10,7 +10,7 @@ Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
     value       visit: it has value if its log-likelihood at the largest friction is VALUE_NATS or
-                more below its maximum, so that it excludes full grip
+                more below its maximum, which is evidence against full grip
     favoured    visit: it favours a slippery road, max ln L(μ < .4) - max ln L(μ >= .4) >=
                 FAVOURED_NATS
     on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
