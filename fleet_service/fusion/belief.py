@@ -220,8 +220,10 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Mix the prior into a belief `p` in place, so that the total probability of a sudden road
-    change is at least CHANGE_LEAST·`power`. `forget` has already applied the change over `change_s`
-    [s]. `power` is the share of the coming vote (effect of one visit) that is new information.
+    change is at least CHANGE_LEAST·`power`. This is needed if visits follow each other within
+    seconds: then `forget` mixes in nearly nothing, and a firm belief would resist a real change.
+    `forget` has already applied the change over `change_s` [s]. `power` is the share of the coming
+    vote (effect of one visit) that is new information.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:

@@ -4,7 +4,7 @@ observations.
 
 T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
 the allowed lateness (delay of an observation); older observations are final. Trust in vehicles is
-updated when the checkpoint advances, and applies to observations of the epoch that begins at T.
+updated when the checkpoint advances. It applies to observations of the epoch that begins at T.
 Therefore the weight of an observation depends on the time at which the vehicle was in the cell, and
 not on the time of its arrival.
 """
@@ -42,7 +42,7 @@ _ANY: Final = 1 << 62
 
 class Updated(NamedTuple):
     """Outcome of an update: arrays (n,) with one item per observation, and the slots that changed.
-    A slot is the storage of one cell and sector.
+    A slot is the storage of one cell and heading sector.
 
     Attributes:
         late: True for an observation that is older than the checkpoint (the time before which
@@ -72,11 +72,11 @@ class RecordedResult(NamedTuple):
 
 class Fusion(BeliefMap):
     """Beliefs of all cells, and the state that later updates need. A slot is the storage of one
-    cell and sector.
+    cell and heading sector.
 
     Args:
         lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
-            L) is late, and is fused with an aged likelihood.
+            L) is late, and is fused with an aged (less certain) likelihood.
         enrolled: True if only vehicles of an enrolment file are fused; an unknown vehicle then has
             full weight.
 
@@ -109,29 +109,31 @@ class Fusion(BeliefMap):
 
     @property
     def epoch(self) -> int:
-        """Epoch (minute since 1970) of the latest fused observation; -1 before the first
+        """Return the epoch (minute since 1970) of the latest fused observation; -1 before the first
         observation.
         """
         return -1 if self._epoch is None else self._epoch
 
     @property
     def waiting(self) -> int:
-        """Number of observations in the lateness window (the recent past in which late arrivals are
-        still sorted in). An observation that affects several cells counts once per cell.
+        """Return the number of observations in the lateness window (the recent past, in which late
+        arrivals are still sorted in). An observation that affects several cells counts once per
+        cell.
         """
         return self.store.waiting
 
     @property
     def checkpoint(self) -> int | None:
-        """Time of the checkpoint [ns]: observations before it are final. One that arrives later is
-        processed as if it had been made at the checkpoint. None before the first observation.
+        """Return the time of the checkpoint [ns]: observations before it are final. If an
+        observation from before the checkpoint arrives later, it is processed as if it had been made
+        at the checkpoint. The result is None before the first observation.
         """
         return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
 
     @property
     def next_epoch(self) -> int:
-        """Start [ns] of the first epoch (minute) that has not been fused yet; 0 before the first
-        observation.
+        """Return the start [ns] of the first epoch (minute) that has not been fused yet; 0 before
+        the first observation.
         """
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
@@ -190,16 +192,16 @@ class Fusion(BeliefMap):
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
-        was before `before` [ns] and no other record refers to the slot. Such slots may be deleted
-        with `drop`.
+        """Return a mask of slots (cells with heading sectors), (size,): True if the last visit of a
+        vehicle was before `before` [ns] and no other record refers to the slot. Such slots may be
+        deleted with `drop`.
         """
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Delete the slots (cells and sectors) that the mask `dropped` (size,) selects; all must be
-        `untouched` (not visited recently, and not referred to). Return the new number of each slot,
-        -1 for deleted ones.
+        """Delete the slots (cells with heading sectors) that the mask `dropped` (size,) selects;
+        all must be `untouched` (not visited recently, and not referred to). Return the new number
+        of each slot, -1 for deleted ones.
         """
         return self.store.drop(dropped)
 
@@ -226,9 +228,9 @@ class Fusion(BeliefMap):
         )
 
     def _advance(self, epoch: int) -> None:
-        """Advance the latest time T to `epoch`. While observations are in the lateness window,
-        whose order can still change, advance by one epoch (minute) at a time. After each, commit
-        (make final) the observations that have become too old for the window.
+        """Advance the latest time T to `epoch`. If the lateness window (recent observations, whose
+        order can still change) is not empty, advance by one epoch (minute) at a time. After each
+        step, commit (make final) the observations that have become too old for the window.
         """
         if self._epoch is None:
             self._epoch = epoch
@@ -303,8 +305,8 @@ def voted_keys(o: Observations) -> IntArray:
 
 def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
     """Return the votes of the selected observations, sorted by time. A vote is the effect of one
-    observation on one cell and sector. The three arrays contain the row of the observation, the key
-    (cell · 4 + sector), and P(the vehicle was in this cell).
+    observation on one cell and heading sector. The three arrays contain the row of the observation,
+    the key (cell · 4 + sector), and P(the vehicle was in this cell).
 
     Besides its own cell and sector, an observation may affect a second sector and neighbouring
     cells.

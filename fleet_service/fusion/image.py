@@ -1,5 +1,6 @@
 """Complete state of a fusion (the beliefs about all cells and the trust in all vehicles) as plain
-arrays, for snapshots. A restored fusion continues exactly where the snapshot was taken. Pure.
+arrays, for snapshots. A restored fusion continues exactly where the snapshot was taken. Pure (no
+I/O).
 
 An `Image` maps table names to tables; a table is a set of one-dimensional columns of equal length.
 An array of records is stored as one column of bytes. LAYOUT describes these bytes: name, offset and

@@ -1,6 +1,6 @@
 """Fusion of observations that arrive after the checkpoint (the time before which observations are
 final). Each is fused at the checkpoint, with its likelihood aged from the time of the visit to the
-checkpoint. Pure.
+checkpoint. Pure (no I/O).
 
 The model of a changing road is a Markov chain: a diffusion with reflecting ends, and sudden changes
 to any friction. The chain is reversible and leaves the uniform belief uniform. So the likelihood of
@@ -10,8 +10,8 @@ the road at the checkpoint C, given a measurement at an earlier time t, is
 
 If no other vehicle visited the cell between t and C, the result equals that of an observation in
 time. Otherwise the late visit counts in addition to the others, as an old report about the present
-road. Late visits are sorted in like all others, the newest first. So the newest visit of each
-vehicle counts, and the order of arrival between two checkpoints does not matter.
+road. All late visits get times directly after the checkpoint, the newest visit first. So the newest
+visit of each vehicle counts, and the order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Observations of friction for the fusion into a map, made from the columns of messages or of the
-archive. Pure.
+archive. Pure (no I/O).
 """
 
 from __future__ import annotations

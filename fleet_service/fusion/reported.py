@@ -37,9 +37,10 @@ class Evidence(NamedTuple):
 
 
 def as_reported(steps: NDArray[Any]) -> Evidence:
-    """Return two arrays for n received log-likelihoods `steps` (n, 32): the same in steps below the
-    maximum, which is 0; and the mean, standard deviation and P(slippery) of each (n, 3), NaN for
-    one that is only a lower bound.
+    """Return two arrays for n received log-likelihoods `steps` (n, 32). The first contains the
+    log-likelihoods in steps below the maximum, which becomes 0. The second, (n, 3), contains the
+    mean, standard deviation and P(slippery) of each; NaN for a likelihood that is only a lower
+    bound.
     """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)

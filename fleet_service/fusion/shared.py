@@ -1,5 +1,5 @@
 """Error that all reports from one place have in common, and the belief after this error is
-integrated out. Pure.
+integrated out. Pure (no I/O).
 
 Vehicles that do the same manoeuvre in the same place make the same error. One cause is the shape of
 the tyre's force curve, which each vehicle assumes: this error grows as the share of grip used
@@ -94,15 +94,15 @@ class Shape(NamedTuple):
 
     @property
     def reader(self) -> float:
-        """Slope (error of a friction value per unit of unused grip) by which intervals are widened
-        for readers of the map.
+        """Return the slope (error of a friction value per unit of unused grip) by which intervals
+        are widened for readers of the map.
         """
         return self.slope + c.SHAPE_DOUBT
 
     @property
     def alarm(self) -> float:
-        """Slope (error of a friction value per unit of unused grip) that an alarm assumes: the
-        upper end of its one-sided 95 % interval.
+        """Return the slope (error of a friction value per unit of unused grip) that an alarm
+        assumes: the upper end of its one-sided 95 % interval.
 
         A new service assumes .5, and a service that has compared many passages of vehicles little
         more than `reader`. Missed ice on tuning seeds: with .5 for all services, .044 of the icy

@@ -2,8 +2,8 @@
 rows are compiled.
 
 Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
-(`agreed`). Every other vehicle counts once, weighted by its own trust; the number of meetings does
-not matter. So a colluding group counts only by the number of its members, not by the number of
+(`agreed`). Every other vehicle counts once, weighted by the trust in it; the number of meetings
+does not matter. So a colluding group counts only by the number of its members, not by the number of
 cells in which it drives alone. Once the majority distrusts the group, the group's reports about
 others have no weight.
 

@@ -1,4 +1,6 @@
-"""Weight of each vehicle's votes (effects of its reports on beliefs), per epoch (minute). Pure."""
+"""Weight of each vehicle's votes (effects of its reports on beliefs), per epoch (minute). Pure (no
+I/O).
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 belief in this order, whatever their order of arrival. Observations older than the checkpoint
 (latest time minus the allowed delay) are final.
 
-A slot is the storage of one cell and sector. Its live row contains the belief after all
+A slot is the storage of one cell and heading sector. Its live row contains the belief after all
 observations. A slot has a window while it has observations younger than the checkpoint. The window
 contains these observations and the base, which is a copy of the row before them. An observation
 that is newer than all others updates the live row. An older one makes the window stale. After each
@@ -75,7 +75,7 @@ class Arrivals(NamedTuple):
 
 class Votes(NamedTuple):
     """Votes of a batch, arrays of shape (k,). A vote is the effect of one observation on one cell:
-    row of the observation, slot (cell and sector), and P(the vehicle was in this cell).
+    row of the observation, slot (cell and heading sector), and P(the vehicle was in this cell).
 
     Among the votes of one observation, the vote for its own cell comes first. At most `most`
     observations of a vehicle may wait in one cell.
@@ -103,8 +103,8 @@ def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Vote
     (recent observations, sorted by time) of their cells, and update the beliefs.
 
     Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
-    out, because `most` observations of their vehicle already wait in the same cell. For an
-    observation that affects several cells, its own cell decides.
+    out, because `most` observations of their vehicle already wait in the same cell. If an
+    observation affects several cells, only its own cell decides about this.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -236,8 +236,8 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """Open a lateness window (list of recent observations) for a slot (cell and sector) without
-    one. Store in it a copy of the slot's belief, and return the row number of the window.
+    """Open a lateness window (list of recent observations) for a slot (cell and heading sector)
+    without one. Store in it a copy of the slot's belief, and return the row number of the window.
     """
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
@@ -258,8 +258,8 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Allocate a list of recent reporters for a slot (cell and sector) that has a window (recent
-    observations) but no such list yet.
+    """Allocate a list of recent reporters for a slot (cell and heading sector) that has a window
+    (recent observations) but no such list yet.
     """
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1

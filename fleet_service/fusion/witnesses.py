@@ -1,5 +1,5 @@
 """Search for the witnesses of an alert: vehicles that reported ice on the slippery stretch of road
-around a cell. Pure.
+around a cell. Pure (no I/O).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from schemas.numeric import BoolArray, IntArray
 
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return, for each slot (cell and sector), the slots of the slippery stretch of road around it,
-    (k, n). The slot itself comes first; positions without a slot are NONE.
+    """Return, for each slot (cell and heading sector), the slots of the slippery stretch of road
+    around it, (k, n). The slot itself comes first; positions without a slot are NONE.
     """
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
 
 class StretchSources(NamedTuple):
-    """Vehicles that reported ice on the slippery stretches around k slots (cells and sectors), the
-    newest first.
+    """Vehicles that reported ice on the slippery stretches around k slots (cells with heading
+    sectors), the newest first.
 
     Attributes:
         who: index of the vehicle, (k, n).
@@ -38,7 +38,8 @@ class StretchSources(NamedTuple):
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
     """Return the vehicles that reported ice on the slippery stretches of road around the slots
-    (cells and sectors) after the times `since` (k,) [ns]. Each vehicle occurs once per stretch.
+    (cells with heading sectors) after the times `since` (k,) [ns]. Each vehicle occurs once per
+    stretch.
     """
     along = stretch_slots(fusion, slots)
     places = along.shape[1]
@@ -54,7 +55,7 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
     """Return the numbers of the vehicles that reported ice on the slippery stretch of road around a
-    slot (cell and sector) after `since` [ns].
+    slot (cell and heading sector) after `since` [ns].
     """
     who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]

@@ -116,7 +116,8 @@ def lower_excess() -> float:
 
 def backlog_fused(rng: Generator) -> float:
     """Return the share of late observations that affect the map after an outage. In this situation,
-    all rows of an hour arrive at its end, while one other vehicle was connected all the time.
+    one vehicle was connected for the whole hour, and the observations of all other vehicles arrive
+    together after it.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

@@ -117,8 +117,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 class _Rest(NamedTuple):
     """Segments (files of new rows) whose rows are not yet in compacted (sorted) files, oldest
-    first. Each has a set of partitions (date and map square) to which an earlier, interrupted run
-    already moved its rows.
+    first. `done` contains, for each segment, the partitions (date and map square) to which an
+    earlier, interrupted run already moved its rows. `term` is the lease term, a number in the names
+    of new files.
     """
 
     root: Path

@@ -24,7 +24,7 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """Stored state of each slot (cell and sector) as columns (n,) with the fields of
+    """Stored state of each slot (cell and heading sector) as columns (n,) with the fields of
     `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) is packed in
     16 bits, see `belief.unpack_belief`.
     """
@@ -70,8 +70,8 @@ def no_beliefs(rows: int) -> PackedArray:
 
 @refcount_free
 def begin_slot(live: Rows, slot: int, key: int) -> None:
-    """Initialise the slot (storage) of a cell and sector, given by its key, with the uniform
-    prior.
+    """Initialise the slot (storage) of a cell and heading sector, given by its key, with the
+    uniform prior.
     """
     live.belief[slot] = FULL
     cell = live.cells[slot]

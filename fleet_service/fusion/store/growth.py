@@ -68,9 +68,12 @@ def grow_pairs(state: State, most: int) -> State:
 
 
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
-    """Return the fusion's state with all pairs (vehicles in cells) settled that have no observation
-    in a window, and without reports that are not remembered at `now` [s]. `names` (V,) are the
-    records of the vehicles, and `size` is the number of slots (cells and sectors) in use.
+    """Return the fusion's state after two changes. All pairs (vehicles in cells) without an
+    observation in a window move to the settled pairs, which are sorted records without free space.
+    Reports that are not remembered at `now` [s] are deleted.
+
+    `names` (V,) are the records of the vehicles, and `size` is the number of slots (cells with
+    heading sectors) in use.
     """
     most = int(state.used[PAIRS])  # of which there will be as many again
     reports, values = drop_reports(state, names, now)
@@ -99,7 +102,7 @@ def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
 def rebuild_reporters(state: State, size: int, least: int) -> State:
     """Return the fusion's state without the lists of recent reporters whose last report was before
     `least` [s]. Cells with observations that are not yet final keep their lists. `size` is the
-    number of slots (cells and sectors) in use.
+    number of slots (cells with heading sectors) in use.
     """
     live = state.live
     cells = live.cells[:size]

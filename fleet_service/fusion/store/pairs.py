@@ -32,8 +32,8 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(state: State, slot: int, vehicle: int) -> int:
-    """Return the row of the active pair (record of a vehicle in a cell) of `slot` (cell and sector)
-    and `vehicle`. If the pair is not active, it becomes active.
+    """Return the row of the active pair (record of a vehicle in a cell) of `slot` (cell and heading
+    sector) and `vehicle`. If the pair is not active, it becomes active.
     """
     pairs = state.pairs
     pair = pair_place(pairs, slot, vehicle)

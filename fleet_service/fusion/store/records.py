@@ -57,8 +57,8 @@ UInt16Array = NDArray[np.uint16]
 
 
 class CellRecord:
-    """A slot (storage of one visited cell and sector). Its belief is stored in another array, see
-    `belief.unpack_belief`.
+    """A slot (storage of one visited cell and heading sector). Its belief is stored in another
+    array, see `belief.unpack_belief`.
 
     Attributes:
         key: cell · 4 + sector.
@@ -231,8 +231,8 @@ class SettledRecord:
 
 
 class SourcesRecord:
-    """The last SOURCES vehicles that reported grip in a cell and sector, and the last that reported
-    ice, with the times of their reports [s].
+    """The last SOURCES vehicles that reported grip in a cell and heading sector, and the last that
+    reported ice, with the times of their reports [s].
     """
 
     source: Annotated[Int32Array, 2, SOURCES]
@@ -240,8 +240,8 @@ class SourcesRecord:
 
 
 class ReportersRecord:
-    """The recent reporters of a cell and sector: the last REPORTERS vehicles that gave a value,
-    with time [s], mean, standard deviation and grip used. The record also contains the last
+    """The recent reporters of a cell and heading sector: the last REPORTERS vehicles that gave a
+    value, with time [s], mean, standard deviation and grip used. The record also contains the last
     vehicles that reported ice or grip there, as in `SourcesRecord`.
     """
 
@@ -299,7 +299,7 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """State of slots (cells and sectors), in three arrays.
+    """State of slots (cells with heading sectors), in three arrays.
 
     Attributes:
         belief: packed beliefs, (n, 32).
@@ -324,15 +324,16 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: the slots (cells and sectors) in the state before the recent observations in their
-            windows, one row per row of `windows`; of the reporters only the sources are copied.
+        base: the slots (cells with heading sectors) in the state before the recent observations in
+            their windows, one row per row of `windows`; of the reporters only the sources are
+            copied.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the records of active pairs.
         settled: `SettledRecord` of each report of the settled pairs, (k,), sorted by slot, vehicle
             and kind.
-        settled_keys: vehicle and kind of each settled report, (k,): four times the vehicle's
-            index, plus two times the kind, plus one if the pair is active again.
+        settled_keys: vehicle and kind of each settled report, (k,): four times the vehicle's index,
+            plus two times the kind, plus one if the pair is active again.
         settled_std: `std` (see `PairRecord`) of the settled reports that are values, in order.
         settled_begin: rows of `settled` and of `settled_std` at which the reports of each slot
             begin, (m + 1, 2). Slots from m on, which are new, have no settled pairs.

@@ -1,5 +1,5 @@
-"""Settled pairs: the last reports of a vehicle in a slot (cell and sector), all of which are final,
-as sorted records without free space. A pair whose vehicle returns becomes active again
+"""Settled pairs: the last reports of a vehicle in a slot (cell and heading sector), all of which
+are final, as sorted records without free space. A pair whose vehicle returns becomes active again
 (`pairs.pair_of`). Compiled.
 """
 
@@ -35,8 +35,8 @@ def oldest_remembered(now: int, kind: int) -> int:
 
 @refcount_free_inlined
 def _to_int(number: np.unsignedinteger[Any]) -> int:
-    """Convert an unsigned number. Numba computes with signed and unsigned numbers together in
-    floating point.
+    """Convert an unsigned number to a signed one, because Numba would otherwise compute with signed
+    and unsigned numbers together in floating point.
     """
     return int(np.int64(number))
 
@@ -68,9 +68,9 @@ def guess_row(state: State, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def _find_first(state: State, slot: int, vehicle: int) -> int:
-    """Return the first row of a slot with settled reports of a vehicle, or of one with a higher
-    index. The search begins at the probable row and doubles its steps, because each cache line
-    outside takes time.
+    """Return the first row of a slot with settled reports of a vehicle. If there is none, return
+    the first row of a vehicle with a higher index. The search begins at the probable row and
+    doubles its steps, so that it reads few cache lines.
     """
     keys = state.settled_keys
     begin = _to_int(state.settled_begin[slot, 0])
@@ -103,8 +103,8 @@ def _find_first(state: State, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def activate_reports(state: State, pair: int) -> None:
-    """Move the settled reports of a pair, if there are any, to its record (row `pair` of the table
-    of pairs), which has just become active.
+    """Move the settled reports of a pair (a vehicle in a cell), if there are any, to the pair's
+    record (row `pair` of the table of pairs), which has just become active.
     """
     this = state.pairs[pair]
     slot = int(this.slot)
@@ -129,7 +129,7 @@ def activate_reports(state: State, pair: int) -> None:
 
 @refcount_free_inlined
 def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> int:
-    """Move a settled report from one row to another one; and if it is a value, its standard
+    """Move a settled report from row `row` to row `to`. If it is a value, also move its standard
     deviation, which has rows of its own. Return 1 for a value, else 0.
     """
     state.settled_keys[to] = state.settled_keys[row]

@@ -62,7 +62,7 @@ class Store:
         state: arrays for compiled code.
         peers: record of each vehicle with its comparisons with other vehicles.
         names: record of each vehicle with its permanent number; the first `vehicles` are in use.
-        size, vehicles: number of slots (cells and sectors) and of vehicles in use.
+        size, vehicles: number of slots (cells with heading sectors) and of vehicles in use.
         forgotten_at: time [s] for which old records of vehicles in cells were last deleted.
     """
 
@@ -113,12 +113,14 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """State of all slots (cells and sectors) as columns."""
+        """Return the state of all slots (cells with heading sectors) as columns."""
         return cells_of(self.state.live)
 
     @property
     def waiting(self) -> int:
-        """Number of entries (observations) in the lateness windows (recent past) of all cells."""
+        """Return the number of entries (observations) in the lateness windows (recent past) of all
+        cells.
+        """
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
@@ -136,19 +138,21 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each key (cell and sector); NONE if the key has no
-        slot.
+        """Return the slot (row number) (n,) of each key (cell and heading sector); NONE if the key
+        has no slot.
         """
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
     def table(self) -> IntArray:
-        """Hash table in which compiled code finds slots (cells and sectors) by key."""
+        """Return the hash table in which compiled code finds slots (cells with heading sectors) by
+        key.
+        """
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each key (cell and sector). An unknown key gets a
-        new slot, which begins with the prior.
+        """Return the slot (row number) (n,) of each key (cell and heading sector). An unknown key
+        gets a new slot, which begins with the prior.
         """
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
@@ -214,8 +218,9 @@ class Store:
     def forget(self, checkpoint_s: int) -> None:
         """Delete old data, once per quarter of an hour of the checkpoint time: reports of a vehicle
         in a cell that are not remembered (`settled.oldest_remembered`), and lists of a cell's
-        recent reporters older than an hour (`trust.compare_reports`, `Fusion.sources`). Settle
-        resting pairs then, and whenever they are many.
+        recent reporters older than an hour (`trust.compare_reports`, `Fusion.sources`). Then, and
+        whenever there are many, move pairs (vehicles in cells) without recent observations to the
+        settled pairs.
         """
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
         state = self.state
@@ -229,8 +234,8 @@ class Store:
             self.state = rebuild_reporters(self.state, self.size, now - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells and sectors), (size,): True if the last visit of a vehicle
-        was before `before` [ns] and no other record refers to the slot.
+        """Return a mask of slots (cells with heading sectors), (size,): True if the last visit of a
+        vehicle was before `before` [ns] and no other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -241,9 +246,9 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Delete the slots (cells and sectors) that the mask `gone` (size,) selects; all must be
-        `untouched` (not visited recently, and not referred to). Return the new number of each slot,
-        NONE for deleted ones.
+        """Delete the slots (cells with heading sectors) that the mask `gone` (size,) selects; all
+        must be `untouched` (not visited recently, and not referred to). Return the new number of
+        each slot, NONE for deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
