@@ -1,28 +1,40 @@
-"""Estimation of many recorded drives in parallel, on threads of this machine or on Spark.
+"""Estimation of many recorded drives in parallel, in processes of this machine or on Spark.
 
-On one machine the drives run on threads of one process, which loads the compiled code once: kernels
-and Parquet release the interpreter lock. Both engines run the same function for each drive and
-write the same bytes.
+On one machine this process loads the compiled code, and the processes forked from it share its
+memory. Both engines run the same function for each drive and write the same bytes.
 """
 
 from __future__ import annotations
 
+import signal
+import sys
+import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pyarrow as pa
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimates_file import EstimatesFile
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.output_path import prepare_path
+from edge_agent.estimators import ESTIMATORS
 from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError
 from schemas.runtime import spark
 from schemas.runtime.durable import own_drafts, sweep_drafts, sync_directory
+from schemas.runtime.process import end_with_parent
+from schemas.signals import CHANNELS
 from schemas.vehicle import load_vehicle
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 
 class Task(NamedTuple):
@@ -79,18 +91,116 @@ def estimate_drives(
 ) -> Iterator[Outcome]:
     """Estimate all drives, `jobs` at a time, and yield the outcomes as they become available.
 
-    A drive that fails does not stop the others.
+    A drive that fails does not stop the others. After Ctrl-C no further drive begins.
 
     Raises:
-        InputError: jobs is below 1.
+        InputError: jobs is below 1, or the system ended one of the processes.
     """
     if jobs < 1:
         raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
-    with ThreadPoolExecutor(jobs) as pool:
-        for future in as_completed(
-            [pool.submit(estimate_drive, task, estimator, memberships) for task in tasks]
-        ):
+    count = min(jobs, len(tasks))
+    if count < 2:
+        for task in tasks:
+            yield estimate_drive(task, estimator, memberships)
+        return
+    from concurrent.futures.process import BrokenProcessPool
+
+    _load_kernels(estimator, memberships)
+    pool = _fork_processes(count)
+    try:
+        for future in as_completed(_submit_drives(pool, tasks, estimator, memberships)):
             yield future.result()
+    except BrokenProcessPool as error:
+        problem = "the system ended a process that estimated a drive, perhaps for lack of memory"
+        raise InputError("jobs", problem, "give fewer jobs") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
+    """Compile or load the kernels of an estimator, by one sample without readings, so that the
+    processes share them. An estimator of another package loads its own in each process, and an
+    error is left to the drives.
+    """
+    if estimator not in ESTIMATORS:
+        return
+    with suppress(InputError):
+        bank = bank_of(estimator, [load_vehicle("class:compact")], memberships)
+        bank.advance(np.zeros((1, 1)), np.full((1, 1, len(CHANNELS)), np.nan))
+
+
+def _fork_processes(count: int) -> ProcessPoolExecutor:
+    """Return a pool of `count` processes, which are not started yet. They are forked on Linux only,
+    because libraries of other systems do not support a fork.
+    """
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    context = get_context("fork" if sys.platform == "linux" else "spawn")
+    return ProcessPoolExecutor(count, context, _prepare_process)
+
+
+def _submit_drives(
+    pool: ProcessPoolExecutor,
+    tasks: Sequence[Task],
+    estimator: str,
+    memberships: Memberships | None,
+) -> list[Future[Outcome]]:
+    """Start the processes of a pool, and give them all drives. Ctrl-C waits until the processes can
+    handle it.
+
+    Python warns of a fork while other threads run, because a lock that one holds stays locked in
+    the new process. The libraries whose threads run here (OpenBLAS, Arrow) are prepared for it.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return [
+                pool.submit(_estimate_in_process, task, estimator, memberships) for task in tasks
+            ]
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _PoolProcess:
+    """State of a process of the pool: whether it estimates a drive, and whether Ctrl-C was
+    pressed."""
+
+    estimates = False
+    interrupted = False
+
+
+def _prepare_process() -> None:
+    """Prepare a process of the pool: it ends with its parent, uses one core, and leaves its drive
+    on Ctrl-C.
+    """
+    end_with_parent()
+    pa.set_cpu_count(1)
+    signal.signal(signal.SIGINT, _interrupt_drive)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _interrupt_drive(*_: object) -> None:
+    """End the estimation of a drive; the parent then reports Ctrl-C."""
+    _PoolProcess.interrupted = True
+    if _PoolProcess.estimates:
+        raise KeyboardInterrupt
+
+
+def _estimate_in_process(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
+    """Estimate one drive in a process of the pool; after Ctrl-C, none.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed; the drive has no file.
+    """
+    _PoolProcess.estimates = True
+    try:
+        if _PoolProcess.interrupted:
+            raise KeyboardInterrupt
+        return estimate_drive(task, estimator, memberships)
+    finally:
+        _PoolProcess.estimates = False
 
 
 def backfill_on_spark(

@@ -17,6 +17,7 @@ slip, so wheels and steering move slightly before the body turns. LEAD corrects 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -36,6 +37,8 @@ SMOOTH_S: Final = 0.1  # of a running mean, taken twice
 LONGEST_DRIVE_S: Final = 1800.0
 DRIVEN: Final = 4.0  # [m/s]
 SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
+NEGLIGIBLE: Final = 1e-18  # share of a past motion that a float64 no longer shows
+NEAR_PEAK: Final = 1e-6  # of a correlation: more than the error of its computation by spectra
 # How fast a body answers to its wheels goes with the file's stiffness: .01 s at 10 % (BIAS of
 # steer_lag in learn.py). [s] that wheels and steering are ahead of the gyro where no device is
 # late: force behind slip. Both are what twenty simulated rough cars showed, with other seeds than
@@ -44,9 +47,14 @@ LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
 def find_lags(
-    t: FloatArray, signals: FloatArray, vehicle: Vehicle, least: float = LEAST_LIKE
+    t: FloatArray,
+    signals: FloatArray,
+    vehicle: Vehicle,
+    least: float = LEAST_LIKE,
+    names: Collection[str] = tuple(LEAD),
 ) -> dict[str, float]:
-    """Return the lags [s] of a drive by quantity, from times t (T,) [s] and signals (T, 18).
+    """Return the lags [s] of a drive by quantity, from times t (T,) [s] and signals (T, 18), for
+    the quantities `names`.
 
     A lag whose correlation is below `least` is left out. Signals are smoothed less than in other
     checks of the signals, because after smoothing over half a second the peak of the correlation
@@ -68,13 +76,15 @@ def find_lags(
         SMOOTH_S,
     )
     driven = (v > DRIVEN) & np.isfinite(gyro)
-    ways = {
-        "wheel_lag": (0.5 * (front + rear), front, rear),
-        "steer_lag": (_bicycle_yaw_rate(v, delta, vehicle),),
-    }
+    turning = gyro - smooth_twice(gyro, SLOW_S)
     found = {}
-    for name, sides in ways.items():
-        peaks = [_find_delay(side, gyro, driven & np.isfinite(side), least) for side in sides]
+    for name in names:
+        sides = (
+            (0.5 * (front + rear), front, rear)
+            if name == "wheel_lag"
+            else (_bicycle_yaw_rate(v, delta, vehicle),)
+        )
+        peaks = [_find_delay(side, turning, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
         if (
             told
@@ -96,38 +106,74 @@ class _Peak(NamedTuple):
 
 
 def _find_delay(
-    left: FloatArray, right: FloatArray, among: BoolArray, least: float
+    side: FloatArray, turning: FloatArray, among: BoolArray, least: float
 ) -> _Peak | None:
-    """Return the delay [s] of the signal `left` relative to `right`, with the correlation at that
-    delay, over the samples of the mask `among`. Return None if a signal varies too little, or if
-    the correlation is below `least`.
+    """Return the delay [s] of the yaw rate `side` (n,) relative to the gyroscope's, with the
+    correlation at that delay, over the samples of the mask `among`. `turning` (n,) is the
+    gyroscope's yaw rate without its slow part. Return None if a signal varies too little, or if the
+    correlation is below `least`.
     """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
     among[: most + 1] = among[len(among) - most - 1 :] = False
     if among.sum() < LEAST_S * RATE_HZ:
         return None
-    left, right = ((x - smooth_twice(x, SLOW_S)) for x in (left, right))
-    if (
-        np.nanstd(left[among]) < LEAST_RATE or np.nanstd(right[among]) < LEAST_RATE
-    ):  # a locked axle, or straight on
+    left = side - smooth_twice(side, SLOW_S)
+    spread = np.nanstd(left[among]), np.nanstd(turning[among])
+    if any(size < LEAST_RATE for size in spread):  # a locked axle, or straight on
         return None
-    like = np.zeros(2 * most + 1)
-    for k in range(-most, most + 1):
-        other = np.roll(right, k)
+
+    def correlate_at(k: int) -> float:
+        other = np.roll(turning, k)
         both = among & np.isfinite(left) & np.isfinite(other)
-        like[k + most] = np.corrcoef(left[both], other[both])[0, 1] if both.sum() > 2 else 0.0
+        return float(np.corrcoef(left[both], other[both])[0, 1]) if both.sum() > 2 else 0.0
+
+    like = _correlate_by_spectra(left / spread[0], turning / spread[1], among, most)
+    for k in np.flatnonzero(~(like < np.nanmax(like, initial=-1.0) - NEAR_PEAK)):
+        like[k] = correlate_at(int(k) - most)
     top = int(np.argmax(like))
     if like[top] < least or top in (0, 2 * most):
         return None
-    before, here, after = like[top - 1 : top + 2]
+    before, here, after = (correlate_at(k) for k in range(top - most - 1, top - most + 2))
     seconds = (top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ
     return _Peak(float(seconds), float(here))
 
 
+def _correlate_by_spectra(
+    left: FloatArray, right: FloatArray, among: BoolArray, most: int
+) -> FloatArray:
+    """Return the correlation of `left` (n,) with `right` (n,) shifted by -most to most samples,
+    over the samples of the mask `among` at which both are known, to about ten digits. All sums over
+    samples are correlations, computed together by fast Fourier transforms. The result is NaN where
+    too few samples or too little variation are left for this.
+    """
+    size = 1 << (len(left) + most).bit_length()
+    known = among & np.isfinite(left)
+    x = np.where(known, left, 0.0)
+    finite = np.isfinite(right)
+    y = np.where(finite, right, 0.0)
+    one, of_x, of_xx = np.fft.rfft(np.stack([known, x, x * x]), size)
+    two, of_y, of_yy = np.conj(np.fft.rfft(np.stack([finite, y, y * y]), size))
+    products = [one * two, of_x * two, of_xx * two, one * of_y, one * of_yy, of_x * of_y]
+    shifts = np.fft.irfft(np.stack(products), size)
+    n, x_sum, xx_sum, y_sum, yy_sum, xy_sum = np.concatenate(
+        [shifts[:, size - most :], shifts[:, : most + 1]], axis=1
+    )
+    x_size = n * xx_sum - x_sum * x_sum
+    y_size = n * yy_sum - y_sum * y_sum
+    usable = (n > 10.0) & (np.minimum(x_size, y_size) > 1e-3 * n * n)
+    size_of_both = np.sqrt(np.where(usable, x_size * y_size, 1.0))
+    return np.where(usable, (n * xy_sum - x_sum * y_sum) / size_of_both, np.nan)
+
+
 def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Return the yaw rate (n,) [rad/s] of a bicycle model with the measured steering, integrated by
-    the trapezoidal rule.
+    the trapezoidal rule: (1 - h A_k) x_k = (1 + h A_k) x_{k-1} + h b (delta_{k-1} + delta_k), where
+    x is (v_y, r), h half a time step, and A_k the model at the speed of sample k.
+
+    All samples are computed together by recursive doubling (Kogge and Stone 1973): from
+    x_k = P_k x_{k-1} + q_k follows x_k = P_k P_{k-1} x_{k-2} + P_k q_{k-1} + q_k, and so on. The
+    motion is zero before the first sample and where the car stands or a reading is missing.
     """
     m = vehicle.mass
     inertia = vehicle.yaw_inertia
@@ -139,23 +185,31 @@ def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle)
     c_f = b * per_share
     c_r = a * per_share
     half = 0.5 / RATE_HZ
-    motion = np.zeros(2)
-    modelled = np.full(len(speed), np.nan)
-    before = 0.0
-    for k, (v, delta) in enumerate(zip(speed.tolist(), steering.tolist(), strict=True)):
-        if not (v > SLOWEST and abs(delta) < 1.0):  # standing, or NaN
-            motion = np.zeros(2)
-            before = 0.0
-            continue
-        system = np.array(
-            [
-                [-(c_f + c_r) / (m * v), (b * c_r - a * c_f) / (m * v) - v],
-                [(b * c_r - a * c_f) / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
-            ]
-        )
-        driven = np.array([c_f / m, a * c_f / inertia]) * (half * (before + delta))
-        motion = np.linalg.solve(
-            np.eye(2) - half * system, motion + half * (system @ motion) + driven
-        )
-        before, modelled[k] = delta, motion[1]
-    return modelled
+    drives = (speed > SLOWEST) & (np.abs(steering) < 1.0)  # not standing, and not NaN
+    v = np.where(drives, speed, 1.0)
+    delta = np.where(drives, steering, 0.0)
+    coupling = b * c_r - a * c_f
+    system = np.array(
+        [
+            [-(c_f + c_r) / (m * v), coupling / (m * v) - v],
+            [coupling / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
+        ]
+    )
+    unit = np.eye(2)[:, :, None]
+    implicit = unit - half * system
+    determinant = implicit[0, 0] * implicit[1, 1] - implicit[0, 1] * implicit[1, 0]
+    inverse = (
+        drives
+        / determinant
+        * np.array([[implicit[1, 1], -implicit[0, 1]], [-implicit[1, 0], implicit[0, 0]]])
+    )
+    step = np.einsum("ijn,jkn->ikn", inverse, unit + half * system)
+    steered = half * (delta + np.concatenate([[0.0], delta[:-1]]))
+    motion = np.einsum("ijn,j->in", inverse, np.array([c_f / m, a * c_f / inertia])) * steered
+    reach = 1
+    while reach < len(speed) and np.abs(step).max() > NEGLIGIBLE:
+        motion[:, reach:] += np.einsum("ijn,jn->in", step[:, :, reach:], motion[:, :-reach])
+        step[:, :, reach:] = np.einsum("ijn,jkn->ikn", step[:, :, reach:], step[:, :, :-reach])
+        step[:, :, :reach] = 0.0
+        reach *= 2
+    return np.where(drives, motion[1], np.nan)

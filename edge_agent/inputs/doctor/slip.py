@@ -204,25 +204,35 @@ def measure_lags_twice(
     Both tests exclude slides. In a slide, the car turns earlier or later than its steering
     predicts, by a different time in each slide, so that the lag would be wrong.
     """
-    half = len(t) // 2
-    whole = find_lags(t, signals, vehicle)
-    halves = [
-        find_lags(t[rows], signals[rows], vehicle, HALF_LIKE)
-        for rows in (slice(None, half), slice(half, None))
+    trusted = [
+        name
+        for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering"))
+        if _holds_with_lag(found[identity])
     ]
-    parts = [whole, *halves]
+    whole = find_lags(t, signals, vehicle, names=trusted) if trusted else {}
+    half = len(t) // 2
+    halves = [
+        find_lags(t[rows], signals[rows], vehicle, HALF_LIKE, tuple(whole))
+        for rows in (slice(None, half), slice(half, None))
+        if whole
+    ]
     told = {}
-    for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering")):
-        fit = found[identity]
-        sound = (
-            fit.is_known
-            and fit.correlation > TURNS_LIKE
-            and abs(np.log(abs(fit.gain))) < 0.35
-            and is_steady(fit)
-        )
-        values = [part[name] for part in parts if name in part]
-        lag = float(np.median(values)) if values else 0.0
+    for name in whole:
+        values = [part[name] for part in (whole, *halves) if name in part]
+        lag = float(np.median(values))
         apart = max(LAGS_APART_S, LAGS_APART * abs(lag))
-        if sound and len(values) == len(parts) and np.ptp(values) < apart:
+        if len(values) == 1 + len(halves) and np.ptp(values) < apart:
             told[name] = lag
     return told
+
+
+def _holds_with_lag(fit: Fit) -> bool:
+    """Return True if an identity (two sides that are equal by physics) holds throughout a drive, so
+    that a lag between its sides comes from a device.
+    """
+    return (
+        fit.is_known
+        and fit.correlation > TURNS_LIKE
+        and abs(np.log(abs(fit.gain))) < 0.35
+        and is_steady(fit)
+    )

@@ -4,7 +4,11 @@ their own, several run at a time, and a bad drive does not stop the others.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -53,15 +57,25 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
     assert len(logs(tmp_path / "2")) == DRIVES
 
 
+def piped_tasks(drives: Path, folder: Path) -> list[Task]:
+    """Return the tasks of the drives, with vehicle files that are named pipes: each drive that
+    begins waits for its pipe.
+    """
+    tasks = [
+        task._replace(vehicle=folder / task.vehicle.name)
+        for task in tasks_of(logs(drives), None, folder)
+    ]
+    for task in tasks:
+        os.mkfifo(task.vehicle)
+    return tasks
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
     """Exactly `jobs` drives must be in progress at once. The vehicle files are named pipes, so each
     started drive waits until its pipe is closed, and the test counts the waiting drives.
     """
-    tasks = [
-        task._replace(vehicle=tmp_path / task.vehicle.name)
-        for task in tasks_of(logs(drives), None, tmp_path)
-    ]
+    tasks = piped_tasks(drives, tmp_path)
     writers: dict[Path, int] = {}
     under_way: list[int] = []
 
@@ -80,14 +94,51 @@ def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs
             until(lambda task=task: is_waiting(task.vehicle))  # type: ignore[misc]
             os.close(writers[task.vehicle])
 
-    for task in tasks:
-        os.mkfifo(task.vehicle)
     watcher = threading.Thread(target=watch)
     watcher.start()
     outcomes = list(estimate_drives(tasks, "ckf", jobs))
     watcher.join()
     assert under_way == [jobs]
     assert all(outcome.error is not None for outcome in outcomes)
+
+
+def test_a_process_that_the_system_ends_is_an_error_and_no_hang(
+    drives: Path, tmp_path: Path
+) -> None:
+    tasks = piped_tasks(drives, tmp_path)
+
+    def end_one() -> None:
+        with tasks[0].vehicle.open("wb"):  # waits until a process reads
+            multiprocessing.active_children()[0].kill()
+
+    watcher = threading.Thread(target=end_one)
+    watcher.start()
+    with pytest.raises(InputError, match="jobs: the system ended a process"):
+        list(estimate_drives(tasks, "ckf", 2))
+    watcher.join()
+    assert not multiprocessing.active_children()
+    assert not logs(tmp_path)
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
+    drives: Path, tmp_path: Path, jobs: str
+) -> None:
+    (pipe, *_) = (task.vehicle for task in piped_tasks(drives, tmp_path))
+    words = ["replay", *map(str, logs(drives)), "--vehicle", str(pipe), "--estimator", "ckf"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edge_agent.cli", *words, "--out", str(tmp_path), "--jobs", jobs],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # a process group of its own, as of a command in a shell
+    )
+    with pipe.open("wb"):  # waits until a drive has begun
+        os.killpg(process.pid, signal.SIGINT)
+        _, reported = process.communicate()
+    assert process.returncode == 130
+    assert reported.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in reported
+    assert not logs(tmp_path)
 
 
 def test_a_bad_log_is_told_and_the_others_are_estimated(
