@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
-from fleet_service.fusion.neighbours import road_beliefs
+from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class
 from fleet_service.fusion.store.cells import Cells
@@ -19,7 +19,7 @@ from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Weather
 from schemas import grid
-from schemas.numeric import Float32Array, FloatArray, IntArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
@@ -69,17 +69,20 @@ class BeliefMap:
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
-        (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells.
+        (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells,
+        which is weaker if the cell's own visits gave no value.
         If `rows` is given, read this copy of the state instead of the live one.
         """
-        kernels = KERNELS[shape_class(self._shape.reader)]
-        return self._read(kernels, slots, np.full(len(slots), now), rows)
+        rows = self.store.state.live if rows is None else rows
+        rule = ReadRule(KERNELS[shape_class(self._shape.reader)], c.SILENCE)
+        at = np.full(len(slots), now)
+        return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
         (k, 32), at the time of the slot's last observation.
         """
-        return self._read(KERNELS[shape_class(self._shape.reader)], slots, self.live.time[slots])
+        return self._read_for_alerts(self._shape.reader, slots)
 
     def slippery(self, slots: IntArray) -> FloatArray:
         """Return P(slippery) for each slot (cell and sector), (k,), at its last observation, from
@@ -96,13 +99,16 @@ class BeliefMap:
         The slope says how far a report may be too low if the vehicle used little grip. Alerts use
         the upper end of the slope's range; see `shared`.
         """
-        return self._read(KERNELS[shape_class(self._shape.alarm)], slots, self.live.time[slots])
+        return self._read_for_alerts(self._shape.alarm, slots)
 
-    def _read(
-        self, kernels: Float32Array, slots: IntArray, now: IntArray, rows: Rows | None = None
-    ) -> FloatArray:
-        rows = self.store.state.live if rows is None else rows
-        return road_beliefs(rows, self.store.table, self._weather, kernels, slots, now)
+    def _read_for_alerts(self, slope: float, slots: IntArray) -> FloatArray:
+        """Return the beliefs (k, 32) at the last observations. A cell between witnesses of ice gets
+        an alert even if its own visitors gave no value, so silence does not count.
+        """
+        rule = ReadRule(KERNELS[shape_class(slope)], 0.0)
+        rows = self.store.state.live
+        at = self.live.time[slots]
+        return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Return the slot (row number) (n,) of each pair of cell and sector; -1 if no vehicle has

@@ -7,7 +7,8 @@ neighbours is more probably slippery than a cell without any information. Each s
 (before, behind, and the other direction of the road) sends it one message, from the most
 informative neighbour on that side:
 
-    m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
+    m_i = 1 - w + w·n_i/p₀_i,    w = q·SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
+    q = exp(-SILENCE·max(v_n·min(k/k_n, 1) - v, 0))
 
 and a reader gets the normalised product K·(b·m₁·m₂·m₃).
 
@@ -22,6 +23,11 @@ value of m is 1 - w, which is .1 next to ice. So a cell in which its own visitor
 cell with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
 ended there. A cell that no vehicle has certainly visited (see `space`) receives no message.
 
+Messages are weaker if the cell's own visitors gave fewer values than those of the neighbour (q),
+because they would give about as many on the same slippery surface. This lowers P(slippery) to
+UNSURE at most: silence does not show grip. The weights v fade with time, so that values from before
+a change of the road count little.
+
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here
 messages travel one step only.
 
@@ -32,24 +38,27 @@ Legend
     p₀     prior of an unmeasured road of the region                                      (32,)
     K      shared kernel, maps measured friction to that of the road, see `shared`        (32, 32)
     d      distance in cells; 1 to the cell of the other direction
+    v, k   weight of recent values, and number of visits, of the cell; v_n, k_n of the neighbour
 """
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road
-from fleet_service.fusion.store.records import AGED, NONE, Rows
+from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
 from fleet_service.fusion.store.table import find_row
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled, refcount_free, refcount_free_inlined
+from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
 _BINS: Final = mugrid.BINS
@@ -86,29 +95,42 @@ def _write_message(message: FloatArray, weight: float, road: FloatArray, prior: 
         message[i] = 1.0 - weight + weight * road[i] / prior[i]
 
 
+class ReadRule(NamedTuple):
+    """Rule by which stored beliefs are read.
+
+    Attributes:
+        kernels: kernels (32, 32 each), which map a belief about measured friction to one about the
+            road, because all reports share an error; see `shared`.
+        silence: SILENCE, or 0 for messages that visits without a value do not weaken.
+    """
+
+    kernels: Float32Array
+    silence: float
+
+
 @compiled
 def road_beliefs(
     live: Rows,
     table: IntArray,
     weather: Weather,
-    kernels: Float32Array,
+    rule: ReadRule,
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
     """Return the belief about the road for each slot (cell and sector), (k, 32), at the times `now`
-    (k,) [ns]. `kernels` (32, 32 each) map a belief about measured friction to one about the road,
-    because all reports share an error (see `shared`); `table` is the hash table that finds slots by
-    key.
+    (k,) [ns]. `table` is the hash table that finds slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
     p = np.empty(_BINS)
+    quiet = np.empty(_BINS)
     message = np.empty(_BINS)
     road = np.empty(_BINS)
     for k in range(len(slots)):
         prior = _age_belief(live, weather, slots[k], now[k], scratch)
         p[:] = scratch[P, :_BINS]
-        read_road(kernels, live.cells, slots[k], p, out[k])
+        quiet[:] = p
+        read_road(rule.kernels, live.cells, slots[k], p, out[k])
         slippery = _slippery_probability(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
@@ -120,6 +142,7 @@ def road_beliefs(
         back = (sector + 2) % grid.SECTORS
         for side in range(3):
             most = 0.0
+            heard = 1.0
             there = cell
             for step in range(1, c.NEIGHBOURS + 1):
                 if side == 2 and step > 3:
@@ -144,18 +167,22 @@ def road_beliefs(
                 if kept < _ASKED:
                     continue
                 _age_belief(live, weather, row, now[k], scratch)
-                read_road(kernels, live.cells, row, scratch[P], road)
+                read_road(rule.kernels, live.cells, row, scratch[P], road)
                 slippery = _slippery_probability(road)
                 weight = _KEPT[1 if side == 2 else step] * (slippery - unknown) / (1.0 - unknown)
                 if weight > most:
                     most = weight
                     _write_message(message, weight, road, weather.prior[prior])
+                    heard = _silence_factor(live.cells, slots[k], row, rule.silence)
             if most > 0.0:
                 informative = True
                 for i in range(_BINS):
                     p[i] *= message[i]
+                    quiet[i] *= 1.0 + heard * (message[i] - 1.0)
         if informative:
-            read_road(kernels, live.cells, slots[k], p, out[k])
+            read_road(rule.kernels, live.cells, slots[k], p, out[k])
+            read_road(rule.kernels, live.cells, slots[k], quiet, road)
+            _lower_to_unsure(out[k], road)
     return out
 
 
@@ -183,6 +210,38 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
                     break
                 out[k, 1 + side * c.NEIGHBOURS + step] = row
     return out
+
+
+@refcount_free_inlined
+def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
+    """Lower P(slippery) of a belief `road` (32) in place to that of `quiet` (32), the belief after
+    weaker messages, but not below UNSURE: silence does not show grip.
+    """
+    told = _slippery_probability(road)
+    least = _slippery_probability(quiet)
+    if told <= c.UNSURE or least >= told:
+        return
+    kept = max((c.UNSURE - least) / (told - least), 0.0)
+    for i in range(_BINS):
+        road[i] = kept * road[i] + (1.0 - kept) * quiet[i]
+
+
+@refcount_free_inlined
+def _silence_factor(cells: RecordArray, row: int, neighbour: int, silence: float) -> float:
+    """Return the factor q in (0, 1] on the message of a slippery neighbour: small if many visits to
+    the cell in `row` gave no value although visits to the neighbour did.
+    """
+    visits = float(cells[row].visits) / max(float(cells[neighbour].visits), 1.0)
+    lacking = _recent_values(cells, neighbour) * min(visits, 1.0) - _recent_values(cells, row)
+    return math.exp(-silence * max(lacking, 0.0))
+
+
+@refcount_free_inlined
+def _recent_values(cells: RecordArray, row: int) -> float:
+    whole = 0.0
+    for kind in range(MANOEUVRES):
+        whole += float(cells[row].manoeuvres[kind])
+    return whole / WEIGHT
 
 
 @refcount_free_inlined
