@@ -7,13 +7,14 @@ LIGHT := .venv/.light
 ONLY ?=
 
 # two processes more than cores, because many tests wait for processes of their own
-TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 2 )) --dist loadfile
+PYTEST := -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 2 )) --dist loadfile
+TESTS := $(BIN)/python $(PYTEST)
 export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of processes
 
 # Main targets have a comment "##", campaigns "#=", everything else "#-"; `make help` and `make campaigns` print them.
 .DEFAULT_GOAL := help
-.PHONY: help campaigns setup demo test test-all test-shuffled check package docs lint types results figures release \
-  faults faults-quick cluster-faults soak bench tune proto lock audit fuzz clean analytics-bench spark-test usability \
+.PHONY: help campaigns setup demo test test-all coverage test-shuffled check package docs lint types results figures \
+  release faults faults-quick cluster-faults soak bench tune proto lock audit fuzz clean analytics-bench spark-test usability \
   sensitivity roads-bench page-bench ahead-bench iov-bench browser-test batch-bench image kube country-bench
 
 help:  #- print the main targets
@@ -53,6 +54,15 @@ test-all: $(PAPERS)  #- all tests, and the campaigns in their quick form
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[cits]' \
 	  || echo "no compiler for python-qpid-proton: the tests of C-ITS are skipped" >&2
 	$(TESTS) --durations 10 -rs
+
+coverage: $(PAPERS)  #- branch coverage of each package by the tests that take seconds, lab/ apart
+	mkdir -p .coverage
+	$(BIN)/python -m coverage erase
+	$(BIN)/python -m coverage run $(PYTEST) -m 'not long and not campaign'
+	$(BIN)/python -m coverage combine --quiet
+	for package in edge_agent fleet_service schemas; do \
+	  echo "$$package $$($(BIN)/python -m coverage report --format total --include "$$package/*") %"; done
+	$(BIN)/python -m coverage report --skip-covered --skip-empty | tail -1
 
 test-shuffled: $(PAPERS)  #- all tests ten times in random order
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
