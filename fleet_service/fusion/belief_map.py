@@ -1,5 +1,5 @@
-"""Beliefs of all cells as the last update left them, and the queries that read them. The module is
-pure.
+"""Beliefs of all cells in the state after the last update, and the functions that read them. The
+module is pure (no I/O).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SLIPPERY_WEIGHTS: Final = tuple(
 
 class BeliefMap:
     """Beliefs of all cells, and the trust in the vehicles that reported them. `Fusion` updates
-    them. A slot is the storage of one cell and sector.
+    them. A slot is the storage of one cell and heading sector.
 
     Attributes:
         store: cells, recent observations per cell, records per vehicle and cell, and vehicles.
@@ -47,31 +47,33 @@ class BeliefMap:
 
     @property
     def live(self) -> Cells:
-        """Current state of all cells (belief, counts, times) as columns; rows from `size` on are
-        unused.
+        """Return the current state of all cells (belief, counts, times) as columns; rows from
+        `size` on are unused.
         """
         return self.store.live
 
     @property
     def size(self) -> int:
-        """Number of slots in use; a slot is the storage of one cell and sector."""
+        """Return the number of slots in use; a slot is the storage of one cell and heading
+        sector.
+        """
         return self.store.size
 
     @property
     def cell(self) -> IntArray:
-        """Cell number of every slot (stored cell and sector), (size,)."""
+        """Return the cell number of every slot (stored cell and heading sector), (size,)."""
         return self.live.key[: self.size] // grid.SECTORS
 
     @property
     def sector(self) -> SmallArray:
-        """Heading sector of every slot (stored cell and sector), (size,)."""
+        """Return the heading sector of every slot (stored cell and heading sector), (size,)."""
         return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
-        (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells,
-        which is weaker if the cell's own visits gave no value.
-        If `rows` is given, read this copy of the state instead of the live one.
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
+        sector), (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring
+        cells, which is weaker if visits to the cell itself gave no friction value. If `rows` is
+        given, read this copy of the state instead of the live one.
         """
         rows = self.store.state.live if rows is None else rows
         rule = ReadRule(KERNELS[shape_class(self._shape.reader)], c.SILENCE)
@@ -79,14 +81,14 @@ class BeliefMap:
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and sector),
-        (k, 32), at the time of the slot's last observation.
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
+        sector), (k, 32), at the time of the slot's last observation.
         """
         return self._read_for_alerts(self._shape.reader, slots)
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """Return P(slippery) for each slot (cell and sector), (k,), at its last observation, from
-        reports of this cell alone (without neighbours).
+        """Return P(slippery) for each slot (cell and heading sector), (k,), at its last
+        observation, from reports of this cell alone (without neighbours).
         """
         return _slippery_probability(
             self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
@@ -96,14 +98,15 @@ class BeliefMap:
         """Return the same array (k, 32) as `beliefs_at_last_report`, but with a more cautious
         tyre-shape slope, as alerts require.
 
-        The slope says how far a report may be too low if the vehicle used little grip. Alerts use
-        the upper end of the slope's range; see `shared`.
+        The slope states by how much a report may be too low if the vehicle used little grip. Alerts
+        use the upper end of the slope's range; see `shared`.
         """
         return self._read_for_alerts(self._shape.alarm, slots)
 
     def _read_for_alerts(self, slope: float, slots: IntArray) -> FloatArray:
-        """Return the beliefs (k, 32) at the last observations. A cell between witnesses of ice gets
-        an alert even if its own visitors gave no value, so silence does not count.
+        """Return the beliefs (k, 32) at the last observations. Visits without a friction value do
+        not weaken the evidence of neighbouring cells here, because a cell between vehicles that
+        report ice must get an alert even if its own visitors gave no value.
         """
         rule = ReadRule(KERNELS[shape_class(slope)], 0.0)
         rows = self.store.state.live
@@ -128,7 +131,7 @@ class BeliefMap:
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
         """Return the report times [ns] of the vehicles that corroborate ice or grip in each slot
-        (cell and sector), (k, SOURCES), newest first.
+        (cell and heading sector), (k, SOURCES), newest first.
 
         Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
         [ns]. At most SOURCES vehicles per slot are stored; time 0 means no vehicle.
@@ -139,9 +142,9 @@ class BeliefMap:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (cells and
-        sectors), as two arrays (k, SOURCES): index of the vehicle, and time of its report [ns]. The
-        time is 0 if the vehicle does not count (see `sources`).
+        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (cells with
+        heading sectors), as two arrays (k, SOURCES): index of the vehicle, and time of its report
+        [ns]. The time is 0 if the vehicle does not count (see `sources`).
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters

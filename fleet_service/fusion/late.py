@@ -37,8 +37,8 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
     """Return the times [ns] at which late visits are fused, given their end times `time` (n,):
-    within one second after the checkpoint (the time before which observations are final), in whole
-    µs. The newest visit gets the earliest time.
+    times in whole µs within one second after the checkpoint (the time before which observations are
+    final). The newest visit gets the earliest time.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)

@@ -23,10 +23,10 @@ value of m is 1 - w, which is .1 next to ice. So a cell in which its own visitor
 cell with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
 ended there. A cell that no vehicle has certainly visited (see `space`) receives no message.
 
-Messages are weaker if the cell's own visitors gave fewer values than those of the neighbour (q),
-because they would give about as many on the same slippery surface. This lowers P(slippery) to
-UNSURE at most: silence does not show grip. The weights v fade with time, so that values from before
-a change of the road count little.
+Messages are weaker (factor q) if the cell's own visitors gave fewer friction values than those of
+the neighbour, because on the same slippery surface they would give about as many. This never lowers
+P(slippery) below UNSURE, because a visit without a value does not show grip. The weights v fade
+with time, so that values from before a change of the road count little.
 
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here
 messages travel one step only.
@@ -101,7 +101,8 @@ class ReadRule(NamedTuple):
     Attributes:
         kernels: kernels (32, 32 each), which map a belief about measured friction to one about the
             road, because all reports share an error; see `shared`.
-        silence: SILENCE, or 0 for messages that visits without a value do not weaken.
+        silence: SILENCE, by which visits without a friction value weaken the messages of
+            neighbouring cells; 0 if they must not weaken them.
     """
 
     kernels: Float32Array
@@ -117,8 +118,8 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Return the belief about the road for each slot (cell and sector), (k, 32), at the times `now`
-    (k,) [ns]. `table` is the hash table that finds slots by key.
+    """Return the belief about the road for each slot (cell and heading sector), (k, 32), at the
+    times `now` (k,) [ns]. `table` is the hash table that finds slots by key.
     """
     out = np.empty((len(slots), _BINS))
     scratch = np.empty((3, SCRATCH))
@@ -188,9 +189,9 @@ def road_beliefs(
 
 @compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
-    """Return each slot (cell and sector), and the slots before and behind it that may belong to the
-    same slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS). Positions without such a slot
-    are NONE.
+    """Return each slot (cell and heading sector), and the slots before and behind it that may
+    belong to the same slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS). Positions
+    without such a slot are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
@@ -228,8 +229,8 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
 
 @refcount_free_inlined
 def _silence_factor(cells: RecordArray, row: int, neighbour: int, silence: float) -> float:
-    """Return the factor q in (0, 1] on the message of a slippery neighbour: small if many visits to
-    the cell in `row` gave no value although visits to the neighbour did.
+    """Return the factor q in (0, 1] on the weight of a slippery neighbour's message. It is small if
+    many visits to the cell in `row` gave no friction value although visits to the neighbour did.
     """
     visits = float(cells[row].visits) / max(float(cells[neighbour].visits), 1.0)
     lacking = _recent_values(cells, neighbour) * min(visits, 1.0) - _recent_values(cells, row)
@@ -267,8 +268,8 @@ def _stored_slippery(live: Rows, row: int) -> float:
 
 @refcount_free
 def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """Age the belief about a slot (cell and sector) to `now` [ns] and write it to `scratch`. Return
-    the row number of the prior that the weather of its region gives.
+    """Age the belief about a slot (cell and heading sector) to `now` [ns] and write it to
+    `scratch`. Return the row number of the prior that the weather of the cell's region gives.
     """
     cells = live.cells
     p = scratch[P]

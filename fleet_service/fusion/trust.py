@@ -146,10 +146,11 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how a vehicle's friction values in one cell change with the grip that it used:
-    `difference` and `used` are the differences of two values and of the grip used, both relative to
-    friction, and `variance` is that of `difference`. A constant relative error of the vehicle
-    cancels.
+    """Record how a vehicle's friction values in one cell change with the grip that the vehicle
+    used. `difference` is the difference of two values and `used` the difference of the grip used,
+    both relative to friction. `variance` is the variance of `difference`.
+
+    A constant relative error of the vehicle cancels in these differences.
     """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)

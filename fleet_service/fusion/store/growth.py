@@ -138,7 +138,7 @@ def grow_rows(old: Array, rows: int) -> Array:
 
 def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
     """Return the list of free rows of an array of records that has grown to `rows`: the earlier
-    free rows `old` and the new rows. The number of free rows is stored in `used[which]`.
+    free rows `old` and the new rows. The number of free rows is written to `used[which]`.
     """
     count = int(used[which])
     more = rows - len(old)
