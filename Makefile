@@ -86,7 +86,7 @@ types: setup  #- mypy
 
 check: lint types test-all package faults-quick  ## lint, types, all tests, package, quick faults: what CI runs
 
-package: setup  #- wheel and sdist, installed and used in a fresh environment
+package: setup  #- wheels and sdist, installed and used in a fresh environment
 	$(BIN)/python -m tests.packaging
 
 faults: setup  #= fault campaigns, hours
@@ -119,7 +119,7 @@ figures: setup  #- keep the figures of the last runs, and write the results page
 results: setup  #- write the results page from the kept figures
 	$(BIN)/python -m tests.results --pages-only
 
-release: setup  #- VERSION=x.y.z: check the changelog, set the version, build sdist, wheel and SBOM in dist/
+release: setup  #- VERSION=x.y.z: check the changelog, set the version, build sdist, wheels and SBOM in dist/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[release]'
 	$(BIN)/python -m tests.release $(VERSION)
 

@@ -1,6 +1,7 @@
 """`make image`: runs the steps of deploy/Dockerfile as a script, without a container engine.
 
-Folders of the image become folders below another root. Python is this machine's interpreter of the
+Folders of the image become folders below another root. Nothing is installed by apt-get: the tools
+are those of this machine. Python is this machine's interpreter of the
 version that FROM names, in a fresh environment. Then a router and a service of the image are
 started; the service must be ready without compiling anything. The user cannot be changed here, so
 the user of the USER instruction is only checked.
@@ -26,7 +27,7 @@ from tests.structure import ROOT
 from tests.waiting import until
 
 DOCKERFILE: Final = ROOT / "deploy" / "Dockerfile"
-PLACES: Final = ("/src", "/etc/gripmap", "/var/lib/gripmap", "/var/cache/gripmap")
+PLACES: Final = ("/src", "/etc/gripmap", "/var/lib/gripmap", "/var/cache/gripmap", "/var/lib/apt")
 OURS: Final = (
     "PIP_",
     "SSL_",
@@ -107,6 +108,7 @@ class Image:
             )
             if done.stdout.strip() == version[1]:
                 subprocess.run([command, "-m", "venv", self.root / "usr"], check=True)
+                (self.root / "usr" / "bin" / "apt-get").symlink_to("/bin/true")
                 self.environment["PATH"] = f"{self.root / 'usr' / 'bin'}:/usr/bin:/bin"
                 return
         raise SystemExit(f"error: Python {version[1]}: is not on this machine")

@@ -1,9 +1,8 @@
-"""`make package`: build sdist and wheel, and try the wheel in a fresh environment outside the
-source tree.
+"""`make package`: build sdist and wheels, and try the wheel for this machine in a fresh environment
+outside the source tree.
 
-The wheel is built from the sdist, so that a file missing in the sdist is noticed. The wheel is
-tried with each Python version of VERSIONS that this machine has, on the PATH or in pyenv. For a
-missing version a line is printed. `--python` adds interpreters.
+The wheel is tried with each Python version of VERSIONS that this machine has, on the PATH or in
+pyenv. For a missing version a line is printed. `--python` adds interpreters.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from tests.platform_wheel import build_packages
 from tests.structure import ROOT
 
 FIRST_USE = """
@@ -30,6 +30,22 @@ assert about["Summary"] and about["Description"], about
 from pathlib import Path
 for package in (schemas, edge_agent, fleet_service, deploy):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package
+"""
+# the kernels in the wheel give the estimates of those that Numba compiles here, to the last digits
+NATIVE = """
+import sys
+from edge_agent.app.native_library import use_agent_library
+from edge_agent.app.shipped_library import SHIPPED, find_shipped_library, read_processor_features
+if find_shipped_library(SHIPPED, read_processor_features()) is None:
+    sys.exit(print("the wheel has no kernels for this processor"))
+assert use_agent_library()
+import numpy as np, pyarrow.parquet
+from edge_agent import estimate, load_vehicle, read_log
+made = estimate(read_log("drive.parquet"), load_vehicle("car.json"))
+by_numba = pyarrow.parquet.read_table("estimates.parquet")
+for name in ("mu", "mu_lower", "mu_upper"):
+    np.testing.assert_allclose(made[name].to_numpy(), by_numba[name].to_numpy(), rtol=1e-5)
+assert "numba" not in sys.modules
 """
 HIDING = {
     "schemas": ("gripmap", "edge_agent", "fleet_service"),
@@ -89,9 +105,7 @@ def main() -> int:
     if not pythons:
         raise SystemExit(f"none of {', '.join(VERSIONS)} works here")
     with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "dist"
-        run_command([sys.executable, "-m", "build", "--outdir", built, ROOT], ROOT)
-        (wheel,) = built.glob("*.whl")
+        wheel = build_packages(Path(folder) / "dist")
         for number, python in enumerate(pythons):
             install_and_use(python, wheel, Path(folder) / f"use{number}")
     return 0
@@ -128,6 +142,7 @@ def install_and_use(python: str, wheel: Path, folder: Path) -> None:
         ],
         folder,
     )
+    run_command([scripts / "python", "-c", NATIVE], folder)
     run_command([scripts / "fleet-service", "--help"], folder)
     for name, imports in HIDING.items():
         own = folder / f"own-{name}" / name

@@ -1,4 +1,4 @@
-"""Prepare a release: check the changelog, set the version, and build sdist, wheel, SBOM and
+"""Prepare a release: check the changelog, set the version, and build sdist, wheels, SBOM and
 licences in `dist/`.
 
     python -m tests.release 0.2.0
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas.errors import InputError
+from tests.platform_wheel import build_packages
 from tests.structure import ROOT
 
 VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
@@ -98,9 +99,7 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    subprocess.run(
-        [sys.executable, "-m", "build", "--outdir", "dist", str(ROOT)], cwd=ROOT, check=True
-    )
+    build_packages(ROOT / "dist")
     sbom = ROOT / "dist" / f"gripmap-{version}.cdx.json"
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(sbom)]
     subprocess.run(command, cwd=ROOT, check=True)

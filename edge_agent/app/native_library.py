@@ -1,8 +1,9 @@
-"""`python -m edge_agent.app.native_library FILE`: compile the kernels that a running agent calls
-into a shared library.
+"""`python -m edge_agent.app.native_library [FILE]`: compile the kernels that a running agent calls
+into a shared library, or, without FILE, into the libraries of the installed package.
 
-The agent then needs neither Numba nor LLVM. A process of its own builds the library before the
-agent's first start, so that the agent never holds the compiler.
+The agent then needs neither Numba nor LLVM. If the package has no library for this machine, a
+process of its own builds one before the agent's first start, so that the agent never holds the
+compiler.
 """
 
 from __future__ import annotations
@@ -12,6 +13,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+from edge_agent.app.shipped_library import (
+    BUILD,
+    SHIPPED,
+    build_shipped_libraries,
+    find_shipped_library,
+    read_processor_features,
+)
 from schemas.runtime import progress_messages
 from schemas.runtime.jit import native_library_path, use_native_kernels
 from schemas.runtime.native_kernels import LINKER, Library
@@ -19,24 +27,35 @@ from schemas.runtime.process import end_with_parent
 
 
 def use_agent_library() -> bool:
-    """Take the kernels of this process from the agent's shared library; build it if there is none.
-    Call this before other imports.
+    """Take the kernels of this process from the agent's shared library: that of the package, or
+    else one built for this machine before or now. Call this before other imports.
 
     Return False if there is no linker or no folder for the library. Numba then compiles the kernels
     in this process.
     """
+    shipped = find_shipped_library(SHIPPED, read_processor_features())
+    if shipped is not None and _load_library(shipped):
+        return True
     path = native_library_path("edge_agent")
     if path is None or not (path.exists() or shutil.which(LINKER)):
         return False
     if not path.exists():
         progress_messages.report_once(progress_messages.COMPILING)
         progress_messages.set_status("compiling the agent's kernels")
-        build = [sys.executable, "-m", "edge_agent.app.native_library", str(path)]
+        build = [sys.executable, "-m", BUILD, str(path)]
         if subprocess.run(build, capture_output=True, check=False).returncode:
             return False
+    return _load_library(path)
+
+
+def _load_library(path: Path) -> bool:
+    """Use the kernels of a library; return False, and report the reason, if the system refuses to
+    load it.
+    """
     try:
         use_native_kernels(Library(path))
-    except OSError:
+    except OSError as error:
+        progress_messages.report(f"kernels in {path}: not used, because of an error: {error}")
         return False
     return True
 
@@ -73,4 +92,7 @@ def build_agent_library(path: Path) -> None:
 
 if __name__ == "__main__":
     end_with_parent()
-    build_agent_library(Path(sys.argv[1]))
+    if sys.argv[1:]:
+        build_agent_library(Path(sys.argv[1]))
+    else:
+        build_shipped_libraries()

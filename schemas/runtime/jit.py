@@ -150,7 +150,7 @@ def native_library_path(package: str) -> Path | None:
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     folder = Path(given) if given else cache_root()
-    name = f"{Path(kernel_cache(package)).name}-{_processor_digest()}.so"
+    name = f"{describe_sources(package)}-{_processor_digest()}.so"
     return None if folder is None else folder / name
 
 
@@ -158,28 +158,40 @@ def _processor_digest() -> str:
     """Return a digest of the processor's model and features, on which compiled machine code
     depends.
     """
-    lines = {platform.machine()}
-    with suppress(OSError):
-        first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
-        lines |= {line for line in first.splitlines() if line.startswith(PROCESSOR)}
+    lines = {platform.machine(), *list_processor_lines()}
     return hashlib.blake2b("\n".join(sorted(lines)).encode(), digest_size=4).hexdigest()
 
 
-@functools.cache
+def list_processor_lines() -> list[str]:
+    """Return the lines of /proc/cpuinfo that tell a processor's model and features, if any."""
+    try:
+        first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
+    except OSError:
+        return []
+    return [line for line in first.splitlines() if line.startswith(PROCESSOR)]
+
+
 def kernel_cache(package: str) -> str:
-    """Return the folder for a package's compiled functions, in the user's cache; a digest of all
-    source files is part of its name.
+    """Return the folder for a package's compiled functions, in the user's cache. Old folders may be
+    deleted at any time.
+    """
+    return str((cache_root() or Path()) / describe_sources(package))
+
+
+@functools.cache
+def describe_sources(package: str) -> str:
+    """Return a package's name with a digest of all source files on which its kernels depend.
 
     The digest is needed because Numba's own cache checks only the source file of a function. After
     a change in another file, whose functions or constants the function uses, Numba would use
-    outdated code. Old folders may be deleted at any time.
+    outdated code.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)
     for folder in (root / "schemas", root / package):
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.read_bytes())
-    return str((cache_root() or Path()) / f"{package}-{digest.hexdigest()}")
+    return f"{package}-{digest.hexdigest()}"
 
 
 @functools.cache

@@ -7,14 +7,17 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import gripmap
 from edge_agent.app.backfill import estimate_drives, tasks_of
 from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.shipped_library import BUILD
 from edge_agent.cli import main as edge
 from edge_agent.inputs.signal_log import read_log
 from schemas.runtime.figures import Figure
@@ -22,6 +25,7 @@ from schemas.vehicle import load_vehicle
 from tests.benchmarks.inputs.live_benchmark import peer_addresses, run_peer, write_profile
 from tests.benchmarks.measure import median_s
 from tests.faults.processes import open_stage
+from tests.structure import ROOT
 
 EDGE = (sys.executable, "-m", "edge_agent.cli")
 FIRST = """import sys
@@ -95,7 +99,27 @@ def measure_start(folder: Path) -> list[Figure]:
             "s",
             0.5,
         ),
+        Figure("bench.start.cold_s", measure_cold_start(folder, files), "s, without a cache", 8),
     ]
+
+
+def measure_cold_start(folder: Path, files: list[str]) -> float:
+    """Return the median time [s] to the first estimate of a new process whose package has the
+    kernels that a wheel ships, where nothing is cached and no linker is found.
+    """
+    package = folder / "package"
+    unused = shutil.ignore_patterns("__pycache__", "*.so")
+    for name in gripmap.PACKAGES:
+        shutil.copytree(ROOT / name, package / name, ignore=unused)
+    shutil.copy(ROOT / "gripmap.py", package)
+    subprocess.run([sys.executable, "-m", BUILD], cwd=package, check=True)
+
+    def run_process() -> None:
+        with tempfile.TemporaryDirectory() as empty:
+            own = os.environ | {"PATH": empty, "XDG_CACHE_HOME": empty, "NUMBA_CACHE_DIR": empty}
+            subprocess.run([sys.executable, "-c", FIRST, *files], cwd=package, env=own, check=True)
+
+    return median_s(run_process)
 
 
 def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app import native_library
+from edge_agent.app import native_library, shipped_library
 from edge_agent.lab.simulation import SimulatedFleet
 from schemas.runtime import jit
 
 # a running agent must load none of these
 HEAVY = ("grpc", "llvmlite", "numba", "pandas", "pyarrow", "rich", "scipy", "yaml")
+LEVEL = next(iter(shipped_library.FEATURES))
 VEHICLES = 2
 DRIVE = f"""import hashlib, sys
 import numpy as np
@@ -52,12 +53,26 @@ for column in last.columns.values():
     digest.update(column.tobytes())
 print(digest.hexdigest(), records + len(last.vehicle))
 """
-NATIVE = "from edge_agent.app.native_library import use_agent_library; assert use_agent_library()"
+# the folder of the wheel's libraries contains one for other sources, which would crash
+NATIVE = """
+from pathlib import Path
+from edge_agent.app import native_library
+native_library.SHIPPED = Path(sys.argv[1]).parent / "kernels"
+assert native_library.use_agent_library()
+"""
 LOADED = f"""
 import edge_agent.app.trip, edge_agent.cli.live, edge_agent.cli.run, edge_agent.publish.publisher
 import edge_agent.app.agent, edge_agent.inputs.live.rows, edge_agent.inputs.live.sources
 print(*[name for name in {HEAVY} if name in sys.modules])
 """
+
+
+def write_library(folder: Path, name: str) -> Path:
+    """Write a file that is no library into a new folder, and return its path."""
+    folder.mkdir()
+    path = folder / name
+    path.write_bytes(b"no library")
+    return path
 
 
 def run_python(code: str, *words: str) -> list[str]:
@@ -71,8 +86,10 @@ def run_python(code: str, *words: str) -> list[str]:
 @pytest.mark.timeout(600)  # Numba compiles if nothing is cached
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
-    bit by bit. The agent that uses the library must not load the heavy modules.
+    bit by bit. The agent that uses the library must not load the heavy modules. It must refuse a
+    library for other sources.
     """
+    write_library(tmp_path / "kernels", f"edge_agent-0123456789abcdef-{LEVEL}.so")
     t, signals = SimulatedFleet("hills", VEHICLES, 3, 100.0, rough=0.5, winter=0.5).step(2000)
     drive = str(tmp_path / "drive.npz")
     np.savez(drive, t=t, signals=signals)
@@ -87,6 +104,7 @@ def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> Non
 def test_without_a_linker_or_a_folder_numba_compiles(
     missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(native_library, "SHIPPED", tmp_path)
     monkeypatch.setenv("PATH", os.fspath(tmp_path) if missing == "linker" else os.environ["PATH"])
     monkeypatch.setattr(
         native_library,
@@ -100,7 +118,8 @@ def test_without_a_linker_or_a_folder_numba_compiles(
 def test_a_library_that_cannot_be_loaded_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "library.so").write_bytes(b"no library")
-    monkeypatch.setattr(native_library, "native_library_path", lambda _: tmp_path / "library.so")
+    path = write_library(tmp_path / "cache", "library.so")
+    monkeypatch.setattr(native_library, "SHIPPED", tmp_path / "kernels")
+    monkeypatch.setattr(native_library, "native_library_path", lambda _: path)
     assert not native_library.use_agent_library()
     assert jit._Native.library is None

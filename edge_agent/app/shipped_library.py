@@ -1,0 +1,85 @@
+"""Shared libraries of the agent's kernels inside the installed package, so that the first start
+needs neither Numba nor a linker.
+
+`python -m edge_agent.app.native_library` builds them: one for each level of the x86-64
+architecture in FEATURES. The name of a library contains a digest of the sources, and the level.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from schemas.runtime.jit import describe_sources, list_processor_lines
+from schemas.runtime.progress_messages import report
+
+SHIPPED: Final = Path(__file__).parents[1] / "kernels"
+BUILD: Final = "edge_agent.app.native_library"
+LEVEL_3: Final = (
+    "abm avx avx2 bmi1 bmi2 cx16 f16c fma lahf_lm movbe popcnt sse4_1 sse4_2 ssse3 xsave"
+)
+# what a processor of each level has, in the words of /proc/cpuinfo; the fastest level first
+FEATURES: Final = {
+    "x86-64-v4": f"{LEVEL_3} avx512bw avx512cd avx512dq avx512f avx512vl",
+    "x86-64-v3": LEVEL_3,
+}
+
+
+def read_processor_features() -> set[str]:
+    """Return the features of this machine's processor, in the words of /proc/cpuinfo."""
+    return {word for line in list_processor_lines() for word in line.split()}
+
+
+def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
+    """Return the fastest library in `folder` for the present sources and a processor with these
+    features. Return None if there is none; report the reason if there are others.
+    """
+    libraries = set(folder.glob("*.so"))
+    sources = describe_sources("edge_agent")
+    available = set(features)
+    for level, needed in FEATURES.items():
+        path = folder / f"{sources}-{level}.so"
+        if path in libraries and available.issuperset(needed.split()):
+            return path
+    if libraries:
+        fits = any(path.name.startswith(sources) for path in libraries)
+        reason = "this processor lacks instructions" if fits else "they are for other sources"
+        report(f"kernels in {folder}: not used, because {reason}")
+    return None
+
+
+def build_shipped_libraries() -> None:
+    """Build the libraries into the installed package, with one process per level; remove others.
+
+    On a processor of another architecture there is nothing to build, so the agent compiles its
+    kernels at its first start.
+
+    Raises:
+        subprocess.CalledProcessError: a process has failed; it has printed the reason.
+    """
+    if platform.machine() != "x86_64":
+        print(f"no kernels are shipped for {platform.machine()}", file=sys.stderr)
+        return
+    print(f"building kernels in {SHIPPED}: takes a minute or two", file=sys.stderr, flush=True)
+    for old in SHIPPED.glob("*.so"):
+        old.unlink()
+    sources = describe_sources("edge_agent")
+    with tempfile.TemporaryDirectory() as cache:
+        own = os.environ | {"NUMBA_CACHE_DIR": cache, "NUMBA_CPU_FEATURES": ""}
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-m", BUILD, os.fspath(SHIPPED / f"{sources}-{level}.so")],
+                env=own | {"NUMBA_CPU_NAME": level},
+            )
+            for level in FEATURES
+        ]
+        codes = [process.wait() for process in processes]
+    for process, code in zip(processes, codes, strict=True):
+        if code:
+            raise subprocess.CalledProcessError(code, process.args)

@@ -1,0 +1,55 @@
+"""Build sdist and wheel, and on x86-64 also a wheel with the agent's compiled kernels.
+
+The wheels are built from the sdist, so that a file missing in the sdist is noticed. An installer
+chooses the wheel with kernels where it fits; the other one is for all other machines.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+from edge_agent.app.shipped_library import BUILD
+from tests.structure import ROOT
+
+
+def build_packages(out: Path) -> Path:
+    """Build sdist and wheels into a folder, and return the path of the wheel for this machine.
+
+    Raises:
+        subprocess.CalledProcessError: a step fails.
+    """
+    build = [sys.executable, "-m", "build", "--outdir", str(out)]
+    subprocess.run([*build, str(ROOT)], cwd=ROOT, check=True)
+    sdist = find_newest(out, "*.tar.gz")
+    if platform.machine() != "x86_64":
+        return find_newest(out, "*.whl")
+    with tempfile.TemporaryDirectory() as folder:
+        with tarfile.open(sdist) as packed:
+            packed.extractall(folder, filter="data")
+        (source,) = Path(folder).iterdir()
+        own = os.environ | {"PYTHONPATH": str(source)}
+        subprocess.run([sys.executable, "-m", BUILD], cwd=source, env=own, check=True)
+        tag = platform_tag(b"".join(path.read_bytes() for path in source.rglob("*.so")))
+        option = f"--config-setting=--build-option=--plat-name={tag}"
+        subprocess.run([*build, "--wheel", option, str(source)], cwd=source, check=True)
+    return find_newest(out, f"*{tag}.whl")
+
+
+def find_newest(folder: Path, pattern: str) -> Path:
+    """Return the newest file in a folder that matches a pattern."""
+    return max(folder.glob(pattern), key=lambda path: path.stat().st_mtime)
+
+
+def platform_tag(code: bytes) -> str:
+    """Return the platform tag (PEP 600) of a wheel with the given machine code: it names the oldest
+    C library that has all functions called.
+    """
+    versions = [int(minor) for minor in re.findall(rb"GLIBC_2\.(\d+)", code)]
+    return f"manylinux_2_{max(versions)}_x86_64"
