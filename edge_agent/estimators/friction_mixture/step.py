@@ -126,19 +126,15 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
     keep = scratch.keep
     leak = constants.leak_wander * abs(memory.last.ax)
     gyro = constants.gyro_wander * scratch.features.speed
-    process[NodeState.VX] = (constants.drift_x**2 + leak**2 + block.missing_x) * duration
+    process[NodeState.VX] = (constants.drift**2 + leak**2 + block.missing_x) * duration
     unsure = constants.distrust_drift * memory.trust.distrust
-    process[NodeState.VY] = (
-        constants.drift_y**2 + gyro**2 + unsure**2 + block.missing_y
-    ) * duration
+    process[NodeState.VY] = (constants.drift**2 + gyro**2 + unsure**2 + block.missing_y) * duration
     forgets = memory.trust.distrust / constants.distrust_forget
     speed = scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         pace = 1.0 / nominal.time[i] + forgets
-        if i == NodeState.SLOPE:
+        if i in (NodeState.SLOPE, NodeState.BANK):
             pace += speed / constants.slope_length
-        elif i == NodeState.BANK:
-            pace += speed / constants.bank_length
         if i in (NodeState.BIAS_X, NodeState.BIAS_Y, NodeState.SLOPE, NodeState.BANK):
             pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)

@@ -83,7 +83,7 @@ MOVES = {
     "sliding_slope": Move(
         "upper", "constant-radius", 1.08
     ),  # more nodes pay for sliding: those of little friction
-    "sliding_penalty": Move("lower", "constant-radius", 1.03),
+    "sliding_penalty": Move("lower", "constant-radius", 1.025),
     "axle_penalty": Move(
         "upper", "constant-radius", 0.85
     ),  # saturated nodes, of little friction, gain
@@ -100,16 +100,13 @@ MOVES = {
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
     "curve_e": Move("sharpness", "j-turn", 0.95),
     "shape_std": Move("std SHAPE", "gaining-slalom", 2.0),
-    "shape_time": Move("std SHAPE", "split-braking", 1.06, LESS),  # it forgets sooner
     "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
     "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
-    "stiffness_time": Move("std STEER", "turn and straight", 0.88),
     "stiffness_power_x": Move(
         "nis", "acceleration", 0.6
     ),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
-    "informing_x": Move("std LN_KX", "j-turn", 1.05),
-    "informing_y": Move("std LN_KY", "pulses", 1.15),
+    "informing": Move("std LN_KX", "j-turn", 1.05),
     "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
     "compliance_mean": Move(
         "strain", "constant-radius", 1.1
@@ -130,29 +127,24 @@ MOVES = {
     # sensors
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
-    "leak_x": Move("vx_std", "braking without torque", 1.04),
-    "leak_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
+    "leak_x": Move("vx_std", "braking without torque", 1.03),
+    "return_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
     "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
     "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
-    "bias_time": Move("std BIAS_Y", "turn and straight", 1.08, LESS),
     "slope_std": Move("std SLOPE", "braking", 1.6),
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),  # it is another one sooner
-    "bank_std": Move("std BANK", "j-turn", 0.5, LESS),
-    "bank_length": Move("std BANK", "braking", 1.2, LESS),  # it is another one sooner
-    "slope_time": Move("std BANK", "acceleration", 1.05, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.0),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
-    "drift_x": Move("std VX", "slalom", 1.2),
-    "drift_y": Move("vy_std", "gaining-slalom", 1.6),
+    "drift": Move("std VX", "slalom", 1.2),
     "leak_wander": Move("std VX", "split-braking", 1.2),
     "gyro_wander": Move("vy_std", "rough acceleration", 1.02),
     # noise: what is expected to be larger is found to be smaller than expected
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
-    "angle_std": Move("nis", "side force without turning", 0.97),
+    "angle_std": Move("nis", "side force without turning", 0.985),
     "angle_share": Move("vy_std", "constant-radius", 1.25),
     "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
     "floor_x": Move("nis", "acceleration", 0.9),
@@ -181,10 +173,10 @@ MOVES = {
     "guard_std": Move("least probabilities", "acceleration", 1.25),
     # contradiction
     "strain_prior": Move("strain", "turn and straight", 1.1),  # it takes more to tell how a car is
-    "strain_usual": Move("vy_std", "turn and straight", 0.97),  # the axles are surer
+    "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are surer
     "strain_power": Move("vy_std", "braking", 1.1, LESS),  # a level car's axles are less sure
     "strain_least": Move("vy_std", "gaining-slalom", 1.15),
-    "strain_most": Move("vy_std", "rough acceleration", 0.9, LESS),
+    "strain_most": Move("vy_std", "rough acceleration", 0.92, LESS),
     "odd_least": Move("distrust", "side force without turning", 0.98),  # it is believed later
     "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
     "distrust_noise": Move(

@@ -383,9 +383,9 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
         side = features.side[axle]
-        features.informs_x[axle] = along * along / (along * along + constants.informing_x**2)
+        features.informs_x[axle] = along * along / (along * along + constants.informing**2)
         features.informs_y[axle] = (
-            0.0 if math.isnan(side) else side * side / (side * side + constants.informing_y**2)
+            0.0 if math.isnan(side) else side * side / (side * side + constants.informing**2)
         )
 
 

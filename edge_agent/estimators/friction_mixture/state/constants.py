@@ -64,14 +64,14 @@ class Constants(NamedTuple):
     block_time: float = 0.05
     # [s] one independent measurement of the tyre per so much time: R is inflated by it over a block
     # (errata)
-    correlation_time: float = 0.2
+    correlation_time: float = 0.26
     # [s] window of the innovation variances
     window: float = 1.0
 
-    # [1/m] one road change to anywhere per 190 m (errata)
-    hazard: float = 1 / 190
+    # [1/m] one road change to anywhere per 270 m (190: beliefs fade before grip is used again)
+    hazard: float = 1 / 270
     # [1/m] slow change to a neighbouring node
-    diffusion: float = 0.003
+    diffusion: float = 0.0024
     # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is
     # covered)
     patch_length: float = 8.0
@@ -105,8 +105,8 @@ class Constants(NamedTuple):
     # wheels
     sliding_penalty: float = 0.3
     # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated
-    # one (.28: false ice)
-    axle_penalty: float = 0.24
+    # one (.28: false ice; .24: less snow is told)
+    axle_penalty: float = 0.2
 
     # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a
     # contradiction
@@ -125,29 +125,24 @@ class Constants(NamedTuple):
     curve_e: float = -0.1
     # [1] tyres between round and sharp: most of them
     shape_std: float = 1.0
-    # [s] return of the shape to its prior: a curve's error differs from slip to slip, and load to
-    # load
-    shape_time: float = 60.0
     # [1] log of the factor along: files of real cars are a third off (BMW M8, AV-21), and no drive
     # got worse by it
     stiffness_x_std: float = 0.18
     # [1] log of the factor across (vehicle)
     stiffness_y_std: float = 0.12
-    # [s] return of the stiffness factors: what they stand for is another one from bend to bend
-    # (300: twice too sure)
-    stiffness_time: float = 60.0
     # [1] power of the stiffness factor that divides a wheel's residual: slip is noisy, force is
     # quiet
     stiffness_power_x: float = 1.0
     # [1] the same for an axle, where both are
     stiffness_power_y: float = 0.3
-    # [1] demand at which a wheel informs half of what it could of stiffness: below, noise of slip
-    # does
-    informing_x: float = 0.06
-    # [1] the same for an axle
-    informing_y: float = 0.1
+    # [1] demand at which a wheel or an axle informs half of what it could of stiffness: below, the
+    # noise of slip does
+    informing: float = 0.06
     # [1] torque gain 3 %, mass 3 %, load and radius (vehicle)
     gain_std: float = 0.045
+    # [s] return of curve shape, stiffness, leaks, offsets, radii, lags, slope and bank to their
+    # prior: what they stand for changes with load, bend and road (300: twice too sure)
+    return_time: float = 60.0
 
     # [1] gravity leak of a rolling body, in measured a_y (errata: .07 of true a_y)
     leak_y_mean: float = 0.06
@@ -155,27 +150,16 @@ class Constants(NamedTuple):
     leak_y_std: float = 0.05
     # [1] gravity leak of a pitching body, in measured a_x: pitch is stiffer than roll
     leak_x: float = 0.02
-    # [s] return of the leaks to their prior
-    leak_time: float = 60.0
 
     # [m/s^2] offset of a_x: tilted mount and sensor, .22 to .96 on logs of real cars
     bias_x_std: float = 0.25
     # [m/s^2] offset of a_y, .07 to .54 there; a crossfall that the wheels do not steer against
     # reads the same
     bias_y_std: float = 0.2
-    # [s] return of the offsets, of radii and of lags to their prior: what they stand for changes
-    # with slope and bend
-    bias_time: float = 60.0
-    # [m/s^2] slope of the road: 3 %
+    # [m/s^2] slope of the road along and across: 3 % of grade, crossfall of 1 to 3 %
     slope_std: float = 0.3
-    # [m] over which it is another one: waves of 100 to 400 m
-    slope_length: float = 100.0
-    # [m/s^2] bank of the road: crossfall 1 to 3 %, and banked bends
-    bank_std: float = 0.3
-    # [m] over which it is another one
-    bank_length: float = 150.0
-    # [s] return of slope and bank to level at any speed
-    slope_time: float = 60.0
+    # [m] over which slope and crossfall are another one: waves of 100 to 400 m
+    slope_length: float = 120.0
     # [rad] offset of steering and toe: 1 to 17 mrad on logs of real cars, mostly below 4
     steer_std: float = 0.004
     # [1] gain of the steering ratio: vehicle files of real cars are 3 to 8 % off
@@ -199,10 +183,8 @@ class Constants(NamedTuple):
     # [s] lag of wheel speeds and of steering against the inertial sensors: devices up to 60 ms late
     lag_std: float = 0.025
 
-    # [m/s/s^.5] white noise of a_x and what is not constant in its offset (vehicle)
-    drift_x: float = 0.02
-    # [m/s/s^.5] the same for a_y
-    drift_y: float = 0.02
+    # [m/s/s^.5] white noise of a_x and a_y, and what is not constant in their offsets (vehicle)
+    drift: float = 0.02
     # [s^.5] what is not constant in the pitch leak, share of a_x
     leak_wander: float = 0.01
     # [rad/s^.5] wander of the yaw rate's offset; times speed an error of a_y
@@ -291,7 +273,7 @@ class Constants(NamedTuple):
     strain_prior: float = 2.0
     # [1] strain at which the axles are as sure as stated: level drives have .2 to .5, rough ones .5
     # to 2
-    strain_usual: float = 0.7
+    strain_usual: float = 0.95
     # [1] power of strain over the usual in R of the axles: what one error says of the next
     strain_power: float = 2.0
     # [1] least of that factor: a level car's axles had .24 of the stated R as the best of a search

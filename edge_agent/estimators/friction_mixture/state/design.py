@@ -64,24 +64,27 @@ def nominal_states(constants: Constants) -> Nominal:
     time = np.full(STATES, np.inf)
     c = constants
     x = NodeState
-    for state, spread, back in (
-        (x.LN_KX, c.stiffness_x_std, c.stiffness_time),
-        (x.LN_KY, c.stiffness_y_std, c.stiffness_time),
-        (x.LEAK_Y, c.leak_y_std, c.leak_time),
-        (x.STEER, c.steer_std, c.stiffness_time),
-        (x.SHAPE, c.shape_std, c.shape_time),
-        (x.GAIN, c.gain_std, c.stiffness_time),
-        (x.BIAS_X, c.bias_x_std, c.bias_time),
-        (x.BIAS_Y, c.bias_y_std, c.bias_time),
-        *((x.RADIUS + wheel, c.wheel_std, c.bias_time) for wheel in range(4)),
-        (x.LAG_WHEEL, c.lag_std, c.bias_time),
-        (x.LAG_STEER, c.lag_std, c.bias_time),
-        (x.COMPLIANCE, c.compliance_std, c.steer_time),
-        (x.STEER_GAIN, c.steer_gain_std, c.steer_time),
-        (x.SLOPE, c.slope_std, c.slope_time),
-        (x.BANK, c.bank_std, c.slope_time),
+    for state, spread in (
+        (x.LN_KX, c.stiffness_x_std),
+        (x.LN_KY, c.stiffness_y_std),
+        (x.LEAK_Y, c.leak_y_std),
+        (x.STEER, c.steer_std),
+        (x.SHAPE, c.shape_std),
+        (x.GAIN, c.gain_std),
+        (x.BIAS_X, c.bias_x_std),
+        (x.BIAS_Y, c.bias_y_std),
+        *((x.RADIUS + wheel, c.wheel_std) for wheel in range(4)),
+        (x.LAG_WHEEL, c.lag_std),
+        (x.LAG_STEER, c.lag_std),
+        (x.COMPLIANCE, c.compliance_std),
+        (x.STEER_GAIN, c.steer_gain_std),
+        (x.SLOPE, c.slope_std),
+        (x.BANK, c.slope_std),
     ):
-        std[state], time[state] = spread, back
+        std[state] = spread
+        time[state] = c.return_time
+    time[x.COMPLIANCE] = c.steer_time
+    time[x.STEER_GAIN] = c.steer_time
     mean[x.LEAK_Y] = c.leak_y_mean
     mean[x.COMPLIANCE] = c.compliance_mean
     return Nominal(mean, std, time)
