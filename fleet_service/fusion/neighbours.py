@@ -136,6 +136,7 @@ def road_beliefs(
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
         informative = False
+        weakened = False
         unknown = _slippery_probability(weather.prior[prior])
         key = live.cells[slots[k]].key
         cell = key // grid.SECTORS
@@ -177,11 +178,13 @@ def road_beliefs(
                     heard = _silence_factor(live.cells, slots[k], row, rule.silence)
             if most > 0.0:
                 informative = True
+                weakened = weakened or heard < 1.0
                 for i in range(_BINS):
                     p[i] *= message[i]
                     quiet[i] *= 1.0 + heard * (message[i] - 1.0)
         if informative:
             read_road(rule.kernels, live.cells, slots[k], p, out[k])
+        if weakened:
             read_road(rule.kernels, live.cells, slots[k], quiet, road)
             _lower_to_unsure(out[k], road)
     return out

@@ -38,17 +38,15 @@ from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet
 from edge_agent.lab.evaluation.real_world import SURE_GRIP, interval_score, town
-from edge_agent.lab.evaluation.worth import manoeuvres
+from edge_agent.lab.evaluation.worth import ESTIMATOR, SETTLED_S, manoeuvres
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU
 
-ESTIMATOR: Final = "aco-fckf"
 SEEDS: Final = range(8001, 8009)
 CARS: Final = 6
 TOWN_S: Final = 30.0
 DRIVE_S: Final = 6.0
-SETTLED_S: Final = 1.0  # before, the score is that of the prior
 FACTORS: Final = (0.7, 1.4)
 SMALL: Final = 1.0  # change in every column below which a number has no effect
 

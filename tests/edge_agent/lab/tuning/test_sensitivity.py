@@ -10,6 +10,7 @@ import pytest
 from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.design import design_of
+from edge_agent.lab.evaluation import worth
 from edge_agent.lab.tuning import sensitivity
 from edge_agent.lab.tuning.sensitivity import ConstantChange
 
@@ -29,12 +30,12 @@ def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.Judg
 
 
 def test_a_filter_measured_twice_gives_the_same(drives: list[sensitivity.JudgedDrives]) -> None:
-    usual = design_of(shipped_memberships(sensitivity.ESTIMATOR), adaptive=True)
+    usual = design_of(shipped_memberships(worth.ESTIMATOR), adaptive=True)
     assert sensitivity.measure(usual, drives) == sensitivity.measure(usual, drives)
 
 
 def test_every_constant_is_changed_by_both_factors() -> None:
-    memberships = shipped_memberships(sensitivity.ESTIMATOR)
+    memberships = shipped_memberships(worth.ESTIMATOR)
     found = [(name, factor) for name, factor, _ in sensitivity.vary_numbers(memberships)]
     assert len(found) == len(set(found))
     for name in Constants._fields:
