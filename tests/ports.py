@@ -13,7 +13,7 @@ FIRST: Final = 15_000
 
 
 def free_ports(count: int) -> list[int]:
-    """Return `count` different ports of 127.0.0.1 on which no server listens.
+    """Return `count` different ports of 127.0.0.1 on which no server listens, by TCP or UDP.
 
     The ports lie below the range that the system uses for outgoing connections (read from the file
     `OUTGOING`). A port of that range could be taken before its server starts.
@@ -26,9 +26,10 @@ def free_ports(count: int) -> list[int]:
         last = USUAL_OUTGOING
     found: list[int] = []
     for port in random.SystemRandom().sample(range(FIRST, last), last - FIRST):
-        with socket.socket() as probe:
+        with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
             try:
-                probe.bind(("127.0.0.1", port))
+                tcp.bind(("127.0.0.1", port))
+                udp.bind(("127.0.0.1", port))
             except OSError:
                 continue
         found.append(port)

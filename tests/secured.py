@@ -22,6 +22,7 @@ from fleet_service.enrolment.fleet import Enrolment, Router
 from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import configuration
+from tests.ports import free_ports
 from tests.waiting import until
 
 SERVICE = "shard-0"
@@ -31,8 +32,12 @@ VEHICLES = ("sim-000", "sim-001")
 ROUTERS = ("router-a", "router-b")
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = f"{keys.ROOT}/shard/probe"
-FREE = {"quic": "quic/127.0.0.1:0", "tls": "tls/127.0.0.1:0"}
 RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}
+
+
+def free_endpoint(protocol: str) -> str:
+    """Return an endpoint at a port that stays free, so that a router can restart on it."""
+    return f"{protocol}/127.0.0.1:{free_ports(1)[0]}"
 
 
 def make_enrolment(**changed: object) -> Enrolment:
@@ -121,7 +126,7 @@ class Network:
         running.write_text(json.dumps(config))
         protocols = dict.fromkeys((self.protocol, "tls"))
         places = {"tls": self.between.get(router), self.protocol: self.endpoints.get(router)}
-        listen = [places[protocol] or FREE[protocol] for protocol in protocols]
+        listen = [places[protocol] or free_endpoint(protocol) for protocol in protocols]
         command = ["--config", str(running), "--listen", *listen]
         process = subprocess.Popen(
             [sys.executable, "-m", "deploy.router", *command],

@@ -27,11 +27,11 @@ from schemas.runtime.zenoh_session import configuration
 from tests.faults.ground import HONEST, ROGUE, Ground, Listener
 from tests.fleet_service.examples import REGION, TILE, batch, key
 from tests.secured import (
-    FREE,
     READER,
     ROUTERS,
     SERVICE,
     WEATHER,
+    free_endpoint,
     make_enrolment,
     open_registry,
     settings,
@@ -143,7 +143,7 @@ def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
             }
         )
     )
-    router, endpoints = open_router(file, FREE[ground.network.protocol])
+    router, endpoints = open_router(file, free_endpoint(ground.network.protocol))
     with router:
         try:
             with zenoh.open(configuration(settings(endpoints[0], ground.folder), HONEST)):

@@ -303,8 +303,14 @@ def _hidden_on_page(ice: KnownIce) -> dict[str, Places]:
 
 
 # The class in which each place (tile, cell within it, heading) is drawn; -1 if it is not drawn.
+# The cells are the script's own, because the page changes those of its state while it is open.
 _KINDS: Final = """async ([places, least]) => {
-  const cells = gripmap.state.cells, found = {}, world = [...cells.known];
+  const { Cells } = await import("/static/cells.js"), found = {};
+  const { setColours } = await import("/static/colours.js");
+  setColours(gripmap.settings);
+  const cells = new Cells(gripmap.state.cells.at);
+  await cells.list();
+  const world = [...cells.known];
   const at = (tile, local) => {
     for (let k = 0; k < tile.rows.count; k++) {
       if (tile.rows.place[k] >> 2 === local) return tile.kind[k];
@@ -332,8 +338,6 @@ _KINDS: Final = """async ([places, least]) => {
     const { columnOf, rowOf } = await import("/static/grid.js");
     const all = { west: 0, east: 1, north: 0, south: 1 };
     const { passing } = await import("/static/paint.js");
-    const { setColours } = await import("/static/colours.js");
-    setColours(gripmap.settings);
     const valued = passing({ oldest: 0, bounds: false });
     const filters = { ribbons: null, "ribbons without bounds": valued };
     for (const [name, passes] of Object.entries(filters)) {
