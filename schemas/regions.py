@@ -80,15 +80,15 @@ def _regions_without(
 
 
 class Rank:
-    """Sort order of places (cells with heading sector) along a route; places that are not on the
-    route come last.
+    """Sort order of places (one per cell and heading sector) along a route; places that are not on
+    the route come last.
     """
 
     def __init__(self, route: Sequence[tuple[float, float]]) -> None:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return the rank of a place (cell with heading sector): a number that grows along the
+        """Return the rank of a place (one cell and heading sector): a number that grows along the
         route. It only serves to compare positions; it is not a distance.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))

@@ -34,8 +34,8 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """Return the possible paths ahead along the places in the map (cells with heading sector),
-    given by their keys `keys` (n,). Each path is at most `length` [m] long.
+    """Return the possible paths ahead along the places in the map (one per cell and heading
+    sector), given by their keys `keys` (n,). Each path is at most `length` [m] long.
 
     The list is empty if the map shows no road at the car.
     """

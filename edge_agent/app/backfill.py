@@ -118,9 +118,10 @@ def estimate_drives(
 
 
 def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
-    """Compile or load the kernels of an estimator, by one sample without readings, so that the
-    processes share them. An estimator of another package loads its own in each process, and an
-    error is left to the drives.
+    """Let an estimator process one sample without readings. This compiles or loads its kernels
+    (compiled functions), so that processes forked afterwards share them. For an estimator of
+    another installed package do nothing: each process loads it itself. An error is ignored here,
+    because the estimation of each drive reports it.
     """
     if estimator not in ESTIMATORS:
         return
@@ -130,8 +131,9 @@ def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
 
 
 def _fork_processes(count: int) -> ProcessPoolExecutor:
-    """Return a pool of `count` processes, which are not started yet. They are forked on Linux only,
-    because libraries of other systems do not support a fork.
+    """Return a pool for `count` worker processes; none is started yet. Only on Linux are they
+    forked from this process, because system libraries of other operating systems do not support a
+    fork.
     """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -146,11 +148,12 @@ def _submit_drives(
     estimator: str,
     memberships: Memberships | None,
 ) -> list[Future[Outcome]]:
-    """Start the processes of a pool, and give them all drives. Ctrl-C waits until the processes can
-    handle it.
+    """Submit all drives to a pool of processes, which starts the processes. SIGINT (Ctrl-C) is
+    blocked until each process has installed its own handler.
 
-    Python warns of a fork while other threads run, because a lock that one holds stays locked in
-    the new process. The libraries whose threads run here (OpenBLAS, Arrow) are prepared for it.
+    Python warns if a process with several threads is forked, because a lock that another thread
+    holds stays locked in the new process. This warning is suppressed: the libraries whose threads
+    run here (OpenBLAS, Arrow) handle a fork correctly.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -164,16 +167,17 @@ def _submit_drives(
 
 
 class _PoolProcess:
-    """State of a process of the pool: whether it estimates a drive, and whether Ctrl-C was
-    pressed."""
+    """State of one worker process: `estimates` is True while it estimates a drive, and
+    `interrupted` is True after Ctrl-C.
+    """
 
     estimates = False
     interrupted = False
 
 
 def _prepare_process() -> None:
-    """Prepare a process of the pool: it ends with its parent, uses one core, and leaves its drive
-    on Ctrl-C.
+    """Prepare a new worker process: it ends when its parent process ends, Arrow uses one thread in
+    it, and Ctrl-C stops the estimation of its current drive.
     """
     end_with_parent()
     pa.set_cpu_count(1)
@@ -182,17 +186,20 @@ def _prepare_process() -> None:
 
 
 def _interrupt_drive(*_: object) -> None:
-    """End the estimation of a drive; the parent then reports Ctrl-C."""
+    """Handle Ctrl-C in a worker process: stop the estimation of the current drive, if there is one,
+    by a KeyboardInterrupt. The parent process reports the interruption to the user.
+    """
     _PoolProcess.interrupted = True
     if _PoolProcess.estimates:
         raise KeyboardInterrupt
 
 
 def _estimate_in_process(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive in a process of the pool; after Ctrl-C, none.
+    """Estimate one drive in a worker process and return its outcome. After Ctrl-C no further drive
+    is estimated.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; the drive has no file.
+        KeyboardInterrupt: Ctrl-C was pressed; no file of estimates is written for this drive.
     """
     _PoolProcess.estimates = True
     try:

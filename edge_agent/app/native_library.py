@@ -1,9 +1,10 @@
-"""`python -m edge_agent.app.native_library [FILE]`: compile the kernels that a running agent calls
-into a shared library, or, without FILE, into the libraries of the installed package.
+"""`python -m edge_agent.app.native_library [FILE]`: compile the kernels (compiled numerical
+functions) that a running agent calls, and write them into the shared library FILE. Without FILE,
+write the libraries that the installed package contains, one per level of the x86-64 architecture.
 
 The agent then needs neither Numba nor LLVM. If the package has no library for this machine, a
-process of its own builds one before the agent's first start, so that the agent never holds the
-compiler.
+separate process builds one before the agent's first start, so that the agent never has the compiler
+in its memory.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from schemas.runtime.process import end_with_parent
 
 
 def use_agent_library() -> bool:
-    """Take the kernels of this process from the agent's shared library: that of the package, or
-    else one built for this machine before or now. Call this before other imports.
+    """Take the kernels (compiled functions) of this process from the agent's shared library. It is
+    the library of the package if one suits this machine, else a library that was built on this
+    machine, now or at an earlier start. Call this before other imports.
 
     Return False if there is no linker or no folder for the library. Numba then compiles the kernels
     in this process.
@@ -61,8 +63,8 @@ def _load_library(path: Path) -> bool:
 
 
 def build_agent_library(path: Path) -> None:
-    """Build the agent's shared library: it contains the kernels that one step of the pipeline
-    calls, with beliefs and without visits too.
+    """Build the agent's shared library `path`. It contains the kernels (compiled functions) that a
+    pipeline with one vehicle calls in one step, and when its friction beliefs are read.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no linker, or it fails.

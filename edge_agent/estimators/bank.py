@@ -80,8 +80,8 @@ class EstimatorBank:
             threads: number of threads that share the vehicles; the result does not depend on it.
 
         Returns:
-            Estimates at the same samples. Only `evidence` contains NaN, namely at all samples at
-            which neither a visit ends nor friction jumps.
+            Estimates at the same samples. Only the column `evidence` contains NaN: at all samples
+            at which neither a visit ends nor friction jumps.
 
         Raises:
             InputError: an array has the wrong shape for the bank, or threads is below 1.

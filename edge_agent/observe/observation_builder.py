@@ -1,10 +1,12 @@
-"""Construction of the records for publication from estimates: one observation per visit (passage of
-a map cell), and states of the vehicle at a given rate.
+"""Construction of the records that an agent publishes, from its estimates: one observation per
+visit (passage of a map cell), and the state of the vehicle (position, motion, friction) at a fixed
+rate.
 
-Each block of samples is processed in three steps. `cell_tracker` marks the samples at which visits
-end. The estimator bank (estimators of all vehicles) processes the block and these marks. Then
-`build_records` constructs the records. The state between blocks is an `OpenVisits`. Any division of
-the samples into blocks gives the same records in the same order. The module is pure (no I/O).
+Samples arrive in blocks (arrays of consecutive samples of all vehicles). First, `cell_tracker`
+marks the samples at which visits end. Then the estimator bank (estimators of all vehicles)
+processes the block with these marks. Then `build_records` makes the records. Visits that have not
+ended are kept in an `OpenVisits` for the next block. Therefore records and their order do not
+depend on how the samples are divided into blocks. The module is pure (no I/O).
 """
 
 from __future__ import annotations

@@ -142,8 +142,8 @@ class BeliefMap:
     def find_sources(
         self, slots: IntArray, side: int, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (cells with
-        heading sectors), as two arrays (k, SOURCES): index of the vehicle, and time of its report
+        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (one per cell and
+        heading sector), as two arrays (k, SOURCES): index of the vehicle, and time of its report
         [ns]. The time is 0 if the vehicle does not count (see `sources`).
         """
         row = self.live.reporters[slots]

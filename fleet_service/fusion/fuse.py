@@ -61,8 +61,8 @@ class Updated(NamedTuple):
 
 
 class RecordedResult(NamedTuple):
-    """Outcome (columns of `Updated`, (n,)) that was recorded when observations were processed
-    first; a replay of the archive uses them again.
+    """Outcome of an earlier update (columns of `Updated`, (n,)), stored in the archive when the
+    observations were fused for the first time. A replay of the archive uses it again.
     """
 
     late: BoolArray
@@ -145,8 +145,8 @@ class Fusion(BeliefMap):
 
         Args:
             o: the observations.
-            before: outcome that was recorded when these observations were fused first; given only
-                when an archive is replayed.
+            before: outcome that was recorded when these observations were fused for the first time;
+                given only when an archive is replayed.
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)
@@ -192,16 +192,16 @@ class Fusion(BeliefMap):
         return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells with heading sectors), (size,): True if the last visit of a
-        vehicle was before `before` [ns] and no other record refers to the slot. Such slots may be
-        deleted with `drop`.
+        """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit
+        of a vehicle was before `before` [ns] and no other record refers to the slot. Such slots may
+        be deleted with `drop`.
         """
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Delete the slots (cells with heading sectors) that the mask `dropped` (size,) selects;
-        all must be `untouched` (not visited recently, and not referred to). Return the new number
-        of each slot, -1 for deleted ones.
+        """Delete the slots (one per cell and heading sector) that the mask `dropped` (size,)
+        selects; all must be `untouched` (not visited recently, and not referred to). Return the new
+        number of each slot, -1 for deleted ones.
         """
         return self.store.drop(dropped)
 

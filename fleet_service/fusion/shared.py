@@ -104,9 +104,9 @@ class Shape(NamedTuple):
         """Return the slope (error of a friction value per unit of unused grip) that an alarm
         assumes: the upper end of its one-sided 95 % interval.
 
-        A new service assumes .5, and a service that has compared many passages of vehicles little
-        more than `reader`. Missed ice on tuning seeds: with .5 for all services, .044 of the icy
-        cell-minutes of a clean fleet had no alert; with this rule .010.
+        A new service assumes .5. A service that has compared many passages of vehicles assumes
+        little more than the slope of `reader`. Missed ice on tuning seeds: with .5 for all
+        services, .044 of the icy cell-minutes of a clean fleet had no alert; with this rule .010.
         """
         return self.reader + Z_95 * self.std
 

@@ -299,16 +299,17 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 @refcount_free_inlined
 def _remembered_parts(seconds: float) -> np.uint16:
-    """Convert a time [s], limited to FORGET_S, to an integer in units of 1/AGED s, as cell records
-    store it.
+    """Convert a duration [s], limited to FORGET_S, to the integer that cell records store, in units
+    of 1/AGED s.
     """
     return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
 
 
 @refcount_free_inlined
 def is_ice_source(entries: RecordArray, entry: int) -> bool:
-    """Return True if a visit supports an alert: by its value, or by the intervention of a slip
-    controller that no value of the visit contradicts.
+    """Return True if a visit supports an ice alert: by its friction value, or by an intervention of
+    a slip controller (ABS, ESC, traction control) that the visit's friction value does not
+    contradict.
 
     An intervention while little grip is used corroborates the reports of other vehicles. The
     intervention itself never changes the belief: the controller and the visit's likelihood observe
@@ -322,14 +323,16 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
-    """Return the evidence of one friction value for ice against grip [nat]: a log-likelihood ratio
-    that allows for an unknown tyre.
+    """Return the evidence [nat] that one observation (row `entry`) gives for ice (μ < SLIPPERY)
+    against grip (μ ≥ SLIPPERY), a log-likelihood ratio. It allows for the tyre-shape error: a
+    vehicle that uses only a part of the grip may report too low a value.
 
-    A vehicle that used grip u on a road μ may report a value that is too low, with a standard
-    deviation of d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the slope (error per
-    unit of unused grip) that an alarm assumes for an unknown fleet, because each report is judged
-    alone. Let L be the reported likelihood, scaled to maximum 1. The likelihood of grip is the
-    maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all roads μ ≥ SLIPPERY and readings r ≤ μ.
+    On a road of friction μ on which the vehicle used the grip u, this error has the standard
+    deviation d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the error per unit of
+    unused grip that alerts assume for a fleet about which nothing has been learned. Let L(r) be the
+    reported likelihood of a reading r, scaled to maximum 1, so that the likelihood of ice is 1. The
+    likelihood of grip is the maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all μ ≥ SLIPPERY and r ≤
+    μ. The result is minus its logarithm.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED

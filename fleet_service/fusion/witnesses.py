@@ -22,8 +22,8 @@ def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
 
 
 class StretchSources(NamedTuple):
-    """Vehicles that reported ice on the slippery stretches around k slots (cells with heading
-    sectors), the newest first.
+    """Vehicles that reported ice on the slippery stretches around k slots (one per cell and heading
+    sector), the newest first.
 
     Attributes:
         who: index of the vehicle, (k, n).
@@ -37,8 +37,8 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return the vehicles that reported ice on the slippery stretches of road around the slots
-    (cells with heading sectors) after the times `since` (k,) [ns]. Each vehicle occurs once per
+    """Return the vehicles that reported ice on the slippery stretches of road around the slots (one
+    per cell and heading sector) after the times `since` (k,) [ns]. Each vehicle occurs once per
     stretch.
     """
     along = stretch_slots(fusion, slots)

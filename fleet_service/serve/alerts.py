@@ -91,8 +91,8 @@ class Alerts:
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that are raised or cleared because the given slots (cells with heading
-        sectors), (k,), were updated.
+        """Return the alerts that are raised or cleared because the given slots (one per cell and
+        heading sector), (k,), were updated.
         """
         time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
@@ -117,9 +117,9 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return True if an alert may be raised under the limit for idle roads. It may not if only
-        its supporting vehicles drive there and they have recently supported alerts in too many
-        other places.
+        """Return True if an alert may be raised under the limit for idle roads. On a road where
+        only the vehicles that report the ice drive, it may not be raised if these vehicles have
+        recently supported alerts in too many other places.
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -130,13 +130,13 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots (cells with heading sectors) in which enough vehicles support an alert.
-        Candidates are the updated slots (k,) and the other slots on their slippery stretches. A
-        "source" is a vehicle whose report supports an alert.
+        """Return the slots (one per cell and heading sector) in which an alert must be raised. A
+        "source" is a vehicle whose report supports the alert. Candidates are the updated slots (k,)
+        that have a source, and all slots on the same stretches of slippery road.
 
-        Neighbouring cells can confirm ice in a cell, but they are not enough alone. Each returned
-        slot either has a source of its own and is likely slippery by its own reports, or lies
-        between cells with sources.
+        Two conditions must hold. First, enough vehicles are sources, in the cell itself or on the
+        stretch. Second, the cell has a source of its own and is probably slippery by its own
+        reports, or it lies between two cells with sources.
         """
         fusion = self._fusion
         slots = slots[self._own_sources(slots, ICE)[:, 0] > 0]
@@ -162,10 +162,10 @@ class Alerts:
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
-        """Return a mask of slots (cells with heading sectors), (k,): True if the alert may be
+        """Return a mask of slots (one per cell and heading sector), (k,): True if the alert may be
         cleared. Within the hour before the last report, at least two more vehicles must have
-        reported grip than ice. If the map remembers only SOURCES vehicles per cell, SOURCES reports
-        of grip are enough.
+        reported grip than ice. The map remembers at most SOURCES vehicles per cell and side, so
+        SOURCES reports of grip are always enough.
         """
         grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)

@@ -62,8 +62,8 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
 
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """Return the cells of `slots` (cells with heading sectors) as a table with the columns of the
-    published map, with friction and its interval for the time `now` [ns].
+    """Return the cells of `slots` (one per cell and heading sector) as a table with the columns of
+    the published map, with friction and its interval for the time `now` [ns].
     """
     return pa.Table.from_batches([batch_of(view_cells(fusion, slots, now), now)])
 

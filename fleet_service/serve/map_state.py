@@ -34,8 +34,8 @@ class MapState:
         self.change = 0  # counter of changes
 
     def mark_changed(self, slots: IntArray) -> None:
-        """Record that slots (cells with heading sectors) were updated, so that their tiles count as
-        changed.
+        """Record that slots (one per cell and heading sector) were updated, so that their tiles
+        count as changed.
         """
         self._index()
         self.change += 1
@@ -72,7 +72,7 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """Return the number of slots (cells with heading sectors) of a tile."""
+        """Return the number of slots (one per cell and heading sector) of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:

@@ -221,7 +221,7 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Publish (copy for readers) those of the slots (cells with heading sectors) that have
+        """Publish (copy for readers) those of the slots (one per cell and heading sector) that have
         become clearly more slippery than readers see.
         """
         current = self._fusion.beliefs(slots, now)
@@ -233,7 +233,7 @@ class PublicCells:
         self._pending[slots[self._shown[slots]]] = 0
 
     def _copy(self, slots: IntArray) -> None:
-        """Copy the current state of the slots (cells with heading sectors) to the public copy,
+        """Copy the current state of the slots (one per cell and heading sector) to the public copy,
         which readers see.
         """
         live = self._fusion.store.state.live
@@ -241,7 +241,7 @@ class PublicCells:
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add new slots (cells with heading sectors) to the public copy, in the state of an
+        """Add new slots (one per cell and heading sector) to the public copy, in the state of an
         unvisited cell. The memory is doubled when it is full, so that this is rare.
         """
         if self._size == self._fusion.size:

@@ -115,8 +115,8 @@ class TileCache:
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
-        """Return the cells of public slots (cells with heading sectors) in the form that readers
-        see.
+        """Return the cells of public slots (one per cell and heading sector) in the form that
+        readers see.
         """
         return self.coarse(view_cells(self.source, slots, now))
 

@@ -76,7 +76,7 @@ class Readable(Protocol):
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return a copy of the state of `slots` (cells with heading sectors), with beliefs
+    """Return a copy of the state of `slots` (one per cell and heading sector), with beliefs
     (probabilities of each friction) for the time `now` [ns]. The map may be updated afterwards
     without changing the copy.
     """

@@ -98,8 +98,8 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Enlarge the memory for new slots (cells with heading sectors). The memory is doubled when
-        it is full, so that this is rare.
+        """Enlarge the memory for new slots (one per cell and heading sector). The memory is doubled
+        when it is full, so that this is rare.
         """
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)

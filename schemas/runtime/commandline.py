@@ -2,7 +2,7 @@
 mode.
 
 Exit codes: 0 success, 1 finished but something failed or is left to do, 2 misuse or bad input, 3
-not plausible (edge-agent), 130 ended by Ctrl-C.
+implausible signals (edge-agent), 130 ended by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -222,7 +222,8 @@ def refuse_input_path(field: str, out: Path, inputs: Sequence[Path]) -> None:
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """Return the completion script for a shell.
+    """Return the script by which a shell completes this program's commands and options at the tab
+    key.
 
     Raises:
         InputError: the shell is not supported.

@@ -25,8 +25,10 @@ class Figure:
 
     Attributes:
         name, value, unit: the measurement.
-        bar: target (limit) for the value; a pair for "within"; None if there is no target.
-        better: side of the target on which the value must lie.
+        bar: target (limit) for the value; if `better` is "within", a pair of limits; None if there
+            is no target.
+        better: "less" or "more": the side of the target on which the value must lie; "within":
+            between both limits.
     """
 
     name: str

@@ -25,8 +25,8 @@ Function: TypeAlias = Callable[[float], float]
 
 
 def intrinsic_of(name: str) -> object:
-    """Return the Numba intrinsic (function made of given machine code) that `lane_types` defines
-    under `name`.
+    """Return the Numba intrinsic (function whose LLVM code this project generates itself) that
+    `lane_types` defines under `name`.
     """
     return load_intrinsic("schemas.runtime.lane_types", name)
 

@@ -1,9 +1,10 @@
-"""Build of a shared library of native kernels (see `native_kernels`) with Numba, LLVM and the
+"""Build of the shared library of native kernels (see `native_kernels`) with Numba, LLVM and the
 system's linker.
 
-A recorder takes the place of the library while a program calls its kernels. It records them with
-the types of their arguments. Each becomes a C function of the library, with the machine code that
-Numba itself would run.
+A *kernel* is a compiled numerical function. First, a program runs with a `CallRecorder` instead of
+a library; it records which kernels are called, and with which types of arguments. Then each
+recorded kernel becomes a C function of the library, with the machine code that Numba itself would
+run.
 """
 
 # the types are Numba's and LLVM's own
@@ -46,7 +47,9 @@ RESULTS: Final = (types.none, types.int64)
 
 
 class CallRecorder(Library):
-    """Empty library that records the calls of kernels and does not run them."""
+    """Stand-in for a library that has no kernels: it records each call of a kernel and does not run
+    it.
+    """
 
     def __init__(self) -> None:
         super().__init__(None)
@@ -91,11 +94,13 @@ def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 def _stop_before_machine_code() -> None:
-    """Let Numba leave each function that it compiles as it is: neither merge it with the functions
-    that it calls nor optimise it nor make machine code.
+    """Within the context, stop Numba's compilation of a function after its LLVM code. Numba then
+    does not merge it with the functions that it calls, does not optimise it and makes no machine
+    code.
 
-    A kernel is compiled before. Its code must not change after that: where multiplication and
-    addition are fused, the optimiser decides on the last bit.
+    The kernel itself has been compiled before this context begins. Its code must not be optimised a
+    second time: the optimiser may fuse other multiplications and additions, which changes the last
+    bit of results.
     """
     library: Any = codegen.JITCodeLibrary
     library.finalize = _mark_finalized
@@ -126,7 +131,9 @@ def _float_of(context: Any, word: Any) -> Any:  # noqa: ARG001
 
 
 class _Adapter:
-    """Source text of a function that makes a kernel's arguments from words and calls the kernel."""
+    """Source text of a function ("adapter") that builds a kernel's arguments from a row of 64-bit
+    words (see `native_kernels`) and calls the kernel.
+    """
 
     def __init__(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
         self._words = HEADER
@@ -139,7 +146,9 @@ class _Adapter:
         self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
 
     def make_function(self, *, returns: bool) -> Callable[..., Any]:
-        """Return the function: it calls the kernel, stores the result, and sets the mark."""
+        """Return the Python function made from the source text. It calls the kernel, stores the
+        result in word 1 if the kernel returns one, and sets word 0 to 1, the mark of completion.
+        """
         result = "words[1] = " if returns else ""
         text = f"def {ADAPTER}(words):\n    {result}{self._call}\n    words[0] = 1\n"
         exec(text, self._known)
@@ -155,8 +164,8 @@ class _Adapter:
         return name
 
     def _expression(self, value: Any) -> str:
-        """Return the expression for an argument; the order of words is that of
-        `describe_type`.
+        """Return the source text that builds one argument of the kernel from the next words; they
+        have the order in which `describe_type` appends them.
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))
@@ -172,8 +181,8 @@ class _Adapter:
 
 
 def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, *, returns: bool) -> Any:
-    """Compile a C function with the name `symbol` that calls a kernel; return Numba's library of
-    it.
+    """Compile the adapter of a kernel (see `_Adapter`) as a C function with the name `symbol`;
+    return the Numba code library that contains it.
     """
     function = _Adapter(kernel, arguments).make_function(returns=returns)
     words = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
@@ -183,8 +192,9 @@ def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, *, re
 
 
 def _merge_modules(whole: Any, overload: Any, adapter: Any, symbol: str) -> None:
-    """Add a kernel, its adapter and the functions that the adapter calls to the module `whole`. The
-    kernel contains the functions that it calls itself.
+    """Add the LLVM code of a kernel, of its adapter (see `_Adapter`) and of the functions that the
+    adapter calls to the LLVM module `whole`. The code of a kernel already contains all functions
+    that it calls.
     """
     visible = {symbol, overload.fndesc.llvm_func_name}
     code = overload.library._get_module_for_linking().clone()
@@ -209,8 +219,9 @@ def _hide_functions(module: Any, visible: set[str], linkage: str) -> None:
 
 
 def _emit_object(whole: Any, symbols: list[str], numba_codegen: Any) -> bytes:
-    """Return object code of a module, of which only `symbols` are visible. Processor and options
-    are those with which Numba makes machine code.
+    """Return the object code of the LLVM module `whole`, in which only the functions `symbols` are
+    visible to other programs. It is made for the same processor and with the same options as
+    Numba's own machine code.
     """
     for function in [one for one in whole.functions if one.is_declaration]:
         if function.name.startswith(RUNTIME):

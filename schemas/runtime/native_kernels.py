@@ -1,9 +1,11 @@
-"""Kernels of a shared library that was compiled before: they run without Numba and LLVM, which take
-60 MB and half a second of a process.
+"""Kernels (compiled numerical functions) that are taken from a shared library, which was compiled
+before the program was started. They run without Numba and LLVM, whose import takes 60 MB and half a
+second.
 
-Each function of the library is a kernel for certain types of arguments. Its only argument is a row
-of 64-bit words: a mark that the kernel has completed, its result, and the parts of its arguments.
-The types are part of the function's name. A call with other types uses the kernel's Numba version.
+Each function of the library is one kernel for fixed types of arguments; the types are part of the
+function's name. Its only argument is the address of a row of 64-bit words: a mark that the kernel
+has completed, its result, and then the parts of its arguments. For a call with other types, Numba
+compiles the kernel.
 """
 
 from __future__ import annotations
@@ -25,11 +27,13 @@ LARGEST: Final = 1 << 63
 
 
 class OtherTypesError(TypeError):
-    """The arguments have types that no native kernel takes."""
+    """Error: an argument of a call has a type that no kernel of a shared library accepts."""
 
 
 class Library:
-    """Shared library of native kernels; `path` None: an empty library."""
+    """Shared library of kernels (compiled numerical functions); if `path` is None, a library
+    without functions.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._functions = None if path is None else ctypes.CDLL(os.fspath(path))
@@ -39,12 +43,16 @@ class Library:
         return None if self._functions is None else getattr(self._functions, name, None)
 
     def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
-        """Call a kernel that the library lacks: run its Numba version, and return the result."""
+        """Run the Numba version of a kernel that the library does not contain, and return the
+        result.
+        """
         return kernel.numba_kernel(*arguments)
 
 
 class NativeKernel:
-    """Kernel that runs from a shared library, or, where that lacks it, by Numba."""
+    """Kernel (compiled numerical function) that runs from the shared library, or is compiled by
+    Numba if the library does not contain it for the types of the arguments.
+    """
 
     def __init__(
         self,
@@ -60,7 +68,7 @@ class NativeKernel:
 
     @functools.cached_property
     def numba_kernel(self) -> Callable[..., Any]:
-        """The Numba version of the kernel; it is compiled at its first use."""
+        """Return the Numba version of the kernel; Numba compiles it at its first call."""
         return self._compile()
 
     def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 differs by kernel
@@ -83,8 +91,9 @@ class NativeKernel:
 
 
 class NativeIntrinsic:
-    """Intrinsic of Numba in a process that uses native kernels: Numba's own is loaded when Numba
-    compiles a function that calls it.
+    """Placeholder for a Numba intrinsic (function whose LLVM code this project generates itself) in
+    a process that uses native kernels. The intrinsic is loaded only when Numba compiles a function
+    that calls it.
     """
 
     def __init__(self, load: Callable[[], Any]) -> None:
@@ -92,20 +101,24 @@ class NativeIntrinsic:
 
     @functools.cached_property
     def numba_intrinsic(self) -> Any:  # noqa: ANN401 the types are Numba's own
-        """The intrinsic of Numba."""
+        """Return the Numba intrinsic itself, and load it if necessary."""
         return self._load()
 
 
 def symbol_of(name: str, types: str) -> str:
-    """Return the symbol of the kernel `name` for arguments of the given types."""
+    """Return the name that the kernel `name`, for arguments of the given types, has in the shared
+    library.
+    """
     digest = hashlib.blake2b(f"{name}({types})".encode(), digest_size=16)
     return f"gripmap_{digest.hexdigest()}"
 
 
 def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 whatever a kernel takes
-    """Return the type of an argument as text, and append its parts to `words`.
+    """Return the type of a kernel's argument as text, and append the 64-bit words that represent
+    the argument to `words`.
 
-    An array is its address and its shape, a tuple its elements, a number itself.
+    An array is represented by its address and its shape, a tuple by the words of its elements, and
+    a number by itself.
 
     Raises:
         OtherTypesError: the argument is neither a number nor a contiguous array that may be

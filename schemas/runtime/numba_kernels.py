@@ -41,8 +41,9 @@ event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 
 @typeof_impl.register(NativeKernel)
 def _typeof_native_kernel(kernel: NativeKernel, _: object) -> types.Dispatcher:
-    """Let functions that Numba compiles call a native kernel (function from a shared library): they
-    get Numba's own version of this kernel.
+    """Let functions that Numba compiles call a native kernel (function from a shared library).
+    Numba asks for the type of `kernel`; return that of the kernel's Numba version, so that the call
+    uses this version.
     """
     dispatcher: Any = kernel.numba_kernel
     return types.Dispatcher(dispatcher)
@@ -50,8 +51,9 @@ def _typeof_native_kernel(kernel: NativeKernel, _: object) -> types.Dispatcher:
 
 @typeof_impl.register(NativeIntrinsic)
 def _typeof_native_intrinsic(made: NativeIntrinsic, _: object) -> types.Type:
-    """Let functions that Numba compiles call an intrinsic (function made of given machine code):
-    they get Numba's own version, which may be loaded only at this moment.
+    """Let functions that Numba compiles call an intrinsic (function whose LLVM code this project
+    generates itself). Numba asks for the type of the placeholder `made`; return that of the
+    intrinsic, which is loaded now if necessary.
     """
     intrinsic = made.numba_intrinsic
     for context in (cpu_target.typing_context, cpu_target.target_context):

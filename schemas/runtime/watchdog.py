@@ -26,14 +26,13 @@ def notify_alive() -> None:
 
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
-    """Notify the service manager repeatedly that the process is ready and waiting, until
-    `notify_alive` is called.
-
-    A thread sends the signals, because a waiting process may be busy for a long time.
+    """Start a thread that notifies systemd, again and again, that the process works, while the
+    process waits (a standby service, for example) and cannot call `notify_alive` regularly. The
+    first call of `notify_alive` ends the thread.
 
     Returns:
-        a function that the process must call repeatedly; the signals stop `most_s` seconds after
-        its last call.
+        a function that the waiting code must call repeatedly. The thread stops `most_s` seconds
+        after its last call; systemd then restarts the process, because the waiting code hangs.
     """
     last = time.monotonic()
     every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4

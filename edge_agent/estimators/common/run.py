@@ -52,8 +52,8 @@ def kernel_of(
     Args:
         begin: starts the filter at the sample in memory.track.
         step: predicts by the given seconds and updates; returns False if the filter has diverged.
-        report: writes motion and friction into the output; returns the friction [1] that is used to
-            decide whether a wheel slides.
+        report: writes motion and friction into the output; returns the friction [1] above which a
+            wheel counts as sliding.
     """
 
     @nogil

@@ -44,8 +44,10 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return all corrections to write into a profile (assignment of signals to channels): the
-    findings (faults), and the small lags in the same form."""
+    """Return all corrections that must be written into a profile (assignment of signals to
+    channels): the faults that the signal doctor has found, and the delays that are too small to
+    count as faults (`small_lags`), as findings of the kind "clock".
+    """
     lags = small_lags(diagnosis)
     return [
         *diagnosis.findings,
@@ -56,8 +58,9 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Return the profile (assignment of signals to channels) and the vehicle file, both corrected
-    by the findings (faults), and the findings that cannot be corrected in either of them.
+    """Correct the faults `findings` in the profile (assignment of signals to channels) and in the
+    vehicle file. Return the corrected profile, the corrected vehicle file, and those faults that
+    cannot be corrected in either of them.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

@@ -1,15 +1,19 @@
-"""Live sources in the notation of the command line: `kind:address?option=value`.
+"""Live sources of vehicle signals, in the notation of the command line:
+`kind:address?option=value&option=value`.
 
-source                                   is
-can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its
-                                         number in the profile (else that in the channel's name),
-                                         other options are those of the interface
-ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0);
-                                         `frames=/can0` is a topic of can_msgs/Frame;
-                                         `messages=FOLDER` has PACKAGE/NAME.msg of your own types
-vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with
-                                         `token=FILE` authenticated
-gpsd:127.0.0.1:2947                      a gpsd
+can:socketcan/can0, can:virtual/bench    CAN bus read by the library python-can; the address is its
+                                         interface and channel. Option `bus`: number of this bus in
+                                         the profile (by default the number in the channel's name).
+                                         Other options are passed to python-can.
+ros2:tcp/127.0.0.1:7447                  topics of ROS 2 (rmw_zenoh), received from the Zenoh router
+                                         at this address. Option `domain`: ROS domain (default 0);
+                                         `frames=/can0`: topic that carries CAN frames
+                                         (can_msgs/Frame); `messages=FOLDER`: folder with the
+                                         definitions PACKAGE/NAME.msg of your own message types
+vss:127.0.0.1:55555                      Kuksa databroker at this address. Option `ca=FILE`:
+                                         certificate authority, for TLS; `token=FILE`: token by
+                                         which the agent authenticates itself
+gpsd:127.0.0.1:2947                      position receiver, through the gpsd at this address
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""The two experiments of paper 004 under its conditions: noise only on the accelerations a_x, a_y
-and the yaw rate r, exact inputs, start at the true state.
+"""The two experiments of paper 004 (constant and variable measurement noise) under the conditions
+of the paper: noise only on the accelerations a_x, a_y and the yaw rate r, inputs of the filter
+without error, and a start at the true state.
 
-The experiments check the implementation. They do not test whether the filter can estimate friction,
-because friction is known at the start. Therefore the targets and the printed tables are for v_x,
-v_y and the yaw rate. The simulated tyre curve is a Magic Formula, and the variable noise is on all
-three channels; `papers.reproduction_004` has Dugoff tyres, and the paper's noise on a_y alone.
+The experiments check that the filter is implemented correctly. They do not test whether it can
+estimate friction, because the filter starts with the true friction. Therefore the targets and the
+printed tables are for v_x, v_y and the yaw rate. Here the simulated car has Magic Formula tyres,
+and the variable noise is on a_x, a_y and r. In `papers.reproduction_004` the car has Dugoff tyres,
+as in the paper, and the variable noise is on a_y only.
 """
 
 from __future__ import annotations

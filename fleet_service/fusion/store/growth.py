@@ -72,8 +72,8 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     observation in a window move to the settled pairs, which are sorted records without free space.
     Reports that are not remembered at `now` [s] are deleted.
 
-    `names` (V,) are the records of the vehicles, and `size` is the number of slots (cells with
-    heading sectors) in use.
+    `names` (V,) are the records of the vehicles, and `size` is the number of slots (one per cell
+    and heading sector) in use.
     """
     most = int(state.used[PAIRS])  # of which there will be as many again
     reports, values = drop_reports(state, names, now)
@@ -102,7 +102,7 @@ def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
 def rebuild_reporters(state: State, size: int, least: int) -> State:
     """Return the fusion's state without the lists of recent reporters whose last report was before
     `least` [s]. Cells with observations that are not yet final keep their lists. `size` is the
-    number of slots (cells with heading sectors) in use.
+    number of slots (one per cell and heading sector) in use.
     """
     live = state.live
     cells = live.cells[:size]

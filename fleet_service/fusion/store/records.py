@@ -299,7 +299,7 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """State of slots (cells with heading sectors), in three arrays.
+    """State of slots (one per cell and heading sector), in three arrays.
 
     Attributes:
         belief: packed beliefs, (n, 32).
@@ -324,9 +324,9 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: the slots (cells with heading sectors) in the state before the recent observations in
-            their windows, one row per row of `windows`; of the reporters only the sources are
-            copied.
+        base: the slots (one per cell and heading sector) in the state before the recent
+            observations in their windows, one row per row of `windows`; of the reporters only the
+            sources are copied.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the records of active pairs.

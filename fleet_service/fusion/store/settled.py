@@ -178,7 +178,9 @@ def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
 
 @compiled
 def find_resting(pairs: RecordArray) -> IntArray:
-    """Return the rows of the active pairs without an observation in a window."""
+    """Return the rows of the active pairs (one vehicle in one slot each) that have no observation
+    in a lateness window, so that they can be settled.
+    """
     out = np.empty(len(pairs), np.int64)
     count = 0
     for row in range(len(pairs)):
@@ -192,9 +194,9 @@ def find_resting(pairs: RecordArray) -> IntArray:
 def count_settling(
     state: State, names: RecordArray, resting: IntArray, now: int
 ) -> tuple[int, int]:
-    """Return the number of reports of pairs (rows `resting` (k,), sorted by slot and vehicle) that
-    are remembered at `now` [s], and the number of values among them. Pairs without such a report
-    are recorded in their cells as visitors.
+    """Return two numbers: the reports of inactive pairs (one vehicle in one slot each) that are
+    still remembered at `now` [s], and the friction values among them. `resting` (k,) are the rows
+    of the pairs. If a pair has no such report, record in its cell that the vehicle has visited it.
     """
     bounds = 0
     values = 0
@@ -214,11 +216,13 @@ def count_settling(
 def insert_reports(
     state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
 ) -> None:
-    """Insert the reports of pairs (rows `resting` (k,), sorted by slot and vehicle) that are
-    remembered at `now` [s] into the settled reports, beginning with the last one.
+    """Merge the reports of inactive pairs (one vehicle in one slot each) into the sorted settled
+    reports. Reports that are no longer remembered at `now` [s] are left out.
 
-    There are `reports` settled reports, `values` of which are values; the arrays have room for the
-    additional ones at their ends. `vehicles` is the number of known vehicles.
+    `resting` (k,) are the rows of the pairs, sorted by slot and vehicle. `reports` is the number of
+    settled reports before the call, and `values` the number of friction values among them. The
+    caller has lengthened the arrays by exactly the number of new reports. Therefore rows are moved
+    in place, from the last to the first. `vehicles` is the number of known vehicles.
     """
     begins = state.settled_begin
     keys = state.settled_keys

@@ -59,11 +59,11 @@ class Store:
     """Complete state of a fusion, empty at first.
 
     Attributes:
-        state: arrays for compiled code.
-        peers: record of each vehicle with its comparisons with other vehicles.
-        names: record of each vehicle with its permanent number; the first `vehicles` are in use.
-        size, vehicles: number of slots (cells with heading sectors) and of vehicles in use.
-        forgotten_at: time [s] for which old records of vehicles in cells were last deleted.
+        state: arrays for compiled code. peers: record of each vehicle with its comparisons with
+        other vehicles. names: record of each vehicle with its permanent number; the first
+        `vehicles` are in use. size, vehicles: number of slots (one per cell and heading sector) and
+        of vehicles in use. forgotten_at: time [s] for which old records of vehicles in cells were
+        last deleted.
     """
 
     def __init__(self) -> None:
@@ -113,7 +113,7 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """Return the state of all slots (cells with heading sectors) as columns."""
+        """Return the state of all slots (one per cell and heading sector) as columns."""
         return cells_of(self.state.live)
 
     @property
@@ -145,8 +145,8 @@ class Store:
 
     @property
     def table(self) -> IntArray:
-        """Return the hash table in which compiled code finds slots (cells with heading sectors) by
-        key.
+        """Return the hash table in which compiled code finds slots (one per cell and heading
+        sector) by key.
         """
         return self._slots
 
@@ -234,8 +234,8 @@ class Store:
             self.state = rebuild_reporters(self.state, self.size, now - _HOUR - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (cells with heading sectors), (size,): True if the last visit of a
-        vehicle was before `before` [ns] and no other record refers to the slot.
+        """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit
+        of a vehicle was before `before` [ns] and no other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -246,9 +246,9 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Delete the slots (cells with heading sectors) that the mask `gone` (size,) selects; all
-        must be `untouched` (not visited recently, and not referred to). Return the new number of
-        each slot, NONE for deleted ones.
+        """Delete the slots (one per cell and heading sector) that the mask `gone` (size,) selects;
+        all must be `untouched` (not visited recently, and not referred to). Return the new number
+        of each slot, NONE for deleted ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)

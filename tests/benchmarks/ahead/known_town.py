@@ -20,8 +20,8 @@ SPREAD = 0.06  # standard deviation that the map states for a cell, and that of 
 
 
 class KnownPlaces(NamedTuple):
-    """Map places (cells with heading sector) through which the lanes of a scenario lead, each once,
-    (n,): key (cell·4 + heading sector), and smallest true friction.
+    """Map places (one per cell and heading sector) through which the lanes of a scenario lead, each
+    once, (n,): key (cell·4 + heading sector), and smallest true friction.
     """
 
     key: IntArray
@@ -29,8 +29,8 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """Return the map places (cells with heading sector) of a scenario's lanes, with their friction
-    at t [s].
+    """Return the map places (one per cell and heading sector) of a scenario's lanes, with their
+    friction at t [s].
     """
     points = scenario.network.points
     x = points[:, LanePoint.X]

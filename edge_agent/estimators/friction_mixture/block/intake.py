@@ -134,8 +134,8 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
 
 @compiled
 def _drop_outlier(value: float, used: float, read: float) -> float:
-    """Return the accelerometer's reading `value` [m/s^2], or NaN if it is far from two values:
-    `used`, the last accepted reading, and `read`, the last reading of any kind.
+    """Return the accelerometer's reading `value` [m/s^2], or NaN if it differs by more than
+    JUMP_M_S2 from both `used` (last accepted reading) and `read` (last reading, accepted or not).
     """
     jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
     return math.nan if jumps else value

@@ -9,14 +9,14 @@ the axles. It is also an input of the rules that decide how much of the evidence
 used.
 
 **Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds, or
-that the axles' innovations have FACTOR times the stated variance. The second happens with delayed
-steering signals or on the banking of a race track. Ice that explains the data does not count
-against the model, nor do unusual states alone. The sum of the log-likelihood ratios against the
-model is `odd` [nat]; old terms fade within minutes. Straight driving does not count in favour of
-the model, because the model cannot fail there. Once `odd` reaches the threshold `odd_least`, the
-filter draws no conclusions. The friction interval and the vehicle states then return to their
-prior, and the axles do not affect the motion. The test leaves out slides, slippery road and walking
-pace (`unexplained_ratio`).
+that the axles' innovations have FACTOR times the stated variance. The second case occurs with
+delayed steering signals or on the banking of a race track. Data that ice explains do not count
+against the model, and neither do unusual vehicle states alone. The sum of the log-likelihood ratios
+against the model is `odd` [nat]; old terms fade within minutes. Straight driving does not count in
+favour of the model, because the model cannot fail there. Once `odd` reaches the threshold
+`odd_least`, the filter draws no conclusions. The friction interval and the vehicle states then
+return to their prior, and the axles do not affect the motion. The test leaves out slides, slippery
+road and walking pace (`unexplained_ratio`).
 
 While the filter draws no conclusions, the model cannot be tested. After `patience` [s] the filter
 tries it again. Each further contradiction makes that time four times as long, because sensors do

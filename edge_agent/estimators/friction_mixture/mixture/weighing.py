@@ -71,8 +71,9 @@ def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Advance all groups of active nodes (filters of one friction hypothesis each) by one block
     (0.05 s). Mix their states after a road change, apply the measurements, and predict to the
-    block's end. Store the NIS (squared innovation over its variance) and the predictive
-    log-likelihood of the mixture.
+    block's end. Store the predictive log-likelihood of the mixture and its NIS (squared
+    innovations, that is, measurement minus prediction, over their variances; mean over the
+    measurements).
     """
     features = scratch.features
     inflation = max(design.constants.correlation_time / features.duration, 1.0)
@@ -127,13 +128,14 @@ def mixture_likelihood(scratch: Scratch, groups: int) -> float:
 
 @compiled
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Replace scratch.log_likelihood [nat] of each node (friction hypothesis) by the evidence that
-    counts for the block (0.05 s): rules weaken (temper) the likelihood.
+    """Weaken (temper) the log-likelihood [nat] of each node (friction hypothesis) for a block (0.05
+    s), in scratch.log_likelihood. The weight, 0 to 1, with which it counts comes from fuzzy rules,
+    or from a formula if the filter is not adaptive.
 
     A node whose friction is below the grip in use is always penalised, at any tyre force. Once the
-    filter accepts that measurements contradict the model, no evidence is used. Without
-    accelerations, yaw rate or steering, sliding cannot be distinguished from rolling, so no
-    evidence on friction is used either.
+    consistency test (`trust.py`) finds that the measurements contradict the model, no evidence is
+    used. Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling,
+    so no evidence on friction is used either.
     """
     constants = design.constants
     features = scratch.features
@@ -181,8 +183,9 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the share, 0 to 1, of the evidence from slip that counts at the speed `vx` [m/s]: 0 up
-    to SLOWEST_M_S, 1 from twice that speed.
+    """Return the weight, 0 to 1, of the evidence from slip at the speed `vx` [m/s] or, if a wheel
+    is faster, at the speed of the fastest wheel: 0 up to SLOWEST_M_S, 1 from twice that speed. At
+    low speed, slip is a quotient of small numbers.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -221,19 +224,20 @@ def update_novelty(
 
 @compiled
 def saturation(slip: float, mu: float) -> float:
-    """Return the fuzzy truth value, 0 to 1, of "the axle slides" on friction `mu`.
+    """Return the degree, 0 to 1, to which an axle slides on a road with friction `mu` [1].
 
-    `slip` is in units of the force over load of a linear tyre [1]. The result is 0 up to a slip of
-    mu and 1 from 1.5 mu on; 0 where the slip is unknown.
+    `slip` is expressed as the force over load [1] that a tyre of constant stiffness would have at
+    this slip. The degree is 0 up to a slip of mu, 1 above a slip of 1.5 mu, and linear between
+    them. It is 0 if the slip is NaN (unknown).
     """
     return 0.0 if math.isnan(slip) else min(max(2.0 * (abs(slip) / mu - 1.0), 0.0), 1.0)
 
 
 @compiled
 def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
-    """Return the absolute difference between a value `now` and its usual value usual[i] (a moving
-    average), and move usual[i] towards `now`. `keep` is the weight of the old value. Return 0 if
-    `now` is NaN.
+    """Return the absolute difference between the current value `now` of a quantity and its moving
+    average usual[i]. Then update the average: `keep` is the weight of the old average, 1 - keep
+    that of `now`. Return 0 if `now` is NaN.
     """
     if math.isnan(now):
         return 0.0
@@ -260,8 +264,8 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Update the actual and expected variance of the innovations (measurement minus prediction),
-    averaged over the last blocks (of 0.05 s). Compute from them the factors on the measurement
-    noise R for the next block.
+    averaged over the latest blocks (of 0.05 s each). Compute from them the factors on the
+    measurement noise R for the next block.
     """
     keep = math.exp(-scratch.features.duration / design.constants.window)
     for group in range(2):
