@@ -55,22 +55,22 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """Result of one simulated drive of all cars, computed from the simulator's true values."""
+    """Result of one simulated drive of all cars. It is computed from the simulator's true values;
+    "new ice" is the ice that appears during the drive. A lap is one passage of a car over it.
+    """
 
-    slid: set[tuple[int, int]] = field(
-        default_factory=set
-    )  # (vehicle, lap) that lost grip on the new ice
-    passed: set[tuple[int, int]] = field(default_factory=set)  # ... and that were there
-    alert_passes: float = float("nan")  # over the new ice until its first alert
-    inside: list[bool] = field(
-        default_factory=list
-    )  # whether the truth lies in the map's interval, by cell
-    visits: int = 0  # that were fused
-    alerts: int = 0  # on the new ice
-    warnings: int = 0
-    known_error: list[tuple[float, float]] = field(
-        default_factory=list
-    )  # |error| in a known cell: with, without
+    # (vehicle, lap) of the laps in which a wheel lost its grip on the new ice
+    slid: set[tuple[int, int]] = field(default_factory=set)
+    # (vehicle, lap) of all laps
+    passed: set[tuple[int, int]] = field(default_factory=set)
+    alert_passes: float = float("nan")  # number of laps before the first alert of the new ice
+    # per cell that several vehicles visited: True if the map's interval contains the true friction
+    inside: list[bool] = field(default_factory=list)
+    visits: int = 0  # number of visits (passages of a cell) that were fused into the map
+    alerts: int = 0  # number of alerts on the new ice
+    warnings: int = 0  # number of warnings that the cars gave
+    # absolute error of the friction estimate in cells that the map knows: with and without the map
+    known_error: list[tuple[float, float]] = field(default_factory=list)
 
 
 class ListeningTown:
@@ -114,8 +114,9 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Return, for each cell and sector that several vehicles visited, True if the map's
-        interval contains the last true friction.
+        """Compare the map with the true friction at the end of the drive. Return, for each cell and
+        heading sector that several vehicles visited, True if the friction interval of the map
+        contains the true friction of the last visit.
         """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -284,8 +285,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """Return the figures that compare drives in which the cars receive the map and its alerts with
-    drives in which they do not.
+    """Return the figures of the comparison between two groups of simulated drives: with the same
+    seeds, the cars receive the map and its alerts in the drives `with_`, and receive nothing in the
+    drives `without`.
     """
     slid, before = (
         sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without)

@@ -135,8 +135,8 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """Return the options for access to the bucket (setting `store`) by name, with secrets in
-        plain text.
+        """Return the options of the setting `store` by name, with which the archive's bucket
+        (object store) is opened. Secrets are in plain text.
         """
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
@@ -259,8 +259,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """Convert an ISO 8601 date, with or without a time of day, to ns since 1970. A time without a
-    zone is UTC.
+    """Convert the text of an ISO 8601 date, with or without a time of day, to nanoseconds since
+    1970. A time without a zone is UTC.
 
     Raises:
         InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.
@@ -306,8 +306,8 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
 
 
 def explain(error: ValidationError, where: str) -> InputError:
-    """Return the first of pydantic's validation errors as an InputError that names the field and
-    the fix.
+    """Convert the first validation error that pydantic reports to an InputError, which names the
+    wrong field and states how to correct it.
     """
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"

@@ -26,8 +26,8 @@ Box = tuple[float, float, float, float]
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return True if two region expressions (key patterns that select regions) have a region in
-    common.
+    """Return True if there is a region that both region expressions (key patterns that select
+    regions) match.
     """
     return all(
         a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
@@ -42,7 +42,9 @@ def covers(wide: str, narrow: str) -> bool:
 
 
 def region_of(tile: int) -> str:
-    """Return the region expression (part of a key) of the region in which a tile lies."""
+    """Return the region expression (part of a key) that matches exactly the region in which a tile
+    lies.
+    """
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 

@@ -118,8 +118,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return a mask (n,) of the places (map cells with heading sector) in `found`: True if a place
-    is slippery with enough certainty for a warning.
+    """Return a mask (n,) of the places (one per map cell and heading sector) in `found`: True if a
+    place is slippery with enough certainty for a warning.
     """
     firm = (
         (found.basis == MEASURED)

@@ -233,7 +233,7 @@ class LocalMap:
         )
 
     def belief_at(self, key: int, now: int) -> FloatArray | None:
-        """Return the current belief about one place (map cell with heading sector), as
+        """Return the current belief about one place (one map cell and heading sector), as
         probabilities (32,) on the friction grid; None if the map has no recent measured value of
         the place.
         """
@@ -255,10 +255,10 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return arrays for n places (map cells with heading sector), given by their keys `key`
-        (n,). They are the belief (probabilities of friction, (n, 32)) and, each (n,), the basis
-        (origin of the values), the time of the last observation, the time of receipt and the number
-        of observing vehicles.
+        """Return arrays for n places (one per map cell and heading sector), given by their keys
+        `key` (n,). They are the belief (probabilities of friction, (n, 32)) and, each (n,), the
+        basis (origin of the values), the time of the last observation, the time of receipt and the
+        number of observing vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

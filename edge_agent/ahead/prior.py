@@ -60,7 +60,7 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # now
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
-        """Return the indices of the vehicles that entered another place (map cell with heading
+        """Return the indices of the vehicles that entered another place (one map cell and heading
         sector) since the last step. For these places, the caller must give the map's beliefs
         (probabilities of friction) to `step`.
         """

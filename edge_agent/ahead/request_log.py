@@ -93,8 +93,9 @@ class Tiles:
         return list(self._wanted)
 
     def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
-        """Update the set of map tiles whose alerts are needed; return (tiles to subscribe to, tiles
-        to unsubscribe from).
+        """Update the set of map tiles whose alerts the vehicle needs on the possible paths ahead.
+        Return two lists: the tiles to which it must subscribe now, and those from which it must
+        unsubscribe.
         """
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]

@@ -142,9 +142,9 @@ def _find_runs(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
-    """Group slippery stretches of several possible paths: stretches that share a place (map cell
-    with heading sector) belong to one group. Return a pair per group: all its places, and all its
-    stretches.
+    """Group slippery stretches of several possible paths: stretches that share a place (one map
+    cell and heading sector) belong to one group. Return a pair per group: all its places, and all
+    its stretches.
     """
     groups: list[tuple[frozenset[int], list[_Stretch]]] = []
     for stretch in stretches:

@@ -160,8 +160,9 @@ class HeldBatches:
         return {key for first, last in ranges for key in _keys_within(held, first, last)}
 
     def pop_oldest(self, kind: Kind) -> int | None:
-        """Return the key of the oldest batch of a kind, or None if there is none. Each call removes
-        the returned key from the order of age, so that the next call returns the next oldest.
+        """Return the key of the oldest batch of a kind, or None if there is none. The key is
+        removed from the list that is sorted by age, so that the next call returns the next oldest
+        batch.
         """
         oldest = self._oldest[kind]
         while oldest:
@@ -173,7 +174,7 @@ class HeldBatches:
     def is_passed_over(self, batch: HeldBatch) -> bool:
         """Return True if the service seems to ignore this batch. That is the case if the batch is
         the oldest one of its stream (vehicle, start, kind, region) in the outbox, and PASSED_OVER
-        later batches of the stream were settled (finally answered).
+        later batches of the stream were settled (acknowledged or refused by the service).
         """
         sequence = self._streams[batch.stream]
         later = sequence.next - batch.seq - len(sequence.held)

@@ -33,8 +33,8 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, 
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Batch on disk that no service has settled (finally answered). A new batch (`fresh`) is sent
-    immediately. Any other batch is sent when `due_batches` returns it.
+    """Batch on disk that no service has settled (acknowledged or refused by the service). A new
+    batch (`fresh`) is sent immediately. Any other batch is sent when `due_batches` returns it.
     """
 
     key: int
@@ -48,9 +48,9 @@ class StoredBatch:
 @dataclass
 class OutboxCounts:
     """Numbers of records by what happened to them in the outbox (store of batches on disk) of this
-    process. They were stored, settled (finally answered), evicted for lack of space, lost by damage
-    of the file, or given up because the service answers only later ones. `damages` is the number of
-    times that the file was found damaged.
+    process. They were stored, settled (acknowledged or refused by the service), evicted for lack of
+    space, lost by damage of the file, or given up because the service answers only later ones.
+    `damages` is the number of times that the file was found damaged.
     """
 
     stored: int = 0
@@ -63,8 +63,8 @@ class OutboxCounts:
 
 
 class Outbox:
-    """Store on disk of the batches of one agent process that no service has settled (finally
-    answered).
+    """Store on disk of the batches of one agent process that no service has settled (acknowledged
+    or refused by the service).
 
     Attributes:
         held: the batches, without payloads; its counts may be read on any thread.
@@ -185,8 +185,8 @@ class Outbox:
                 self.counts.evicted[kind] += self._drop_batch(key)
 
     def delete_settled(self) -> None:
-        """Delete settled (finally answered) batches from the disk now, instead of with the next
-        `store`.
+        """Delete settled (acknowledged or refused by the service) batches from the disk now,
+        instead of with the next `store`.
 
         Raises:
             sqlite3.Error: the disk does not accept the change.

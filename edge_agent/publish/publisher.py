@@ -95,8 +95,8 @@ class Publisher:
         )
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled (finally answered) yet; see
-        `PublisherStatus`.
+        """Return the number of records that no service has settled (acknowledged or refused by the
+        service) yet; see `PublisherStatus`.
         """
         return self.status.count_unsettled(kind)
 

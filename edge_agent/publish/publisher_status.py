@@ -94,8 +94,9 @@ class PublisherStatus:
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled (finally answered). They are in
-        the outbox (store on disk), also from an earlier start, or not stored yet.
+        """Return the number of records that no service has settled (acknowledged or refused by the
+        service). These records are in the outbox (store on disk), where some may come from an
+        earlier start of the agent, or they are not stored yet.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

@@ -134,8 +134,9 @@ def is_damage(error: sqlite3.Error) -> bool:
 
 
 def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Open the file, checked and locked for this process; return it and the path of a damaged file
-    that was set aside, or None.
+    """Open an outbox's file, check it, and lock it for this process; return its database connection
+    and None. If the file is damaged, rename it, copy its readable content to a new file, and return
+    the connection of the new file and the path of the damaged one.
 
     Raises:
         InputError: the file belongs to another agent or is not an outbox, or the path cannot be
@@ -166,8 +167,8 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
 
 
 def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
-    """Return a new file with the readable content of a damaged file, and the path to which the
-    damaged file was renamed.
+    """Rename a damaged file, and copy its readable batches to a new file at `path`. Return the
+    database connection of the new file, and the path of the damaged one.
 
     Raises:
         sqlite3.Error, OSError: the disk does not accept the write.

@@ -74,16 +74,17 @@ class Endpoints:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Answer a hand-over request: shut the service down regularly, so that the standby (waiting
-        service) that the request names takes over.
+        """Answer a hand-over request, which names a standby (waiting service). If the standby is
+        ready, begin an orderly shutdown of this service, so that the standby takes over its
+        regions.
         """
         self._engine.holding.to = (
             handover.answer_request(query, session, self._config.regions) or self._engine.holding.to
         )
 
     def _answer_standing(self, asked: zenoh.Query) -> None:
-        """Answer a query for the active ("standing") alerts. Clients send it when they start,
-        because earlier messages do not reach them.
+        """Answer a query for the active ("standing") alerts. Clients send this query when they
+        start, because they did not receive the alerts that were published before.
         """
         expression = asked.key_expr
         with asked:

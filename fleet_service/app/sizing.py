@@ -71,9 +71,9 @@ COSTS: Final = Costs(
 
 
 class MemoryContent(NamedTuple):
-    """Content of a service's memory: numbers of vehicles, of cells (with heading sector), of pairs
-    of a vehicle and a cell that it visited lately, and of observations in the lateness window (the
-    last minutes, in which late reports are still used in order of time).
+    """Content of a service's memory: numbers of vehicles, of cells (counted once per heading
+    sector), of pairs of a vehicle and a cell that it visited lately, and of observations in the
+    lateness window (the last minutes, in which late reports are still used in order of time).
     """
 
     vehicles: float
@@ -88,7 +88,7 @@ class PlannedFleet(NamedTuple):
     Attributes:
         vehicles: number of vehicles on the road at the same time.
         rate_hz: observations per second of each vehicle; one per visited cell.
-        cells: number of cells (with heading sector) of all roads.
+        cells: number of cells (counted once per heading sector) of all roads.
         message_rows: observations per message.
         lateness_s: setting `lateness_s` of the service [s].
     """
@@ -153,8 +153,8 @@ def remembered_pairs(rate: float, values: float) -> float:
 
 
 def cells_of_roads(road_km: float, latitude: float) -> float:
-    """Return the number of cells (with heading sector, both directions) of roads of a total length
-    [km] at a latitude [deg].
+    """Return the number of cells (counted once per heading sector, so both directions count) of
+    roads of a total length [km] at a latitude [deg].
     """
     edge_m = _CELL_M * math.cos(math.radians(latitude))
     return _DIRECTIONS * _DIAGONAL * 1e3 * road_km / edge_m

@@ -228,8 +228,8 @@ def link_cells(cell: IntArray) -> IntArray:
 
 
 def _find_neighbours(cell: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the positions in `cell` of each pair of distinct cells at most LINK_CELLS apart, as
-    two arrays with one item per pair.
+    """Find all pairs of distinct cells that are at most LINK_CELLS apart. Return two arrays with
+    one item per pair: the indices in `cell` of the first and of the second cell.
     """
     column, row = (part.astype(np.int64) for part in grid.deinterleave(cell))
     key = column << 32 | row

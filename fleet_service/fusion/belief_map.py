@@ -47,8 +47,8 @@ class BeliefMap:
 
     @property
     def live(self) -> Cells:
-        """Return the current state of all cells (belief, counts, times) as columns; rows from
-        `size` on are unused.
+        """Return the current state of all cells (belief, counts, times) as columns; only the first
+        `size` rows are in use.
         """
         return self.store.live
 

@@ -90,13 +90,16 @@ def next_cell(cell: int, heading: int) -> int:
 
 @refcount_free_inlined
 def _write_message(message: FloatArray, weight: float, road: FloatArray, prior: FloatArray) -> None:
-    """Write the factors (32,) by which a neighbour with the belief `road` changes a belief."""
+    """Write to `message` (32,) the factors m by which a slippery neighbour multiplies the belief
+    about a cell. `weight` is w, `road` (32,) the neighbour's belief n, and `prior` (32,) the belief
+    p₀ about an unmeasured road.
+    """
     for i in range(_BINS):
         message[i] = 1.0 - weight + weight * road[i] / prior[i]
 
 
 class ReadRule(NamedTuple):
-    """Rule by which stored beliefs are read.
+    """Parameters for the computation of beliefs about the road from stored beliefs.
 
     Attributes:
         kernels: kernels (32, 32 each), which map a belief about measured friction to one about the
@@ -218,8 +221,9 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
 
 @refcount_free_inlined
 def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
-    """Lower P(slippery) of a belief `road` (32) in place to that of `quiet` (32), the belief after
-    weaker messages, but not below UNSURE: silence does not show grip.
+    """Lower P(slippery) of a belief `road` (32,) in place to that of `quiet` (32,), the belief with
+    weaker messages, but not below UNSURE. The reason for the weaker messages is only that visits
+    gave no friction value, which does not show grip.
     """
     told = _slippery_probability(road)
     least = _slippery_probability(quiet)

@@ -101,7 +101,9 @@ class _Fields(NamedTuple):
         return self.walked.sizes
 
     def present_columns(self) -> PresentColumns:
-        """Return, for each column, a mask (k,) of the messages that contain it."""
+        """Return which columns each of the k messages contains: for each column a mask (k,), True
+        for a message that contains it.
+        """
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind,

@@ -67,7 +67,9 @@ def drive_of(rng: Generator) -> AttackedDrive:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Return the number of alerts that each attack raises or suppresses, summed over the seeds."""
+    """Simulate each attack with each of the `seeds`; return, by name of the attack, in how many
+    cells it raised or suppressed an alert, summed over the seeds.
+    """
     out = dict.fromkeys((f"fusion.attack.{name}" for name in ATTACKS), 0.0)
     for seed in seeds:
         rng = np.random.default_rng([seed, 7])

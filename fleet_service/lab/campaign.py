@@ -89,8 +89,9 @@ def run(
 
 
 def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
-    """Return True if a figure called `name` must be in the table of a run of the evaluation. The
-    table of an end-to-end run also has the end-to-end figures that were not measured.
+    """Return True if the figure `name` must appear in the table of a run. `only` is the part that
+    the run was limited to, and `found` the measured figures. The table of an end-to-end run also
+    lists end-to-end figures that were not measured.
     """
     if only == END_TO_END_PART:
         return name.startswith(END_TO_END)

@@ -1,6 +1,6 @@
-"""Ice that forms and melts on one road of a town. The module counts the passes until the map shows
-the change. Only passes count in which the vehicle used enough grip to measure the friction. Pure
-(no I/O).
+"""Evaluation of a changing road: ice forms or melts on one road of a simulated town. The module
+counts the vehicles' passes until the map shows the change. Only passes count in which the vehicle
+used enough grip to measure the friction. Pure (no I/O).
 """
 
 from __future__ import annotations

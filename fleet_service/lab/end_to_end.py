@@ -94,10 +94,10 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
-    """Return figures of one drive, by name. Only cells that at least SEVERAL vehicles visited are
-    judged. The figures include the share of these cells whose 90 % interval contains the true
-    friction, and the error of μ in those in which friction was measured. They also include the
-    numbers of alerts and observations.
+    """Return figures of the map after one simulated drive, by name. Only cells that at least
+    SEVERAL vehicles visited are judged. The figures include the share of these cells whose 90 %
+    interval contains the true friction, and the error of μ in those in which friction was measured.
+    They also include the numbers of alerts and observations.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)
@@ -201,8 +201,8 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Return the reports of the vehicles of a simulated drive together with the true values, read
-    from the files in a folder.
+    """Read the files of a simulated drive in `folder`; return the visits (passages of cells) with
+    the vehicles' reports and the true values.
     """
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)

@@ -1,7 +1,7 @@
-"""Properties that must hold except for rounding: the map does not depend on the order of arrival,
-and a replay from the archive gives the same map. The module also measures how far the upper end of
-an interval is lowered by visits (passages of cells) in which a vehicle used too little grip to
-measure the friction.
+"""Evaluation of properties of the map that must hold except for rounding errors: it does not depend
+on the order in which reports arrive, and a replay from the archive gives the same map. The module
+also measures how far the upper end of an interval is lowered by visits (passages of cells) in which
+a vehicle used too little grip to measure the friction.
 """
 
 from __future__ import annotations

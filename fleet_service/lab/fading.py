@@ -1,5 +1,6 @@
-"""Fading of knowledge about a dry road: measures the lower end of the map's interval at some times
-after the last pass. Pure (no I/O).
+"""Evaluation of ageing: how fast the map's knowledge about a dry road fades. The module measures
+the lower end of the friction interval at some times after the last vehicle has passed. Pure (no
+I/O).
 """
 
 from __future__ import annotations

@@ -93,8 +93,9 @@ def _make_message(
 
 
 def forge_messages(message: Message, thief: int) -> tuple[Message, Message]:
-    """Return two forged messages: another vehicle's message under the attacker's own key, and the
-    same observations in a batch with the attacker's own name.
+    """Return two messages that an attacker (`thief`) makes from a message of another vehicle: the
+    unchanged message under the attacker's own Zenoh key, and the same observations in a batch with
+    the attacker's own name.
     """
     batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)

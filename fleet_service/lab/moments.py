@@ -1,4 +1,5 @@
-"""Drives with the real estimator, evaluated at several moments: after one, six and thirty minutes.
+"""Evaluation of the map at several moments of a drive with the real estimator: after one, six and
+thirty minutes.
 
 A map that is calibrated after a minute may later become overconfident about errors that all
 vehicles share. A map that is calibrated after half an hour may have been overconfident in the first
@@ -41,7 +42,7 @@ MIDDLE: Final = 0.91
 
 
 class AskedWay(NamedTuple):
-    """Scores at one moment of a drive.
+    """Scores of the map at one moment of a drive.
 
     Attributes:
         scores: scores of the cells that several vehicles had visited.

@@ -1,5 +1,5 @@
-"""Plots of the evaluation, drawn from its figures alone. They need matplotlib (the `demo`
-extra).
+"""Plots of the map's evaluation, drawn only from its figures (named results). They need matplotlib,
+which the optional dependencies `demo` install.
 """
 
 from __future__ import annotations

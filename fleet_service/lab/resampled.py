@@ -1,5 +1,5 @@
-"""Simulated visits (passages of cells) in a town whose reports have the errors of the real
-estimator. They are drawn from its reports on simulated drives. Pure (no I/O).
+"""Simulated visits (passages of cells) in a town, with reports that have the errors of the real
+estimator: each report is drawn from the estimator's own reports on simulated drives. Pure (no I/O).
 
 The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
 too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all

@@ -49,7 +49,9 @@ class Scores:
     crps: FloatArray
 
     def taken(self, rows: BoolArray) -> Scores:
-        """Return the scores of those answers of the map that `rows` selects."""
+        """Return the scores of those answers (beliefs about one cell at one time) that `rows`
+        selects.
+        """
         return Scores(*(column[rows] for column in vars(self).values()))
 
 
@@ -158,8 +160,8 @@ def score_snapshots(
     vehicles: int,
     where: BoolArray | bool = True,
 ) -> Scores:
-    """Return the scores of the map at the minutes `at`. Only cells of the mask `where` are included
-    in which a vehicle used enough grip to measure the friction.
+    """Return the scores of the map at the minutes `at`. Cells outside the mask `where` are left
+    out, and so are cells in which no vehicle used enough grip to measure the friction.
     """
     out = []
     for minute in at:

@@ -1,5 +1,5 @@
-"""Short situations in which a fused map could become wrong: many lower bounds, an outage, careful
-drivers on ice, a wet curve.
+"""Evaluation of short situations in which the map could become wrong: many reports that are only
+lower bounds of friction, an outage of the network, careful drivers on ice, and a wet curve.
 
 The true friction is known by construction. Pure (no I/O).
 """
@@ -115,9 +115,9 @@ def lower_excess() -> float:
 
 
 def backlog_fused(rng: Generator) -> float:
-    """Return the share of late observations that affect the map after an outage. In this situation,
-    one vehicle was connected for the whole hour, and the observations of all other vehicles arrive
-    together after it.
+    """Return the share of late observations that still affect the map after an outage of the
+    network. In this situation, one vehicle was connected for the whole hour, and the observations
+    of all other vehicles arrive together after it.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

@@ -1,10 +1,12 @@
-"""Fleets of another maker: vehicles that follow only the public contract (`schemas/README.md`) and
-have an error model of their own. Pure (no I/O).
+"""Evaluation with simulated fleets of another maker. Their vehicles do not run GripMap's agent:
+they follow only the public contract (`schemas/README.md`), and have an error model of their own.
+Pure (no I/O).
 
-Each vehicle has a gain error that affects both its value of μ and the grip that it reports as used.
-If the map's computation learned a correction from both, it would see a relation between them that
-is not a property of the road. The values have noise, whose size the vehicles state correctly.
-Vehicles send complete log-likelihoods and none of the optional columns.
+Each vehicle has a gain error (constant relative error), which affects both its value of μ and the
+grip that it reports as used. Therefore the two are related in a way that is not a property of the
+road. A computation of the map that learned a correction from this relation would be wrong. The
+values have noise, whose size the vehicles state correctly. Vehicles send complete log-likelihoods
+and none of the optional columns.
 
 There are two drives:
 
@@ -69,8 +71,8 @@ COLD_GAP_S: Final = 5.0
 
 
 class ForeignDrive(NamedTuple):
-    """Visits (passages of cells) of a drive of another maker's fleet, and the grid number of each
-    cell.
+    """Simulated drive of another maker's fleet: its visits (passages of cells), and the grid number
+    of each cell.
     """
 
     visits: Visits
@@ -172,8 +174,9 @@ def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
 
 
 def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]:
-    """Return figures of the map of an honest fleet over `seeds`: coverage, false grip, error, false
-    and missed alerts.
+    """Simulate an honest fleet with each of the `seeds`, and return figures of the map: coverage
+    and error of friction, share of false grip, false and missed alerts. `name` is the first part of
+    the figures' names, `gain_std` the standard deviation of the vehicles' gain errors.
     """
     found = [score_honest(np.random.default_rng([seed, 23]), gain_std) for seed in seeds]
     scores = join_scores([one[0] for one in found])
@@ -325,8 +328,10 @@ def measure_cold(seed: int) -> dict[str, float]:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return all figures of the other maker's fleets; `log_line` is called with lines about the
-    progress.
+    """Simulate all drives of the other maker's fleets, and return the figures by name. Three cases
+    are measured: honest fleets with each size of gain error, a change of the road, and a service
+    that does not know the vehicles yet. `log_line` is called with a line about the progress after
+    each fleet.
     """
     out: dict[str, float] = {}
     for name, gain_std in GAINS.items():

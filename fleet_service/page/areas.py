@@ -20,8 +20,9 @@ MOST: Final = 100
 
 
 def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
-    """Return the areas with data; each has `name` (empty if no named place is near), `box`,
-    `latitude`, `longitude`, `cells` and `alerts`.
+    """Return the areas of the map that have data (groups of neighbouring tiles), one dictionary
+    each: `name` of the nearest place (empty if no named place is near), `box` [deg], `latitude` and
+    `longitude` of its centre [deg], and the numbers of `cells` and `alerts` in it.
 
     Args:
         world: the mirrored map.

@@ -108,7 +108,7 @@ def restore_streams(
 
 
 def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Return pseudonyms (n,), given as text, as 64-bit numbers."""
+    """Convert pseudonyms (n,) from text to 64-bit numbers."""
     chunked = (
         pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
     )
@@ -372,8 +372,8 @@ def _prefetch_parts(parts: Iterator[_Held]) -> Iterator[_Held]:
 
 
 def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
-    """Yield the rows of the archive files in `listing` in parts of about PART_ROWS. An error is
-    raised if there are more than `most` rows.
+    """Yield the rows of the archive files in `listing` in parts of about PART_ROWS. If there are
+    more than `most` rows, an InputError is raised.
     """
     name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]

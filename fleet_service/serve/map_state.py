@@ -61,7 +61,7 @@ class MapState:
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Return the slots (row numbers of cells with heading sectors), (n,), of a tile, in the
+        """Return the slots (row numbers, one per cell and heading sector), (n,), of a tile, in the
         order of their first visit (passage of a cell).
         """
         self._index()

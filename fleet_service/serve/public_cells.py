@@ -129,14 +129,14 @@ class PublicCells:
         self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers of cells with heading sectors) that are public at
-        `now` [ns].
+        """Return those of the slots (row numbers, one per cell and heading sector) that are public
+        at `now` [ns].
         """
         self.publish(now)
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots (row numbers of cells with heading sectors) that were published since
+        """Return the slots (row numbers, one per cell and heading sector) that were published since
         the last call.
         """
         found = np.concatenate([np.zeros(0, np.int64), *self._published])

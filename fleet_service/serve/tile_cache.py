@@ -134,8 +134,8 @@ class TileCache:
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers of cells with heading sectors) that are public at
-        `now` [ns].
+        """Return those of the slots (row numbers, one per cell and heading sector) that are public
+        at `now` [ns].
         """
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
@@ -174,5 +174,7 @@ def _common_bounds(
 
 
 def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """Return, as arrays by name, the columns of a tile by which queries select cells."""
+    """Return the columns that decide if a cell of a tile belongs to the answer to a query (its box
+    and its number of vehicles, see SELECTED_BY), as arrays (k,) by name.
+    """
     return {name: cells[name].to_numpy() for name in SELECTED_BY}

@@ -1,6 +1,6 @@
-"""Live hand-over of a region: the active service stops regularly, and a named standby (a waiting
-service) gets its lease (ownership of the archive). A token is the Zenoh liveliness token by which a
-service announces itself.
+"""Live hand-over of a region: the active service shuts down in an orderly way, and a named standby
+(a waiting service) gets its lease (ownership of the archive). A token is the Zenoh liveliness token
+by which a service announces itself.
 
     client                                   active service
     get gripmap/v1/shard/SERVICE?to=NAME ──► checks that NAME stands by for its regions, replies

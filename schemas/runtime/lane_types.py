@@ -141,9 +141,9 @@ def _is_truth(kind: Any) -> bool:
 
 
 def _register(function: Any, arguments: int, given: Any, result: Any, lower: Any) -> None:
-    """Make Numba use `lower` to generate the code of `function` (an operator, for example) if at
-    least one argument has the vector or mask type `given`. The other arguments may be single
-    numbers or truth values.
+    """Register a code generator with Numba: `lower` then generates the code of `function` (for
+    example of an operator) for calls in which at least one argument has the type `given` (vector or
+    mask). The other arguments may be single numbers or truth values.
     """
     fits: Callable[[Any], bool] = _is_number if given is LANES_TYPE else _is_truth
 
@@ -251,7 +251,7 @@ def type_store(context: Any, array: Any, place: Any, value: Any) -> Any:
 
 def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `select`, which takes each
-    number from one of two vectors, as a mask says.
+    number from the first or the second of two vectors, depending on a mask.
     """
     wide = any(isinstance(kind, LanesType | MaskType) for kind in (where, first, other))
     number = LANES_TYPE if wide else types.float64

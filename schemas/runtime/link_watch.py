@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class LinkWatch:
-    """Watch over the links (connections to routers) of a Zenoh session.
+    """Observer of the links (connections to routers) of a Zenoh session.
 
     Attributes:
         epoch: number of times that the session was connected to a router.

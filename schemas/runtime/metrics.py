@@ -151,8 +151,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"/metrics and /healthz\n")
 
     def _is_own_name(self) -> bool:
-        """Return True if the request's host name is allowed. On loopback, a foreign host name is
-        refused, because a web page could use it to read the metrics (DNS rebinding).
+        """Return True if the host name in the HTTP request is allowed. A server on the loopback
+        interface refuses any other host name, because otherwise a web page could read the metrics
+        by DNS rebinding.
         """
         server = self.server
         try:

@@ -20,7 +20,8 @@ _ALL: Final = f"{SERVES}/**"
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
     """Return the Zenoh liveliness tokens (signs that a process is alive) of services that are
-    active now and visible to this session. Another `root` selects other kinds of tokens.
+    active now and visible to this session. `root` is the first part of the tokens' keys; other
+    roots give other kinds of tokens, such as those of standby services.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -76,8 +77,8 @@ class PresenceTracker:
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record that a service's token (sign that it is alive) became active (`stands` is True) or
-        was lost (`stands` is False).
+        """Record a change of a service's liveliness token (sign that it is alive): the token
+        appeared if `stands` is True, and disappeared if it is False.
         """
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)

@@ -57,15 +57,17 @@ def limit_memory(*without: str) -> None:
 
 
 def trim_memory() -> None:
-    """Give unused memory back to the system, after work that needed much memory for a short
-    time.
+    """Return unused memory to the operating system. Call this after work that needed much memory
+    for a short time.
     """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def end_with_parent() -> None:
-    """Let the system end this process when its parent ends, on Linux."""
+    """On Linux, make the operating system end this process as soon as its parent process ends;
+    elsewhere do nothing.
+    """
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 

@@ -59,7 +59,7 @@ def report_once(line: str) -> None:
 
 
 def set_status(words: str) -> None:
-    """Set the text about the current activity, which the spinner shows."""
+    """Set the text that the spinner shows: a few words about what the command is now doing."""
     with _voice.lock:
         _voice.words = words
         if _voice.shown is not None:
@@ -85,7 +85,9 @@ def show_status(words: str) -> Iterator[None]:
 
 
 def stop_status() -> None:
-    """Stop the spinner, because the command has ended or asks the user a question."""
+    """Stop the spinner. Call this when the command has ended, or before it asks the user a
+    question.
+    """
     timer = _voice.timer
     _voice.timer = None
     if timer is not None:

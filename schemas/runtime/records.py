@@ -45,8 +45,8 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class EmptyRecord:
-    """Record to pass to a compiled function whose record argument is not needed; its only field is
-    not used.
+    """Record without content. It is passed to a compiled function that requires a record as
+    argument but does not need its fields.
     """
 
     unused: bool

@@ -35,7 +35,9 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """Head of a batch (message with records): the fields other than its records."""
+    """Head of a batch (message with records): all fields of the message except its records, such as
+    the vehicle's name and the sequence number.
+    """
 
     kind: Kind
     vehicle: str

@@ -104,8 +104,9 @@ def measure_start(folder: Path) -> list[Figure]:
 
 
 def measure_cold_start(folder: Path, files: list[str]) -> float:
-    """Return the median time [s] to the first estimate of a new process whose package has the
-    kernels that a wheel ships, where nothing is cached and no linker is found.
+    """Return the median time [s] that a new process takes to its first estimate on a machine
+    without cached compiled functions and without a linker. The process runs a copy of the package
+    that contains shared libraries of compiled kernels, as an installed wheel does.
     """
     package = folder / "package"
     unused = shutil.ignore_patterns("__pycache__", "*.so")

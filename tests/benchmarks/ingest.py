@@ -130,8 +130,9 @@ def make_messages(
     """Return `count` messages with `records` visits (passes through map cells) each, the last of
     which end at `now` [ns], in one region or in a region `east` regions further east.
 
-    The first `begin` messages were made before: vehicles and sequence numbers continue after them.
-    Each vehicle drives to and fro on a straight road, so that the service accepts its path.
+    Vehicles and sequence numbers continue after the first `begin` messages, which an earlier call
+    has returned. Each vehicle drives to and fro on a straight road, so that the service accepts its
+    path.
     """
     rng = np.random.default_rng([SEED, begin])
     columns = make_visits(rng, np.zeros(count * records, np.int64), now, CELLS_ACROSS).columns

@@ -56,8 +56,8 @@ class Told(NamedTuple):
 
     def longest_wait(self, since: float) -> float:
         """Return the time [s] from `since` until all batches that an outbox had stored before
-        `since` were settled (finally answered). The result is infinite if one of these batches was
-        never settled.
+        `since` were settled (acknowledged or refused by the service). The result is infinite if one
+        of these batches was never settled.
         """
         waits = [
             self.settled.get(name, float("inf")) - since

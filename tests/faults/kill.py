@@ -4,8 +4,8 @@ once, under load.
 The kills run in rounds, each with its own archive, so that a restarted service has to read back
 minutes and not hours. The archive also has old rows, which a retention process removes meanwhile;
 this process is killed too. At the end of a round everything runs until all batches are settled
-(finally answered). Then the archive is compared with the agents' journals (lists of stored and
-acknowledged batches).
+(acknowledged or refused by the service). Then the archive is compared with the agents' journals
+(lists of stored and acknowledged batches).
 """
 
 from __future__ import annotations

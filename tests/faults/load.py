@@ -1,6 +1,6 @@
 """Load generator. It sends observations of synthetic visits (passes through map cells) through the
-agent's real publisher and outbox, and writes a journal of stored and settled (finally answered)
-batches.
+agent's real publisher and outbox, and writes a journal of stored and settled (acknowledged or
+refused by the service) batches.
 
 `python -m tests.faults.load FILE` reads the fields of `Plan` from a JSON file. The journal is the
 standard output: one line per batch that was committed to the outbox, and one per batch that an
@@ -54,7 +54,8 @@ class Plan:
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
     """Print a line for each batch to the journal: `sign vehicle boot kind region seq records time`.
-    The sign is `+` for a batch on disk and `-` for a settled (finally answered) batch.
+    The sign is `+` for a batch on disk and `-` for a settled (acknowledged or refused by the
+    service) batch.
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
@@ -65,8 +66,8 @@ def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
 
 
 class WatchedOutbox(Outbox):
-    """Outbox of an agent that also prints a line when a batch is stored or settled (finally
-    answered by a service).
+    """Outbox of an agent that also prints a line when a batch is stored or settled (acknowledged or
+    refused by a service).
     """
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:

@@ -21,8 +21,8 @@ DRAIN_S: Final = 60.0
 
 
 def router_down(site: Site) -> list[Figure]:
-    """Kill the router for a minute. Every report of that minute must be settled (finally answered)
-    soon after the router's return.
+    """Kill the router for a minute. Every report of that minute must be settled (acknowledged or
+    refused by the service) soon after the router's return.
     """
     down_s = site.choose_amount(60, 4)
     with open_stage(site.folder) as there:
@@ -146,8 +146,8 @@ def _load_agents(there: Stage, processes: int) -> None:
 
 
 def _is_settled(there: Stage) -> bool:
-    """Return True if every batch that the agents have stored by now is settled (finally answered)
-    within DRAIN_S seconds.
+    """Return True if every batch that the agents have stored by now is settled (acknowledged or
+    refused by the service) within DRAIN_S seconds.
     """
     since = time.time()
     deadline = time.monotonic() + DRAIN_S

@@ -64,8 +64,9 @@ class Trip(NamedTuple):
 
 
 class Pursuit(NamedTuple):
-    """Result of an attempt to follow a car: the probability of naming the right place for each
-    publication, that of a random place, and the probability of naming the right street.
+    """Result of an attempt to follow a car. For each publication, `hits` is the probability that
+    the reader names the right place, and `chance` that of a random guess. `street` is the
+    probability that the reader names the right street.
     """
 
     hits: list[float]
@@ -192,8 +193,9 @@ def _places(cells: IntArray) -> FloatArray:
 
 
 def pursue(town: Town, street: int) -> Pursuit:
-    """Let a car of a street leave alone at night, let the reader examine each publication, and
-    return the result.
+    """Simulate one attempt to follow a car. A car from side street number `street` drives away
+    alone at night. After each publication of the map, the reader guesses where the car is, as the
+    module's docstring describes. Return how often the guesses were right.
     """
     trip = _trip(street, 0)
     begin = town.day + 22 * HOUR

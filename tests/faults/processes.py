@@ -168,14 +168,14 @@ class Stage:
 
     @property
     def journals(self) -> list[Path]:
-        """Return the paths of the load generators' journals, which list stored and settled (finally
-        answered) batches.
+        """Return the paths of the load generators' journals, which list stored and settled
+        (acknowledged or refused by the service) batches.
         """
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:
         """Stop new observations, and wait until every batch of every load generator is settled
-        (finally answered).
+        (acknowledged or refused by the service).
 
         The wait ends early if no batch is settled for `patience_s`. Batches left in an outbox are
         then missing in the archive; the comparison with the archive counts them.

@@ -265,8 +265,8 @@ def install_demo(house: House) -> Path:
 
 
 def install_wheel(wheel: Path, extras: str, place: Path) -> None:
-    """Create the environment `place` with the wheel, its extras and pip, without packages from
-    outside.
+    """Create a new Python environment in the folder `place`. Install into it only the wheel, its
+    optional dependencies `extras`, and pip.
     """
     venv.create(place, with_pip=True)
     pip = [str(place / "bin" / "python"), "-I", "-m", "pip", "install", "--quiet", "--constraint"]

@@ -89,9 +89,9 @@ def list_commands(text: str) -> list[str]:
 
 
 def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Run all commands of PAGES in a folder. Return those that failed, with the last line that they
-    printed, and for each map in MAPS the reason why it does not count as populated (empty if it
-    does).
+    """Run all commands of PAGES in a folder. Return the commands that failed, with the last line
+    that they printed. Also return, for each map in MAPS, "" if it counts as populated (see
+    `look_at_map`), otherwise the reason why not.
     """
     for name in ("deploy", "tests/data"):
         shutil.copytree(
@@ -145,8 +145,7 @@ def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
 
 
 def look_at_map(place: str | Path) -> str:
-    """Open a map in a browser, and return the reason why it does not count as populated; empty if
-    it does.
+    """Open a map in a browser. Return "" if it counts as populated, otherwise the reason why not.
 
     A populated map shows at least LEAST_CELLS cells, drawn over at least LEAST_PX pixels. The user
     need not click for it, no error occurs, and no card covers it.
@@ -183,8 +182,8 @@ _EXTENT: Final = """() => {
 
 
 def look_at_demo(folder: Path) -> str:
-    """Run the README's demo, and return the reason why the map on its page does not count as
-    populated (empty if it does).
+    """Run the README's demo, and look at the map on its page. Return "" if the map counts as
+    populated (see `look_at_map`), otherwise the reason why not.
     """
     assert DEMO in README.read_text(encoding="utf-8"), "the README names the demo otherwise"
     log = folder / "demo.log"
@@ -205,7 +204,7 @@ def look_at_demo(folder: Path) -> str:
 
 
 def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
-    """Return the exit code of a command, or a message that it did not end in time."""
+    """Run a command to its end. Return its exit code, or a message that it did not end in time."""
     with log.open("wb") as out:
         try:
             done = subprocess.run(
@@ -253,8 +252,8 @@ def _last_line(log: Path) -> str:
 
 def main() -> int:
     """Run the demo of the README and the commands of PAGES in the folder that the command line
-    names. Print as JSON the commands that failed, and for each map that they leave the reason why
-    it does not count as populated (empty if it does). The process must have its own network
+    names. Print as JSON the commands that failed, and for each map that the commands have made, ""
+    or the reason why it does not count as populated. The process must have its own network
     namespace.
     """
     folder = Path(sys.argv[1])

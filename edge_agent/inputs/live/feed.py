@@ -70,8 +70,8 @@ class Stamps:
         return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
 
     def host_time(self, stamp: float, arrival: float) -> float:
-        """Return the host's time [s] for a time stamp [s] of a message that arrived at `arrival`
-        [s].
+        """Convert the time stamp [s] of a message from the clock of its source to the clock of this
+        host [s]. The message arrived at `arrival` [s] by the host's clock.
         """
         if arrival - self._turned > WHILE_S:
             self._before = self._lately

@@ -1,5 +1,5 @@
-"""List of the figures (named numbers) that the evaluation campaign reports: first those with a
-target ("bar"), then all other measures for context.
+"""List of the figures (named numbers) that the evaluation campaign reports. Figures with a target
+("bar") come first; all other measures follow for information.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def false_per_hour(results: Results) -> float:
 
 
 def both_stops(results: Results) -> float:
-    """Return how often the friction interval contains the true value (coverage): the mean over two
-    braking manoeuvres with ABS, on dry road and on snow.
+    """Return how often the default estimator's friction interval contains the true value
+    (coverage): the mean over two braking manoeuvres with ABS, one on dry road and one on snow.
     """
     return 0.5 * (
         mean_of("default.abs.dry", "coverage90")(results)

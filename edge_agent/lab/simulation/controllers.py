@@ -1,7 +1,7 @@
 """Simulated controllers of a vehicle: ABS, traction control (TCS), drag torque control and ESC.
 
-They act in each integration step of the vehicle model and know the exact slip, because only their
-effect is modelled, not their sensors.
+Each controller acts in every integration step of the vehicle model. It gets the true slip of the
+wheels: the effect of the controllers on the wheels is simulated, but not their sensors.
 
     ABS    If a wheel exceeds its slip limit, its brake torque is reduced at the rate DUMP, then
            held until the slip is half of the limit. It is then increased again: fast up to NEARLY

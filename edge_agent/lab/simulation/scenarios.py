@@ -276,8 +276,9 @@ def winter(seed: int) -> Scenario:
 
 
 def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
-    """Return the patches of other road surface (ice, snow) of one kind on the points of a lane.
-    `numbers` are three random numbers in [0, 1) that determine position, length and friction.
+    """Return the patches of ice or slush for one lane in winter. `kind` is the kind of patch (see
+    `winter`), and `points` are the points of the lane. `numbers` are three random numbers in [0, 1)
+    from which position, length and friction of the patches follow.
     """
     place, size, grip = numbers
     ice = 0.10 + 0.095 * grip

@@ -33,7 +33,9 @@ REDRAWS = 32
 
 @dataclass(frozen=True)
 class Iteration:
-    """One iteration of a search: values of the objective (larger is better)."""
+    """Progress of a search after one iteration: values of the objective (larger is better), and
+    number of evaluations.
+    """
 
     iteration: int
     best: float  # best value so far
@@ -65,8 +67,8 @@ class Problem:
 
 @dataclass(frozen=True)
 class Result:
-    """The best vector (V,) of a search, its value, and the objective's values over the
-    iterations.
+    """Result of a search: the best vector (V,) that was found, the objective's value for it, and
+    the values of the objective in each iteration.
     """
 
     best: FloatArray

@@ -56,7 +56,7 @@ def expression(t: Table, maps: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return how often later values lay within the map's intervals as a table, for the selected
-    part of the archive; `expression` describes the rows.
+    """Answer the question for the selected part of the archive. Return a table that states how
+    often later friction values lay within the map's intervals; `expression` describes its rows.
     """
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -43,7 +43,9 @@ def _to_int(number: np.unsignedinteger[Any]) -> int:
 
 @refcount_free_inlined
 def _make_key(vehicle: int, kind: int) -> np.uint32:
-    """Return the key of a settled report: index of the vehicle, kind, and the flag _MOVED."""
+    """Return the key of a settled report, one integer made from the index of the vehicle, the kind
+    of report (BOUND or VALUE), and the flag _MOVED.
+    """
     return np.uint32(4 * vehicle + 2 * kind)
 
 

@@ -46,7 +46,8 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the local map of a car that has received all places (map cells with heading sector).
+    """Return the local map of a car that has received all places (one per map cell and heading
+    sector).
 
     The friction in the map is the true one; with `rng`, random errors of standard deviation SPREAD
     are added.

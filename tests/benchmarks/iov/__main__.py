@@ -1,5 +1,8 @@
-"""`python -m tests.benchmarks.iov [--only PART …] [--out DIR] [--quick]`: measure the interfaces
-for other vehicles and programs.
+"""`python -m tests.benchmarks.iov [--only PART …] [--out DIR] [--quick]`: benchmarks of the
+interfaces by which other vehicles and programs use GripMap.
+
+The parts are: own and foreign hazard messages (DENM), routes around ice, the speed limit for a
+motion planner, the Kuksa provider, MCAP files, and clients in other programming languages.
 """
 
 from __future__ import annotations
@@ -117,8 +120,8 @@ def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
 
 
 def _meets(shape: np.ndarray[Any, Any], middles: np.ndarray[Any, Any]) -> bool:
-    """Return True if a route `shape` (points [deg]) passes the middle of an icy street; `middles`
-    are these middles [deg].
+    """Return True if the route with the points `shape` [deg] passes the midpoint of an icy street;
+    `middles` are the midpoints of all icy streets [deg].
     """
     scale = np.array([1.0, np.cos(np.radians(routes.ORIGIN[0]))])
     first = shape[:-1] * scale
@@ -160,8 +163,8 @@ PARTS: Final = {
 
 
 def main() -> int:
-    """Measure the interfaces for other vehicles and programs. Return 0 if every figure meets its
-    target, otherwise 1.
+    """Run the chosen parts of the benchmark, and write and print their figures. Return 0 if every
+    figure meets its target, otherwise 1.
     """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.iov", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts alone")

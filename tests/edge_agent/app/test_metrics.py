@@ -1,6 +1,6 @@
 """Tests of an agent's metrics and health: they show how many reports were sent, were settled
-(finally answered) and are waiting, and they report problems such as a lost router or delay behind
-real time.
+(acknowledged or refused by the service) and are waiting, and they report problems such as a lost
+router or delay behind real time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests that an agent uses the libraries of kernels in its package only where they fit."""
+"""Tests of the shared libraries of compiled kernels in the installed package: an agent uses a
+library only if it was compiled from the present sources and for its processor.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def test_a_library_for_others_is_refused_with_the_reason(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """An agent that may not use a library of its package must go on with Numba."""
+    """An agent whose package contains only libraries for other sources or processors must print the
+    reason, and compile its kernels with Numba.
+    """
     write_libraries(tmp_path, sources)
     monkeypatch.setattr(native_library, "SHIPPED", tmp_path)
     monkeypatch.setattr(native_library, "read_processor_features", lambda: set(features))

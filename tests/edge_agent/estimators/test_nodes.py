@@ -1,5 +1,6 @@
 """Tests of mathematical identities of the friction mixture (grid of friction hypotheses): uniform
-prior, conserved probability at a road change, and likelihoods that equal the evidence put in.
+prior, conserved probability at a road change, and a likelihood of the visit that equals the
+evidence by which the test has updated the filter.
 """
 
 from __future__ import annotations

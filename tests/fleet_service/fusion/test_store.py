@@ -141,8 +141,9 @@ def test_bounds_are_remembered_for_an_hour_and_values_for_three(
 
 def repeat_after_settling(evidence: FloatArray, *, forgets: bool) -> Fusion:
     """Return a fusion (beliefs about all cells) in which 300 vehicles passed a cell and one of
-    them, number 0, repeats its report 40 minutes later. If `forgets`, the fusion lost all settled
-    pairs (compact entries that show which vehicle visited a cell) before the repetition.
+    them, number 0, repeats its report 40 minutes later. If `forgets`, all settled pairs (compact
+    records of a vehicle's earlier reports in a cell) are deleted before vehicle 0 repeats its
+    report.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations(0.1 * np.arange(300), np.arange(300), evidence.repeat(300, 0), CELL))

@@ -253,8 +253,9 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A client must ask a service again if its queryables exist but its liveliness token (sign of a
-    connected service) has not arrived yet.
+    """The service answers map queries, but clients do not see its liveliness token (sign of a
+    connected service). The client's first query gets no reply. The client must notice that a
+    service can answer, and query again.
     """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:

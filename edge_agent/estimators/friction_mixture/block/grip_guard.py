@@ -50,8 +50,8 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """Return the upper end of the friction interval: `friction.upper`, but at least ABOVE plus the
-    recent grip in use.
+    """Return the upper end of the friction interval: the larger of `friction.upper` and the recent
+    grip in use plus ABOVE.
 
     The result may exceed 1.2, the end of the friction grid, because the friction of racing tyres
     does.

@@ -168,8 +168,9 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def nominal_agreement(trust: Trust, constants: Constants) -> float:
-    """Return the agreement of the car with its vehicle file, 0 to 1. It is 0 if the strain
-    (deviation of the states from their prior) has its usual value or more.
+    """Return the degree, 0 to 1, to which the car agrees with its vehicle file. It decreases
+    linearly with the strain (deviation of the states from their prior): 1 without strain, 0 if the
+    strain has its usual value or more.
     """
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 

@@ -20,8 +20,8 @@ from schemas.signals import CHANNELS, S
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[SimulatedFleet, FloatArray, FloatArray, Truth]:
-    """Return two minutes of thirty vehicles in the demonstration with ideal sensors: fleet, times
-    (T, N), signals (T, N, 18), and true states.
+    """Simulate two minutes of the demonstration scenario with thirty vehicles and ideal sensors.
+    Return the fleet, the times (T, N), the signals (T, N, 18), and the true states.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("edge_agent.lab.simulation.fleet.ORDINARY", "ideal")

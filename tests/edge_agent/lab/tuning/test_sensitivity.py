@@ -1,4 +1,6 @@
-"""Sensitivity of the default estimator to its constants."""
+"""Tests of the sensitivity analysis, which measures how much the default estimator's results change
+with each of its constants.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from edge_agent.lab.tuning.sensitivity import ConstantChange
 
 @pytest.fixture(scope="module")
 def drives() -> list[sensitivity.JudgedDrives]:
-    """Return two short towns with manoeuvres, one of them in winter."""
+    """Simulate short drives for two seeds: in two towns, one of them in winter, and manoeuvres.
+    Return the drives.
+    """
     return sensitivity.simulate_drives([8001, 8002], cars=2, town_s=8.0, drive_s=2.0)
 
 

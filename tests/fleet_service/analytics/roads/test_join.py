@@ -1,5 +1,6 @@
-"""Tests of the assignment of map cells (with heading sector) to road links: a cell belongs to the
-nearest link with the same direction, or to both links where one ends and the next begins.
+"""Tests of the assignment of map cells (counted once per heading sector) to road links: a cell
+belongs to the nearest link with the same direction, or to both links where one ends and the next
+begins.
 """
 
 from __future__ import annotations
