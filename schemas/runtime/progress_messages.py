@@ -59,7 +59,7 @@ def report_once(line: str) -> None:
 
 
 def set_status(words: str) -> None:
-    """Set the text that the spinner shows: a few words about the current activity of the command."""
+    """Set the text that the spinner shows: a few words about the command's current activity."""
     with _voice.lock:
         _voice.words = words
         if _voice.shown is not None:
