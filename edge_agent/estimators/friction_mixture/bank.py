@@ -15,6 +15,7 @@ from edge_agent.estimators.friction_mixture.report.visit_parts import begin_part
 from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.friction_grid import quantile, visit_evidence
+from edge_agent.estimators.friction_mixture.state.gap import YAW_STD
 from edge_agent.estimators.friction_mixture.state.memory import (
     MixtureMemory,
     Quantiles,
@@ -27,8 +28,6 @@ from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Records, put_record, records
-
-YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 
 
 def mixture_bank(
@@ -129,7 +128,7 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
         constants.common_lag * last.ax
     ) ** 2  # what no sensor tells
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
-    var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
+    var_rate = last.yaw_rate_var + YAW_STD**2
     write_motion(output, (vx, vy, last.yaw_rate), (var_x, var_y, var_rate))
     _report_friction(
         memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU

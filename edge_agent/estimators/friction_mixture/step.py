@@ -124,11 +124,9 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
     duration = scratch.features.duration
     process = scratch.process
     keep = scratch.keep
-    leak = constants.leak_wander * abs(memory.last.ax)
-    gyro = constants.gyro_wander * scratch.features.speed
-    process[NodeState.VX] = (constants.drift**2 + leak**2 + block.missing_x) * duration
+    process[NodeState.VX] = (constants.drift**2 + block.missing_x) * duration
     unsure = constants.distrust_drift * memory.trust.distrust
-    process[NodeState.VY] = (constants.drift**2 + gyro**2 + unsure**2 + block.missing_y) * duration
+    process[NodeState.VY] = (constants.drift**2 + unsure**2 + block.missing_y) * duration
     forgets = memory.trust.distrust / constants.distrust_forget
     speed = scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):

@@ -31,6 +31,7 @@ from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.adaptation.rule_base import plain_rules
 from edge_agent.app.tuned_memberships import search_results, shipped_memberships
 from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet, join_drives
@@ -149,6 +150,16 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
     return join_drives(drives)
 
 
+def run_filter(batch: DriveSet, design: MixtureDesign) -> tuple[Estimates, FloatArray]:
+    """Run the filter with the tables `design` on a set of N drives. Return its estimates, and the
+    interval scores of friction (K, N) of the K samples from SETTLED_S on.
+    """
+    bank = mixture_bank(parameter_table(batch.vehicles), design)
+    estimates = bank.advance(batch.t, batch.signals)
+    score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)
+    return estimates, score[batch.t[:, 0] >= SETTLED_S]
+
+
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
     """Run the filter with the tables `design` on the drives. Return the mean interval score of
     friction over all drives ("all"), and over the samples of each surface (NaN if a surface does
@@ -157,12 +168,10 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
     drives = []
     samples = []
     for batch in batches:
-        bank = mixture_bank(parameter_table(batch.vehicles), design)
-        estimates = bank.advance(batch.t, batch.signals)
-        settled = batch.t[:, 0] >= SETTLED_S
-        score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)[settled]
+        _, score = run_filter(batch, design)
         drives.append(score.mean(axis=0))
-        samples.append((score.ravel(), batch.mu[settled].ravel()))
+        settled = batch.mu[batch.t[:, 0] >= SETTLED_S]
+        samples.append((score.ravel(), settled.ravel()))
     score, mu = (np.concatenate([pair[k] for pair in samples]) for k in range(2))
     found = {"all": float(np.concatenate(drives).mean())}
     for name, (above, most) in SURFACES.items():

@@ -32,13 +32,11 @@ import numpy as np
 
 from edge_agent.adaptation.memberships import LENGTHS, Memberships
 from edge_agent.app.tuned_memberships import shipped_memberships
-from edge_agent.dynamics.parameters import parameter_table
-from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet
-from edge_agent.lab.evaluation.real_world import SURE_GRIP, interval_score, town
-from edge_agent.lab.evaluation.worth import ESTIMATOR, SETTLED_S, manoeuvres
+from edge_agent.lab.evaluation.real_world import SURE_GRIP, town
+from edge_agent.lab.evaluation.worth import ESTIMATOR, manoeuvres, run_filter
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU
@@ -105,11 +103,8 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
     scores = []
     cried = grippy = warned = slippery = 0
     for batch, excited in drives:
-        bank = mixture_bank(parameter_table(batch.vehicles), design)
-        estimates = bank.advance(batch.t, batch.signals)
-        settled = batch.t[:, 0] >= SETTLED_S
-        score = interval_score(estimates.mu_lower, estimates.mu_upper, batch.mu)
-        scores.append(score[settled].mean(axis=0))
+        estimates, score = run_filter(batch, design)
+        scores.append(score.mean(axis=0))
         called = estimates.p_slippery > CALLED_SHARE
         high = batch.mu > SURE_GRIP
         low = excited & (batch.mu < SLIPPERY_MU)

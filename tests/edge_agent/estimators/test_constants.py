@@ -92,7 +92,7 @@ MOVES = {
         "penalty", "braking", 0.5, LESS
     ),  # nodes may not go to where they would be charged
     "huber": Move(
-        "nis", "stopping", 5.0, LESS
+        "nis", "stopping", 4.0, LESS
     ),  # R is inflated by what is refused, and follows it less
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
@@ -139,19 +139,15 @@ MOVES = {
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.2),
-    "leak_wander": Move("std VX", "split-braking", 1.2),
-    "gyro_wander": Move("vy_std", "rough acceleration", 1.02),
     # noise: what is expected to be larger is found to be smaller than expected
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.985),
     "angle_share": Move("vy_std", "constant-radius", 1.25),
-    "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
     "floor_x": Move("nis", "acceleration", 0.9),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
-    "shape_share": Move("nis", "acceleration", 0.95),
     "lag": Move("nis", "pulses", 0.85),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.89),
@@ -159,12 +155,10 @@ MOVES = {
     "standing_time": Move("stands", "stopping", 0.5),
     "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
     "agreeing_width": Move("v_x told by wheels", "pulses", 0.8, LESS),
-    "agreeing_most": Move("v_x told by wheels", "stopping", 2.0),
     "agreeing_std": Move("std of wheels' v_x", "turn and straight", 1.6),
     "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
     "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
-    "agreeing_lag": Move("std of wheels' v_x", "rough acceleration", 1.13),
     "agreeing_look": Move("std VX", "turn and straight", 1.1),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
     "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),

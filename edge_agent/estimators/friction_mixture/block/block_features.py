@@ -27,6 +27,7 @@ from edge_agent.estimators.friction_mixture.block.drive_split import (
 )
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.gap import YAW_STD
 from edge_agent.estimators.friction_mixture.state.memory import BlockSums, MixtureMemory, Trust
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.numeric import FloatArray
@@ -301,10 +302,7 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.abrupt_noise[wheel] = (
             linear * constants.abrupt_share * wheel_speed_jump(memory, constants, features, wheel)
         ) ** 2
-        shape = constants.shape_share * features.force[wheel] ** 2
-        variance = (
-            0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
-        )
+        variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2
         features.noise_std[wheel] = math.sqrt(variance * scale)
         features.slip_noise[wheel] = slip_variance * scale
     scale = (
@@ -316,20 +314,17 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     for axle in range(2):
         side = features.side[axle]
         turning = (
-            constants.gyro_std
-            * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR])
-            / speed
+            YAW_STD * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
         )
         pointing = constants.angle_share * features.steer_sin[2 * axle]
         angle = row[Parameter.SLOPE_Y] * math.sqrt(
             constants.angle_std**2 + turning**2 + pointing**2
         )
         share = constants.axle_share * side
-        shape = constants.shape_share * side * side
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
         before[axle] = side
-        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
+        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + lag**2
         wide = (
             wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
             if design.adaptive

@@ -36,7 +36,6 @@ FAST_M_S = 3.0  # slip is told above this speed
 TURNS_M_S2 = 3.0  # and below this lateral acceleration
 UNLIKE = 0.3  # share of the slip asked for by which stiffness and load differ
 LOOK_S = 0.2  # one independent look per so much time
-LARGEST_LOSS = 4.0  # [nat] of a look
 LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 
 
@@ -86,7 +85,11 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
         if kind != ALL_WHEELS and off * asked > 0.0:
             off = 0.0
         odds[kind] *= math.exp(
-            -look * (min(0.5 * off * off, LARGEST_LOSS) + math.log(spread / constants.wheel_std))
+            -look
+            * (
+                min(0.5 * off * off, constants.largest_loss)
+                + math.log(spread / constants.wheel_std)
+            )
         )
         total += odds[kind]
     for kind in range(3):

@@ -19,7 +19,6 @@ FAST_S = 0.06
 HELD_S = 1.0  # the largest grip holds so long,
 FORGOTTEN = 0.5  # [1/s] and then fades: roads change
 ABOVE = 0.02  # what smoothing takes from the top of a hard stop
-LARGEST_LOSS = 3.0  # [nat] a block
 # of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
 AT_PEAK = 0.95
 
@@ -45,7 +44,7 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
     """Return the penalty [nat] of a friction hypothesis (node): side_mu (2,) is its friction on the
     left and right. The penalty is 0 unless this friction lies below the grip in use."""
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
-    return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))
+    return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, constants.largest_loss))
 
 
 @compiled

@@ -41,8 +41,7 @@ TURN_SHARE = 0.05  # of the speed difference of the sides in a turn: track and y
 SIDE_SHARE = 0.5  # share by which sideslip differs from the side force over nominal stiffness
 LEFT_FLOOR = 0.03  # [m/s]
 TURNING = 1.5  # v*r against a_y: both must be small
-UNSURE = 0.5  # distrust from which the wheels' middle is taken whether they agree or not
-FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to follow
+FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle follows during distrust
 
 
 @compiled
@@ -81,9 +80,9 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     middle = total / seen
     turning = TURN_SHARE * abs(features.yaw_rate) * row[Parameter.TRACK_FRONT]
     allowed = constants.agreeing_width * abs(middle) + AGREE_FLOOR + 2.0 * step + turning
-    if not (most - least <= allowed and abs(features.change) < constants.agreeing_most):
+    if not most - least <= allowed:
         rolling.disagreed_time = time
-    unsure = memory.trust.distrust > UNSURE
+    unsure = memory.trust.distrust > 0.0
     if unsure and seen == 4:
         middle = 0.5 * (total - least - most)
     if unsure or time - rolling.disagreed_time >= constants.agreeing_time:
@@ -128,12 +127,9 @@ def _compute_velocities(
         + constants.agreeing_cube * abs(pull) ** 3
     )
     rolling.ahead = (1.0 - slip) * middle
-    late = constants.agreeing_lag * features.change
-    rolling.ahead_std = math.sqrt(
-        (share * middle) ** 2 + constants.agreeing_floor**2 + step * step + late * late
-    )
+    rolling.ahead_std = math.sqrt((share * middle) ** 2 + constants.agreeing_floor**2 + step * step)
     side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
-    most = FARTHEST_FOLLOWED if memory.trust.distrust > UNSURE else constants.following_most
+    most = FARTHEST_FOLLOWED if memory.trust.distrust > 0.0 else constants.following_most
     if abs(side) < most and abs(features.yaw_rate * middle) < TURNING * most * GRAVITY:
         rolling.left = (
             row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]

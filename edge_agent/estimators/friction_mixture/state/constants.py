@@ -90,7 +90,8 @@ class Constants(NamedTuple):
     demand_power: float = 4.0
     # [nat] a larger loss in a block counts whatever the demand: the node has lost the motion
     plausible_loss: float = 2.0
-    # [nat] most that a block may take from a node: a spike is forgiven within two
+    # [nat] most that a block may take from a node, or a look from a kind of drive: a spike is
+    # forgiven within two
     largest_loss: float = 3.0
     # [s] memory of the usual force, against which a new one is judged
     steady_time: float = 2.0
@@ -185,10 +186,6 @@ class Constants(NamedTuple):
 
     # [m/s/s^.5] white noise of a_x and a_y, and what is not constant in their offsets (vehicle)
     drift: float = 0.02
-    # [s^.5] what is not constant in the pitch leak, share of a_x
-    leak_wander: float = 0.01
-    # [rad/s^.5] wander of the yaw rate's offset; times speed an error of a_y
-    gyro_wander: float = 0.0005
 
     # [rad/s] white noise of a wheel speed sample (vehicle)
     omega_noise: float = 0.03
@@ -204,9 +201,6 @@ class Constants(NamedTuple):
     angle_std: float = 0.0003
     # [1] how the wheels of an axle point, of the angle; the common gain of the steering is a state
     angle_share: float = 0.01
-    # [rad/s] offset and white noise of the yaw rate in a block: turns an axle's slip, most at low
-    # speed
-    gyro_std: float = 0.002
     # [1] rolling resistance, in force over load
     floor_x: float = 0.006
     # [1] toe, compliance and what steering and a_y share badly, in force over load
@@ -215,8 +209,6 @@ class Constants(NamedTuple):
     force_share: float = 0.04
     # [1] load transfer between axles and inertia (vehicle)
     axle_share: float = 0.03
-    # [1] shape error of the tyre curve at full demand, in force over load
-    shape_share: float = 0.05
     # [s] side force behind slip (relaxation, roll), times its rate
     lag: float = 0.02
     # [1] where torque is missing: how unlike the wheels of an axle pull, of the force
@@ -243,8 +235,6 @@ class Constants(NamedTuple):
     agreeing_time: float = 1.0
     # [1] within which they agree, of the speed: radii and slip apart
     agreeing_width: float = 0.02
-    # [m/s^2] beyond which they may agree and slip all the same: ABS and full throttle
-    agreeing_most: float = 9.0
     # [1] speed that agreeing wheels tell, relative: radii and slip
     agreeing_std: float = 0.01
     # [m/s] the same at standstill
@@ -253,8 +243,6 @@ class Constants(NamedTuple):
     agreeing_slip: float = 0.6
     # [1] slip beyond that near the limit, times the cube of force over load
     agreeing_cube: float = 0.05
-    # [s] wheel speeds late, times a_x
-    agreeing_lag: float = 0.04
     # [s] one independent look at it per so much time
     agreeing_look: float = 0.25
     # [1] a_y over g up to which the rear axle follows: beyond, sliding may be what it seems

@@ -23,7 +23,7 @@ from schemas.runtime.lanes import put_lanes
 from schemas.signals import S
 
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
-YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
+YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample, and its offset
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 SLOWEST_M_S = 1.5
