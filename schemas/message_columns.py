@@ -22,8 +22,8 @@ I64: Final = "int64"
 
 
 class MessageColumn(NamedTuple):
-    """One column of a message. The attributes are those of `schemas.tables.Field`, with a type of
-    this module.
+    """One column of a message. It has the attributes of `schemas.tables.Field`, but `type` is one
+    of the types that this module defines, so that Arrow need not be imported.
     """
 
     name: str

@@ -67,7 +67,9 @@ WORDS: Final = (
 
 
 class Parser(NamedTuple):
-    """Parser to be fuzzed, with the exceptions that it documents."""
+    """Parser to be fuzzed, and the exceptions that it may raise for invalid input according to its
+    documentation.
+    """
 
     parse: Callable[[bytes], object]
     allowed: tuple[type[Exception], ...] = (InputError,)

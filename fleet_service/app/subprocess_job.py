@@ -19,8 +19,9 @@ def run_module(
     what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None
 ) -> str | None:
     """Run a Python module as a process, with the arguments `words` and the text `document` on its
-    standard input. Return its stdout, or None if `stop` was set. The process must tolerate being
-    killed at any time. `what` names the work in error messages.
+    standard input. Return its stdout, or None if `stop` was set. If `stop` is set, the process is
+    killed, so it must be a job that may be killed at any time. `what` names the work in error
+    messages.
 
     Raises:
         InputError: the process failed.

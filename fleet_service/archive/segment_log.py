@@ -37,7 +37,9 @@ class _Load(Generic[Batch]):
 
     @property
     def rows(self) -> int:
-        """Return the number of this load's rows that have not been written to disk yet."""
+        """Return how many rows of this load (rows that are written together) have not been written
+        to disk yet.
+        """
         return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
 
     def take(self, other: _Load[Batch]) -> None:

@@ -92,7 +92,9 @@ def add_part(parser: argparse.ArgumentParser) -> None:
 
 
 def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
-    """Declare the options for the archive of a command, and for the form of its report."""
+    """Declare two options of a command: one names the archive's folder, the other selects the form
+    of the command's report (text or JSON).
+    """
     parser.add_argument(
         "--archive",
         metavar="DIR",

@@ -149,7 +149,9 @@ def issue_certificate(
 
 
 def alternative_names(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
-    """Return the names and addresses for which a certificate for `name` is valid."""
+    """Return the host names and addresses that a certificate for `name` must list as alternative
+    names.
+    """
     found: list[x509.GeneralName] = [x509.DNSName(name)]
     for host in hosts:
         try:

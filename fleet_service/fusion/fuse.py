@@ -116,9 +116,9 @@ class Fusion(BeliefMap):
 
     @property
     def waiting(self) -> int:
-        """Return the number of observations in the lateness window (the recent past, in which late
-        arrivals are still sorted in). An observation that affects several cells counts once per
-        cell.
+        """Return the number of observations in the lateness windows: the recent observations, which
+        are not final because late ones may still be sorted in before them. An observation that
+        affects several cells counts once per cell.
         """
         return self.store.waiting
 

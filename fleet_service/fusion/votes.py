@@ -191,8 +191,8 @@ def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: f
 
 
 class CellPlace(NamedTuple):
-    """Rows of one cell in `Rows`: of its state, and of the list of vehicles that recently reported
-    ice or grip in it.
+    """Place of one cell in the arrays of `Rows`: row number of its state, and row number of its
+    list of vehicles that recently reported ice or grip.
     """
 
     row: int

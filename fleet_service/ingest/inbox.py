@@ -186,8 +186,9 @@ class BatchIntake:
         self.times: dict[str, int] = {}
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Return the rows of valid, new batches (messages with records), by kind (observations or
-        states); all other batches are refused or counted.
+        """Decode and check messages. Return the rows of those batches (messages with records) that
+        are valid and new, by kind (observations or states). Invalid batches are refused, and
+        repeated ones are counted.
         """
         self.times.clear()
         self._now = clock.now / NS
@@ -218,7 +219,7 @@ class BatchIntake:
         self._witnesses.sync()
 
     def acknowledge(self, batches: Sequence[BatchId]) -> None:
-        """Record acknowledgements for batches (messages with records) whose rows are durable on
+        """Queue acknowledgements for batches (messages with records) whose rows are now durable on
         disk.
         """
         self._pending.difference_update(batches)
@@ -461,8 +462,8 @@ def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, In
 def _with_identity(
     kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock
 ) -> Rows:
-    """Return the rows with columns that identify their batches (vehicle, start, region, sequence
-    number), as the archive stores them.
+    """Add to the rows the columns that identify their batches (vehicle, start, region, sequence
+    number), in the form in which the archive stores them; return all columns.
     """
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {

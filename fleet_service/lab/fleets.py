@@ -117,8 +117,8 @@ def drive_seed(fleet: Fleet, seed: int, found: Found) -> None:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Simulate all fleets and return their figures; `log_line` is called with one line per
-    fleet.
+    """Simulate all fleets with and without misbehaving vehicles, and return the figures of the map
+    by name. `log_line` is called with a line about the progress after each fleet.
     """
     out: dict[str, float] = {}
     for fleet in FLEETS:

@@ -73,7 +73,9 @@ def score_town(
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Return the figures of all fleets; `log_line` is called with lines about the progress."""
+    """Simulate all fleets of this module in towns with the given seeds, and return the figures of
+    the map by name. `log_line` is called with a line about the progress after each fleet.
+    """
     out: dict[str, float] = {}
     for name, model in MODELS.items():
         out |= _town_figures(f"fusion.{name}", [score_town(model, seed) for seed in seeds])

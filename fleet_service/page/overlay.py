@@ -1,5 +1,5 @@
-"""Additional map drawn over the live map, such as the true friction of a simulation: a Parquet file
-of cell, heading sector and mu.
+"""Additional map that the page can draw over the live map, such as the true friction of a
+simulation. It is read from a Parquet file with the columns cell, heading sector and mu.
 
 The file is read on each request, because it may appear while the page is running.
 """

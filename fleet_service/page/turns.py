@@ -1,5 +1,5 @@
-"""Queues for requests, so that one client cannot block the page, or the page's queries about the
-past, for other clients.
+"""Queues for the requests of browsers, so that one client cannot block the page for other clients,
+neither for ordinary requests nor for queries about past maps.
 
 At most RUNNING requests of one client are computed at a time; its other requests wait.
 

@@ -104,7 +104,9 @@ class Watchers:
             self._watchers.pop(watcher.queue, None)
 
     async def run(self) -> None:
-        """Send changes of the map to the browsers until the task is cancelled."""
+        """Send the changes of the map to all watching browsers, again and again, until this asyncio
+        task is cancelled.
+        """
         beaten = 0.0
         while True:
             await asyncio.sleep(FLUSH_S)

@@ -55,8 +55,8 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """Return the fusion (beliefs about all cells) that tables describe; it continues exactly like
-    the fusion that was passed to `tables_of`.
+    """Restore a fusion (beliefs about all cells) from its tables. With the same later observations,
+    it gives exactly the same results as the fusion that was passed to `tables_of`.
 
     Raises:
         InputError: the tables are of another version, or incomplete.

@@ -44,8 +44,8 @@ class MapState:
         self._changed.update(dict.fromkeys(tiles, self.change))
 
     def changed_at(self, tile: int) -> int:
-        """Return the number that the map's counter of changes had at the last change of a tile; 0
-        if the tile never changed.
+        """Return the version of a tile: the value of the map's counter of changes when the tile
+        changed last; 0 if the tile never changed.
         """
         return self._changed.get(tile, 0)
 

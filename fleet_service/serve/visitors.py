@@ -107,8 +107,8 @@ class Visitors:
             self._bits = longer
 
     def _move_on(self, part: int) -> None:
-        """Begin to count in the part with number `part` of the time window, and drop the counts of
-        parts that are too old.
+        """Begin a new part of the time window, with number `part`: vehicles are counted in it from
+        now on. Delete the counts of parts that no longer belong to the window.
         """
         ago = part - self._part
         if ago > 0:

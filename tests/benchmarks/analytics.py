@@ -253,7 +253,10 @@ def open_folder() -> Iterator[Path]:
 
 
 def main() -> int:
-    """Measure archive and analytics. Return 1 if a figure misses its target, otherwise 0."""
+    """Measure the time and the size of archive operations, and the time and the agreement of
+    analytic queries; write and print the figures. Return 1 if a figure misses its target, otherwise
+    0.
+    """
     parser = argparse.ArgumentParser(
         prog="make analytics-bench", description=(__doc__ or "").splitlines()[0]
     )

@@ -19,8 +19,9 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measure_all(folder: Path) -> list[Figure]:
-    """Measure the work on Spark and in Iceberg tables, and return all figures. Temporary files go
-    into `folder`.
+    """Run all benchmarks of this module: compare results on Spark, and the rows of Iceberg tables,
+    with those of one process; measure the speed-up. Return the figures. Temporary files are written
+    to `folder`.
     """
     logs = spread.simulate_drives(folder / "drives")
     return [
@@ -41,8 +42,8 @@ def measure_all(folder: Path) -> list[Figure]:
 
 
 def main() -> int:
-    """Measure the work on many files at once (Spark, Iceberg). Return 1 if a figure misses its
-    target, otherwise 0.
+    """Run the benchmarks of work on many files at once (Spark, Iceberg), and write and print the
+    figures. Return 1 if a figure misses its target, otherwise 0.
     """
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:

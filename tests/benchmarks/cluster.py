@@ -46,8 +46,8 @@ def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
 
 
 def cluster() -> list[Figure]:
-    """Compare the acknowledgement times of a service whose archive has a copy in a bucket (object
-    store) with those of a service without.
+    """Measure the times until acknowledgement of a service whose archive has a copy in a bucket
+    (object store), and of a service without a copy. Return their ratio as a figure.
     """
     alone: list[float] = []
     both: list[float] = []

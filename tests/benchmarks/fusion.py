@@ -171,8 +171,8 @@ def resident() -> None:
 
 
 def fusion() -> list[Figure]:
-    """Measure observations per second of the map computation (fusion) alone into 10⁶ cells, the
-    effect of more cells, and memory.
+    """Run the benchmarks of the map computation (fusion): observations per second with 10⁶ cells,
+    slowdown with more cells, and memory. Return the figures.
     """
     few = per_observation_s(10_000)
     many = per_observation_s(CELLS)

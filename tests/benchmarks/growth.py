@@ -40,8 +40,8 @@ SECOND: Final = 10**9
 
 
 def growth() -> list[Figure]:
-    """Measure the processor time of the engine (service without network) for one second of messages
-    at 10³ to 10⁵ observations per second.
+    """Measure how much processor time an engine (service without network) needs for the messages of
+    one second, at rates from 10³ to 10⁵ observations per second. Return the figures.
     """
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])

@@ -363,7 +363,9 @@ def count_states() -> float:
 
 
 def measure_all() -> list[Figure]:
-    """Measure the live page, and return all figures in the order of the printed table."""
+    """Run all benchmarks of the live page, and return the figures in the order of the printed
+    table.
+    """
     with open_stage(SEED) as on:
         found = _time_part("drawn", lambda: measure_drawing(on))
         found["push_p95_ms"] = _time_part("pushed", lambda: pushed_ms(on))
@@ -404,8 +406,8 @@ def _time_part(what: str, measure: Callable[[], T]) -> T:
 
 
 def main() -> int:
-    """Measure the live page and write the figures. Return 1 if a figure misses its target,
-    otherwise 0.
+    """Run all benchmarks of the live page, and write and print the figures. Return 1 if a figure
+    misses its target, otherwise 0.
     """
     began = time.time_ns()
     rows = measure_all()

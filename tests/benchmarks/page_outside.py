@@ -287,7 +287,9 @@ def join_right() -> float:
 
 
 def measure_outside() -> list[Figure]:
-    """Measure the page's interfaces for other systems, and return all figures."""
+    """Run all benchmarks of this module (DATEX II, OGC API Features, links of a road network), and
+    return the figures.
+    """
     invalid, unended = made_up(is_valid())
     try:
         found = measure_publication()

@@ -35,8 +35,9 @@ QUERIES = 15
 
 
 def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
-    """Measure the time [ms] of a query about a past map (`at=`) for a thousand cells, and the
-    largest change of a cell's probabilities caused by a restart.
+    """Measure the time [ms] of a query for a thousand cells of a past map (parameter `at`), and the
+    largest difference between the probabilities of a cell before and after a restart. Return the
+    figures.
     """
     synthetic.write_archive(root, WORLD)
     compact(root)

@@ -244,8 +244,9 @@ def ack_delays_s(
 
 
 def service() -> list[Figure]:
-    """Measure queries, alerts and acknowledgements under 20 000 observations/s, and compare queries
-    with those of a bare Zenoh queryable (program that only answers queries).
+    """Measure the times of queries, alerts and acknowledgements of a service that receives 20 000
+    observations/s. Compare the queries with those of a bare Zenoh queryable (program that only
+    answers queries). Return the figures.
     """
     tile = keys.map_key(_TILE)
     # The first cell. The box goes from it over all columns and half of the lines. It is a little

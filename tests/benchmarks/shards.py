@@ -44,8 +44,9 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """Measure the time to ingest a burst of messages in one service, and in two services that share
-    its regions, with engines (services without network) and over Zenoh.
+    """Measure the time in which one service ingests a burst of messages, and the time that two
+    services need that serve one half of its regions each. Both are measured with engines (services
+    without network) and over Zenoh. Return the figures.
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
@@ -95,8 +96,8 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
 
 
 def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
-    """Start a round in all processes, and return the time [s] until all have finished. The first
-    round is a warm-up.
+    """Let all processes ingest one burst at the same time, and return the time [s] until all have
+    finished. The caller ignores the first round, which is a warm-up.
     """
     began = time.perf_counter()
     for process in running:

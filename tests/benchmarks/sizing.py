@@ -37,7 +37,9 @@ BAR: Final = 0.2
 
 
 def sizing() -> list[Figure]:
-    """Measure the relative error of the calculated memory at 10⁴ and 10⁵ vehicles."""
+    """Measure the memory of an engine (service without network) with 10⁴ and with 10⁵ vehicles.
+    Return as figures the relative errors of the memory that `fleet-service size` calculates.
+    """
     out = []
     for vehicles, messages in VEHICLES.items():
         command = [sys.executable, "-m", "tests.benchmarks.sizing", str(vehicles), str(messages)]

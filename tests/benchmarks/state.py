@@ -40,8 +40,8 @@ SECOND: Final = 10**9
 
 
 def state() -> list[Figure]:
-    """Measure the saving of a service's state with 10⁶ cells (a checkpoint) during ingest, and a
-    restart from it.
+    """Measure, for a service with 10⁶ cells, the time to write a checkpoint (saved state) while
+    messages are ingested, and the time of a restart from it.
     """
     now = START + int(SPAN_S) * SECOND
     with tempfile.TemporaryDirectory() as name:

@@ -45,8 +45,9 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Measure an archive of twenty million observations and forty million states (in a quick run,
-    eighty thousand observations), and return the figures.
+    """Generate an archive of twenty million observations and forty million states (in a quick run,
+    eighty thousand observations). Measure how long a service needs to start from it, and the cost
+    of a query about the past; return the figures.
     """
     millions = site.choose_amount(2000, 8) / 100
     shares = (0.1,) if site.quick else (0.1, 0.3)
@@ -186,8 +187,8 @@ def _encode_past_query(root: Path) -> bytes:
 
 
 def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """Run the operation `what` (such as a start) of the program `age_process` on an archive, and
-    return the figures that it prints.
+    """Run the program `age_process` with the operation `what` ("ready", "checkpoint" or "past") on
+    an archive. Return the time [s] and the peak memory [MB] that it prints.
     """
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)

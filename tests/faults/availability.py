@@ -42,7 +42,9 @@ Attack = AbstractContextManager[None]
 
 
 class Target(NamedTuple):
-    """Addresses of the page and the service that are attacked, and address of the router."""
+    """Addresses of the live page and of the service, which are attacked, and of the router between
+    them.
+    """
 
     host: str
     port: int
@@ -51,8 +53,8 @@ class Target(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Send twenty requests of another reader during each attack (in a quick run, six), and return
-    figures of their answers.
+    """Send twenty requests of another reader during each attack (in a quick run, six). Return as a
+    figure the share of these requests that are answered during the worst attack.
     """
     asked = site.choose_amount(20, 6)
     served = {}

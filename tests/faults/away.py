@@ -180,6 +180,8 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
 
 
 def _list_shown_cells(engine: Engine) -> set[int]:
-    """Return the map's cells with at least one counted visit (pass of a vehicle)."""
+    """Return the numbers of the cells on the service's map in which at least one visit (passage of
+    a vehicle) is counted.
+    """
     fusion = engine.state.fusion
     return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

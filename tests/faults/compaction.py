@@ -109,7 +109,7 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
 
 def run(site: Site) -> list[Figure]:
     """Kill a compaction of the archive (its sorting of new rows) 50 times (in a quick run, five
-    times), and return figures of lost and doubled rows.
+    times), and return the numbers of lost and doubled rows as figures.
     """
     root = site.folder / "archive"
     random_ = random.Random(site.seed)

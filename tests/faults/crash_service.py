@@ -6,9 +6,9 @@ A history is a few lives (runs of the service) of one archive, days apart. In ea
 receives batches and weather, and its maintenance jobs run in any order. Between two lives an
 operator may erase one vehicle's month or the whole month. The power fails at a random operation.
 The next life must find every acknowledged row exactly once, and all weather that was used. It must
-recognise a repeated batch if and only if the archive contains it. The map from a checkpoint and the
-log must equal the map from the log alone, no compacted file may be damaged, and erased rows must
-not come back.
+recognise a repeated batch if and only if the archive contains it. The map restored from a
+checkpoint and later rows must equal the map restored from all rows without a checkpoint, no
+compacted file may be damaged, and erased rows must not come back.
 """
 
 from __future__ import annotations
@@ -303,8 +303,8 @@ class ServiceHistory(Lives[Sent]):
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
 
     def _find_state_errors(self, root: Path, rows: Counter[int]) -> list[str]:
-        """Compare the map and the known batches restored from a checkpoint (saved state) with those
-        restored from the log alone, and return the differences.
+        """Restore the map and the known batches twice: from a checkpoint (saved state) and later
+        rows, and from all archived rows without a checkpoint. Return a message for each difference.
         """
         if not (root / "inbox").is_dir():
             return []

@@ -109,8 +109,9 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Fill the disk several times, at different stages of the background jobs, and return figures
-    of losses and recovery.
+    """Fill the disk several times, at different stages of the background jobs. Return the figures:
+    rows acknowledged without being stored, and parts that do not continue when the disk has space
+    again.
     """
     false = 0
     stuck = 0

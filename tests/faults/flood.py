@@ -98,7 +98,7 @@ class Honest:
         )
 
     def drive(self) -> None:
-        """Send the next batch of this honest vehicle."""
+        """Publish the next batch of this honest vehicle, and remember when it was sent."""
         seq = len(self.sent) + 1
         one = make_visit(self.name, seq, time.time_ns())
         self._last[seq] = time.monotonic()
@@ -120,8 +120,8 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood the service for half a minute (in a quick run, three seconds), and return figures of
-    its effect on the other vehicles.
+    """Flood the service for half a minute (in a quick run, three seconds), and return as figures
+    how much the other vehicles' acknowledgements and the map change.
     """
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])

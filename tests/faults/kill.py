@@ -63,8 +63,8 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """Load during the kills: number of observations, duration [s], and True if retention (deletion
-    of old rows) removed a day meanwhile.
+    """Load of the system while processes were killed: number of observations sent, duration [s],
+    and True if a retention process (deletion of old rows) removed a day in this time.
     """
 
     observations: int
@@ -158,9 +158,9 @@ def _find_finished_jobs(archive: Path) -> frozenset[str]:
 
 
 def map_difference(archive: Path) -> float:
-    """Compare the map that a service restores from its checkpoint (saved state) with the map from
-    the log alone. Return the largest difference of mu, its bounds and P(slippery), or infinity if a
-    cell or a visit is missing.
+    """Restore the map of a service twice: from its checkpoint (saved state) and later rows, and
+    from all archived rows without a checkpoint. Return the largest difference of mu, its bounds and
+    P(slippery) between both maps, or infinity if a cell or a visit is missing.
     """
     maps = []
     for _ in range(2):

@@ -187,7 +187,9 @@ class VirtualTime:
         return self.now * self.process.rate
 
     def time(self) -> float:
-        """Return the reading [s] of the wall clock of the running simulated process."""
+        """Return the time [s] that the wall clock of the currently running simulated process
+        shows.
+        """
         return self.process.wall + self.now
 
 
@@ -284,7 +286,9 @@ class ServiceHistory:
         self.refused = 0
 
     def run(self) -> None:
-        """Simulate the three services to the end of the run."""
+        """Run the simulation: let the three services compete for the lease until the simulated time
+        is over.
+        """
         for name in NAMES:
             self._start_process(name, 0.0)
         chaos = _Process("chaos", self._random, 1.0)

@@ -98,7 +98,9 @@ class Namespaces:
         return car, link
 
     def move_car(self, car: str, number: int) -> None:
-        """Give the car another address, as a mobile network does; the old address is removed."""
+        """Give the simulated car a new network address and remove the old one, as a mobile network
+        does.
+        """
         device = f"{DEVICE}77"
         run_command("ip", "-n", car, "address", "flush", "dev", device)
         run_command("ip", "-n", car, "address", "add", f"10.77.0.{number}/24", "dev", device)

@@ -39,7 +39,8 @@ WHOLE_WAY: Final = 200
 
 def run(site: Site) -> list[Figure]:
     """Cut the newest segment (file of new rows) at every byte, and change every fifth byte (in a
-    quick run, some hundred bytes); return figures of lost rows.
+    quick run, some hundred bytes); return as figures how many rows were lost or wrongly counted as
+    received.
     """
     logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
     batches, newest = _write_archive(site.folder)

@@ -47,7 +47,8 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
     """Return the longest time [s] between two outputs of a command on a terminal, including start
     and end.
 
-    A command that prints `ready` is interrupted then, and the time until its end does not count.
+    A command that runs until it is stopped is interrupted as soon as it prints `ready`; the time
+    until it has ended does not count.
     """
     here, there = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}

@@ -1,4 +1,6 @@
-"""`weather`: values of mu by the temperature at the nearest weather station in the same hour."""
+"""`weather`: statistics of the reported values of mu, by the air temperature that the nearest
+weather station measured in the same hour.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,3 @@
-"""Export from an archive: extracts as tables, and a mirror of its files."""
+"""Export from an archive: selected rows as tables, and a mirror (copies of its files on another
+file system).
+"""

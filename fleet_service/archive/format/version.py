@@ -88,7 +88,8 @@ def is_newer(entries: Mapping[str, str]) -> bool:
 
 
 def check_version(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
-    """Return the format version of an archive file, given its columns and key-value pairs.
+    """Check the columns of an archive file and the key-value pairs of its footer; return the file's
+    format version.
 
     Raises:
         DamagedError: the columns or the key-value pairs are not those that were written.

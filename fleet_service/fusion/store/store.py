@@ -118,8 +118,8 @@ class Store:
 
     @property
     def waiting(self) -> int:
-        """Return the number of entries (observations) in the lateness windows (recent past) of all
-        cells.
+        """Return the number of entries (observations) in the lateness windows (lists of recent
+        observations, which are not final) of all cells.
         """
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 

@@ -79,8 +79,8 @@ def _make_stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Let a service ingest simulated messages of the given kind, and print the memory that they
-    added [bytes].
+    """Let a service ingest simulated messages of the given kind, and print by how many bytes the
+    memory of its process has grown.
     """
     sent = _make_stream(kind)
     with (

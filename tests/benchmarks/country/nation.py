@@ -321,8 +321,8 @@ def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> l
 
 
 def _make_share_figures(looks: Sequence[Look], observations: int) -> list[Figure]:
-    """Return figures of the processor time of services, router and sender in the measured ten
-    minutes.
+    """Return figures of the processor time that services, router and sender used in the measured
+    ten minutes: cores used by each of them, and time per observation.
     """
     late = [look for look in looks if look.time >= WARM_S]
     first = late[0]

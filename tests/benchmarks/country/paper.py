@@ -19,8 +19,8 @@ DAY_S: Final = 86_400.0
 
 
 def estimate_million(found: Mapping[str, float]) -> list[Figure]:
-    """Return estimated figures (memory, processor time) for a million vehicles that each report at
-    the country's rate.
+    """Return estimated figures (memory, processor time) of a service for a million vehicles, each
+    of which reports as often as a vehicle of the simulated country.
 
     Args:
         found: measured figures of the country by name.

@@ -46,8 +46,8 @@ def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Fig
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure the inputs and write the figures. Return 0 if every figure meets its target,
-    otherwise 1.
+    """Evaluate the readers, the signal doctor, the calibration and the live sources, and write the
+    figures. Return 0 if every figure meets its target, otherwise 1.
     """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.inputs", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(".evaluation/inputs"))

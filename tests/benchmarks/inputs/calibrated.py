@@ -127,8 +127,9 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
-    """Return the width of the friction interval with calibration, its ratio to the width without
-    calibration, and the share of true values inside it in both cases, as figures.
+    """Return three figures with and without a calibration of the cars: mean width of the friction
+    interval with calibration, this width divided by that without calibration, and the share of true
+    frictions inside the interval.
     """
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)

@@ -273,7 +273,10 @@ def _health_problems(port: int) -> list[str]:
 
 
 def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
-    """Return the number of lost samples by kind of source, and the number of agents that failed."""
+    """Run the benchmark: count the samples that are lost from each kind of live source in
+    `seconds`, and the agents that fail when their source is killed `kills` times. Return these
+    counts as figures.
+    """
     found = []
     for kind in COUNTED:
         missing, sent = count_lost(kind, folder, seconds)

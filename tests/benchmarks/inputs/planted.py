@@ -103,8 +103,8 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """Return the drive with a status bit in the upper bits of a wheel speed, set in two of seven
-    readings, as wrongly decoded messages have it.
+    """Return the drive with a recording error as of a wrongly decoded message: in two of seven
+    readings of one wheel speed, an upper bit of the number is set, because it is a status bit.
     """
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
@@ -203,8 +203,8 @@ def drives(
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Return two booleans: True if the signal doctor (a check of recorded signals) names the fault,
-    and True if it finds the drive free of faults.
+    """Let the signal doctor (a check of recorded signals) examine a drive. Return two booleans:
+    True if it names the added fault `planted`, and True if it reports no fault at all.
     """
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}

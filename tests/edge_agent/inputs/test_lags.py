@@ -21,8 +21,8 @@ CAR = load_vehicle("class:compact")
 
 
 def integrate_step_by_step(speed: FloatArray, steering: FloatArray, car: Vehicle) -> FloatArray:
-    """Return the yaw rate of the bicycle model; each step of the trapezoidal rule is one solution
-    of its equations.
+    """Return the yaw rate of the bicycle model, computed sample by sample: the linear equations of
+    each step of the trapezoidal rule are solved one after the other.
     """
     a = car.cg_to_front_axle
     b = car.cg_to_rear_axle

@@ -1,4 +1,6 @@
-"""Tests that slippery neighbours influence a cell, and that this influence has limits."""
+"""Tests that reports of ice in neighbouring cells make a cell more probably slippery, within the
+documented limits.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Tests of the page's states in a real browser: each state is named in words. A picture of each is
-kept in `.page/states`, so that a person can look at it.
+"""Tests of the live page in a real browser, in each of its states (such as "no service answers"):
+the page must name the state in words. A picture of each state is stored in `.page/states`, so that
+a person can look at it.
 """
 
 from __future__ import annotations

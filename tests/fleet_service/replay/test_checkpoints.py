@@ -1,5 +1,5 @@
-"""Tests of checkpoints (saved states of a service): a restart from a checkpoint equals a restart
-from the whole log, and reads only later rows.
+"""Tests of checkpoints (saved states of a service): a restart from a checkpoint gives the same
+state as a restart from all archived rows, and reads only rows written after the checkpoint.
 """
 
 from __future__ import annotations
@@ -165,8 +165,9 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """The state restored from a checkpoint (saved state), or from the log alone, must equal that of
-    the running service. In the test, some reports before the checkpoint are late and out of order.
+    """The state restored from a checkpoint (saved state), and the state restored from all archived
+    rows without it, must equal that of the running service. In the test, some reports before the
+    checkpoint are late and out of order.
     """
     rng = np.random.default_rng(3)
     now = time.time_ns()

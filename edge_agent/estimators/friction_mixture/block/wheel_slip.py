@@ -32,7 +32,7 @@ REAR_LAG_S = 0.1
 
 @compiled
 def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.slip, the signs of sliding wheels, with the wheel speeds of the block (the
+    """Update the evidence that wheels slide, memory.slip, with the wheel speeds of the block (the
     samples within 0.05 s).
     """
     slip = memory.slip

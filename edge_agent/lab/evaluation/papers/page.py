@@ -47,16 +47,17 @@ def cells(row: PaperRow) -> list[str]:
 
 
 def limit_text(row: PaperRow) -> str:
-    """Return the target of the number under the paper's conditions as text, for example "≤ 0.02";
-    "" without a target."""
+    """Return as text the target for the result under the paper's conditions (`matched`), for
+    example "≤ 0.02"; "" if there is no target.
+    """
     if row.limit is None:
         return ""
     return f"{'≤' if row.better == 'less' else '≥'} {row.limit:g}"
 
 
 def summary(done: Reproduction) -> str:
-    """Return one sentence of the report that states how many numbers under the paper's conditions
-    meet their target.
+    """Return one sentence for the report: how many of the results under the paper's conditions meet
+    their targets.
     """
     barred = [row for row in done.rows if row.limit is not None]
     text = f"{len(barred) - len(done.missed_rows)} of {len(barred)} matched numbers meet their bar."
