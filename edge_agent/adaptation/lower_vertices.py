@@ -24,10 +24,10 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.adaptation.memberships import SETS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-SETS: Final = 5
 FEET: Final = 2 * (SETS - 1)
 # share of the distance of two peaks by which their sets overlap at least
 LEAST_OVERLAP: Final = 0.02

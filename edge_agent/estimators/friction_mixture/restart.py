@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.arrays import clear_vector
 from edge_agent.estimators.common.excitation import begin_excitation
@@ -32,16 +33,12 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# [m/s] wheels that turn slower at the first sample are those of a car at rest
-REST_M_S = 0.1
 # along, over load, below which wheels that roll alike are taken for rolling freely
 FREE_FORCE = 0.05
 ALIKE = 0.03  # relative difference of their speeds
 FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
-LEAST_ROLLING_M_S = 0.5  # slower wheels may be locked
 LOST_SPREAD_M_S = 5.0
-# of the speed that agreeing wheels tell: beyond, the motion is lost
-FAR_M_S = 0.7
+# of the speed that agreeing wheels tell, beyond `diverged_x`: there the motion is lost
 FAR_SHARE = 0.04
 FAR_SPREADS = 2.0
 
@@ -55,6 +52,7 @@ def start_vehicle(
     """
     if not math.isfinite(time):
         return flags.TIME_GAP
+    constants = design.constants
     last = memory.last
     now = memory.last.now
     block = memory.block
@@ -75,7 +73,7 @@ def start_vehicle(
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
     forget_vehicle(memory)
     covariance = memory.overall_covariance
-    first = STANDING_STD if speed < REST_M_S else FIRST_V_STD
+    first = STANDING_STD if speed < constants.agreeing_floor else FIRST_V_STD
     covariance[NodeState.VX, NodeState.VX] = (first if known else UNKNOWN_V_STD) ** 2
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
@@ -125,18 +123,19 @@ def reset_to_wheel_speed(
     recover: the tyre curve is flat there, so the measurements hardly change their velocity.
     """
     rolling = memory.rolling
+    near = design.constants.diverged_x
     if not math.isnan(rolling.ahead):
-        far = FAR_M_S + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.ahead_std
+        far = near + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.ahead_std
         astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
         if not math.isnan(rolling.left):
-            far = FAR_M_S + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.left_std
+            far = near + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.left_std
             astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
         if astray:
             return _begin_anew(memory, design, rolling.ahead)
     speed = free_speed(memory, features)
     if memory.last.time - rolling.disagreed_time < FREE_S or math.isnan(speed):
         return 0
-    if abs(memory.overall_mean[NodeState.VX] - speed) > FAR_M_S + FAR_SHARE * speed:
+    if abs(memory.overall_mean[NodeState.VX] - speed) > near + FAR_SHARE * speed:
         restart_motion(
             memory, speed, FIRST_V_STD
         )  # friction stays: a slide that ended has taught it
@@ -158,7 +157,7 @@ def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
             fastest = max(fastest, features.rolling[wheel])
     turning = abs(features.yaw_rate) * memory.row[Parameter.TRACK_REAR]
     alike = fastest - slowest <= ALIKE * max(fastest, SLOWEST_M_S) + turning
-    return fastest if alike and fastest > LEAST_ROLLING_M_S else math.nan
+    return fastest if alike and fastest > SLOWEST_SLIP_M_S else math.nan
 
 
 @compiled

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
@@ -34,7 +35,6 @@ from edge_agent.estimators.friction_mixture.mixture.mixing import (
     wake_or_sleep,
 )
 from edge_agent.estimators.friction_mixture.mixture.trust import (
-    LEAST_VARIANCE,
     nominal_agreement,
     update_consistency,
 )
@@ -91,7 +91,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     features.speed = abs(memory.overall_mean[NodeState.VX])
     health = block_features(memory, design, features)
     learn_drive(memory, design.constants, features)
-    update_slip(memory, design.constants, features)
+    update_slip(memory, features)
     vx, vy = turned_velocity(memory, features.gain, features.cos, features.sin)
     update_novelty(memory, design, features, vx, vy)
     watch_wheels(memory, design.constants, features)
@@ -104,7 +104,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     share_weights(memory, scratch)
     match_moments(memory, scratch)
     memory.health = health | reset_to_wheel_speed(memory, design, features)
-    ratio = scratch.actual_sum[1] / max(scratch.stated_sum, LEAST_VARIANCE)
+    ratio = scratch.actual_sum[1] / max(scratch.stated_sum, TINY)
     update_consistency(memory, design, features.duration, ratio, memory.health)
     if memory.trust.distrust > 0.0:
         memory.health |= flags.CONTRADICTION

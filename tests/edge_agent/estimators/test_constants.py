@@ -117,7 +117,6 @@ MOVES = {
     ),  # they are forgotten sooner
     "spin_share": Move("nis", "braking", 0.9),
     # wheels that slide
-    "slip_time": Move("least probabilities", "acceleration", 1.04, LESS),
     "slip_change": Move(
         "least probabilities", "acceleration", 1.1
     ),  # the road may be any other sooner
@@ -138,7 +137,7 @@ MOVES = {
     "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
-    "drift": Move("std VX", "slalom", 1.2),
+    "drift": Move("std VX", "slalom", 1.19),
     # noise: what is expected to be larger is found to be smaller than expected
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
@@ -159,7 +158,6 @@ MOVES = {
     "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
     "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
-    "agreeing_look": Move("std VX", "turn and straight", 1.1),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
     "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),
     # no friction below the grip in use

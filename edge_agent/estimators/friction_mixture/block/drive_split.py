@@ -13,6 +13,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.numeric import FloatArray
@@ -32,10 +33,8 @@ BRAKES_FRONT = 0.64
 BRAKES_STD = 0.06
 ENGINE_BRAKE = 1.5  # [m/s^2] to twice this a car may slow by its engine, on the driven axle alone
 PULLS = 0.05  # a_x over g from which the driven axle shows
-FAST_M_S = 3.0  # slip is told above this speed
-TURNS_M_S2 = 3.0  # and below this lateral acceleration
+TURNS_M_S2 = 3.0  # lateral acceleration below which it shows
 UNLIKE = 0.3  # share of the slip asked for by which stiffness and load differ
-LOOK_S = 0.2  # one independent look per so much time
 LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
 
 
@@ -71,12 +70,12 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
     rolling = features.rolling
     pull = features.change / GRAVITY
     speed = 0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3])
-    if not (pull > PULLS and speed > FAST_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
+    if not (pull > PULLS and speed > SLOW_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
         return
     apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
     rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     per_force = pull / row[Parameter.SLOPE_X]
-    look = min(features.duration / LOOK_S, 1.0)
+    look = min(features.duration / constants.correlation_time, 1.0)
     total = 0.0
     for kind in range(3):
         asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))

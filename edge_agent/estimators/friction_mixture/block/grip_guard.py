@@ -11,13 +11,13 @@ from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.memory import GripInUse, Quantiles
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
 # smoothing: of the noise of accelerometers and of what a body shakes
 SLOW_S = 0.15
 FAST_S = 0.06
-HELD_S = 1.0  # the largest grip holds so long,
-FORGOTTEN = 0.5  # [1/s] and then fades: roads change
+# [1/s] at which the largest grip fades after UTILISED_WINDOW_S: roads change
+FORGOTTEN = 0.5
 ABOVE = 0.02  # what smoothing takes from the top of a hard stop
 # of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
 AT_PEAK = 0.95
@@ -35,7 +35,7 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
     if grip.fast >= grip.held:
         grip.held = grip.fast
         grip.age = 0.0
-    elif grip.age > HELD_S:
+    elif grip.age > UTILISED_WINDOW_S:
         grip.held = max(grip.fast, grip.held - FORGOTTEN * dt)
 
 

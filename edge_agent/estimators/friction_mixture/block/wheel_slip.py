@@ -13,10 +13,11 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
-from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import NodeState
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
+from schemas.thresholds import UTILISED_WINDOW_S
 
 SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like slip
 # of the speed, between two wheels: may slide, slides
@@ -31,14 +32,14 @@ REAR_LAG_S = 0.1
 
 
 @compiled
-def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
+def update_slip(memory: MixtureMemory, features: BlockFeatures) -> None:
     """Update the evidence that wheels slide, memory.slip, with the wheel speeds of the block (the
     samples within 0.05 s).
     """
     slip = memory.slip
     seen = slip_membership(memory, features)
     slip.begins = max(seen - slip.held, 0.0)
-    slip.held = max(seen, slip.held * math.exp(-features.duration / constants.slip_time))
+    slip.held = max(seen, slip.held * math.exp(-features.duration / UTILISED_WINDOW_S))
     slip.ended = slip.held - seen
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]

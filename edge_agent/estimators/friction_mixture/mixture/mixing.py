@@ -44,7 +44,6 @@ from schemas.runtime.lanes import lanes_at, largest_lane, put_lanes, select, sum
 from schemas.runtime.records import LANES
 
 LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
-LEAST_WEIGHT = 1e-9  # nor does a node of less
 # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
 SLEEPING_SHARE = 0.5
 FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
@@ -183,7 +182,7 @@ def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
             total = 0.0
             for group in range(groups):
                 share = lanes_at(scratch.share, group)
-                share = select(share < LEAST_WEIGHT, 0.0, share)
+                share = select(share < SMALLEST, 0.0, share)
                 product = lanes_at(apart, (group, i)) * lanes_at(apart, (group, j))
                 total += share * (lanes_at(memory.covariance, (group, i, j)) + product)
             found = sum_lanes(total)

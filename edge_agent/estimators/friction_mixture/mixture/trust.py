@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.adaptation.rule_base import forgetting_rate
+from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
@@ -36,12 +37,12 @@ from edge_agent.estimators.friction_mixture.state.constants import (
     NodeState,
 )
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory, Trust
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU
 
-LEAST_VARIANCE = 1e-12  # before the first innovation
 FACTOR = 9.0  # contradiction: errors are three times what they can be
 LARGEST_RATIO = 4.0  # [nat/s] a burst of half a second contradicts nothing
 CALLED_BACK = 0.5  # of odd_least: once may be a pothole
@@ -49,9 +50,6 @@ LONGEST_PATIENCE = 600.0  # [s]
 RELAPSE = 4.0  # times as long as the last time
 FORGIVEN_S = 300.0  # in which that is forgotten
 STRAIGHT = 0.6  # [m/s^2] a_y up to which it is tried again: there the wheels tell the motion
-# [m/s] tight turns of parking lie outside the model's range, and test nothing
-SLOW_FOOT = 3.0
-SLOW_PEAK = 6.0
 
 
 @compiled
@@ -75,7 +73,7 @@ def update_consistency(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
     )
     trust.hurry = forgetting_rate(
-        design.rules, memory.actual[0] / max(memory.theoretical[0], LEAST_VARIANCE) - 1.0
+        design.rules, memory.actual[0] / max(memory.theoretical[0], TINY) - 1.0
     )
     if trust.distrust > 0.0:
         trust.left -= duration
@@ -112,7 +110,7 @@ def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float
     range and do not count either.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
-    moving = min(max((speed - SLOW_FOOT) / (SLOW_PEAK - SLOW_FOOT), 0.0), 1.0)
+    moving = min(max(speed / SLOW_M_S - 1.0, 0.0), 1.0)
     return float(
         moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio
     )

@@ -48,8 +48,7 @@ from schemas.runtime.lanes import (
 )
 from schemas.runtime.records import LANES
 from schemas.signals import S
-
-LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
+from schemas.thresholds import UTILISED_WINDOW_S
 
 
 @compiled
@@ -143,7 +142,7 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     best = -math.inf
     for j in range(count):
         best = max(best, scratch.log_likelihood[j])
-    need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
+    need = (constants.demand_half / max(features.demand, TINY)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
     slid = memory.slip.held
     share = features.novelty / (1.0 + need)
@@ -216,7 +215,7 @@ def update_novelty(
     change = max(force, slip)
     features.new = change**2 / (change**2 + constants.steady_half**2)
     slides *= slippery_probability(memory, design)
-    held = memory.slip.axle_held * math.exp(-features.duration / constants.slip_time)
+    held = memory.slip.axle_held * math.exp(-features.duration / UTILISED_WINDOW_S)
     memory.slip.axle_held = max(slides, held)
     steady = min(max(2.0 - 2.0 * force / max(features.demand, TINY), 0.0), 1.0)
     memory.slip.axle_ended = (memory.slip.axle_held - slides) * steady

@@ -19,6 +19,7 @@ from edge_agent.estimators.friction_mixture.node.covariance import subtract_row,
 from edge_agent.estimators.friction_mixture.node.residuals import gained_by
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray
@@ -29,10 +30,10 @@ from schemas.thresholds import GRAVITY
 
 STANDING_STD = 0.05  # [m/s] sensors of a wheel that creeps show nothing
 STANDING_RAD_S = 0.05  # a wheel that turns slower stands
-RESTING_TIME = 1.0  # [s] smoothing of a_x while wheels stand
 STARTS = 0.25  # [m/s^2] from there within which the car does not start or stop
-SLOW_M_S = 3.0  # a faster car whose wheels stand has locked them, or the filter is lost:
-SLIDES_M_S2 = 1.0  # a car with locked wheels decelerates by more on all but the slipperiest ice
+# If the wheels of a car faster than SLOW_M_S stand, they are locked, or the filter is lost. A car
+# with locked wheels decelerates by more than this on all but the slipperiest ice.
+SLIDES_M_S2 = 1.0
 LOCKED_SHARE = 0.1  # of the speed: wheels that all turn slower while the car decelerates are locked
 LOST_S = 2.0  # [s] until wheels that stand without that are those of a car that stands
 LONGEST_SLIDE_S = 10.0  # [s] of a car with locked wheels
@@ -99,7 +100,7 @@ def _update_standstill(
         rolling.resting_ax = features.change
     if not still:
         rolling.moved_time = time
-    keep = math.exp(-features.duration / RESTING_TIME)
+    keep = math.exp(-features.duration / constants.window)
     rolling.resting_ax = keep * rolling.resting_ax + (1.0 - keep) * features.change
     wait = constants.standing_time
     if features.speed >= SLOW_M_S:
@@ -161,7 +162,7 @@ def take_rolling(
     cost = 0.0 * lanes_at(mean, 0)
     cos = features.cos
     sin = features.sin
-    look = max(constants.agreeing_look / features.duration, 1.0)
+    look = max(constants.correlation_time / features.duration, 1.0)
     if not math.isnan(rolling.ahead):
         ahead = cos * lanes_at(mean, NodeState.VX) + sin * lanes_at(mean, NodeState.VY)
         innovation = rolling.ahead - (ahead + gained_by(features.gain, mean)[0])

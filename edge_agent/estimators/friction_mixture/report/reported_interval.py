@@ -31,11 +31,10 @@ LEARNED_END = 0.86  # and one in eighty on level drives
 LEARNED = 0.05  # [nat] divergence at which most of it is
 # [1] most by which the upper end comes nearer: a belief that leans to ice has a long upper tail
 DRAWN_IN = 0.085
-# How much nearer it comes in a car that is as its file says, by level and at the most: what else is
+# How much nearer it comes in a car that is as its file says, by level and in friction: what else is
 # wrong of it is small as well. On level drives one truth in eighty had lain above. The lower end
 # stays: safe deceleration rests on it.
 NEARER = 0.15
-DRAWN_NEARER = 0.15
 
 
 @compiled
@@ -81,5 +80,5 @@ def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> flo
     widest = quantile(design.mu, design.prior, weight, UPPER_END)
     return max(
         quantile(design.mu, design.prior, weight, level),
-        widest - DRAWN_IN - DRAWN_NEARER * likeness,
+        widest - DRAWN_IN - NEARER * likeness,
     )

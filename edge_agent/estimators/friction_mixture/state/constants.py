@@ -21,11 +21,6 @@ ALL_NODES = NODES + SPLIT_NODES
 GROUPS = -(-ALL_NODES // LANES)
 PLACES = GROUPS * LANES
 PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
-CURVED = 4  # states in which the rows of measurement are not linear
-# states up to this one are differentiated one by one; the others follow from these and from speeds
-STRAIGHT = 10
-ACTIVE = 18  # states that the rows see within a block
-STATES = 20
 ROWS = 6  # of measurement: four wheels along, two axles across
 
 
@@ -53,6 +48,13 @@ class NodeState(IntEnum):
     BANK = 19  # gravity across the road, felt to the left [m/s^2]
 
 
+CURVED = int(NodeState.STEER)  # states in which the rows of measurement are not linear
+# states up to this one are differentiated one by one; the others follow from these and from speeds
+STRAIGHT = int(NodeState.RADIUS)
+ACTIVE = int(NodeState.SLOPE)  # states that the rows see within a block
+STATES = NodeState.BANK + 1
+
+
 class Constants(NamedTuple):
     """Constants of the default estimator's filter. A comment above each one gives its unit and
     reason.
@@ -62,10 +64,10 @@ class Constants(NamedTuple):
 
     # [s] one measurement update per block: model error is correlated over more, so nothing is lost
     block_time: float = 0.05
-    # [s] one independent measurement of the tyre per so much time: R is inflated by it over a block
-    # (errata)
+    # [s] one independent measurement of tyre or wheel speeds per so much time: R is inflated by it
+    # over a block (errata)
     correlation_time: float = 0.26
-    # [s] window of the innovation variances
+    # [s] window of the innovation variances, and of a_x at rest
     window: float = 1.0
 
     # [1/m] one road change to anywhere per 270 m (190: beliefs fade before grip is used again)
@@ -220,8 +222,6 @@ class Constants(NamedTuple):
     # own, ABS acts at 8 Hz
     spin_share: float = 0.3
 
-    # [s] for which a slide is remembered
-    slip_time: float = 1.0
     # [1] probability of a road change where a wheel begins to slide
     slip_change: float = 0.3
     # [1/m] one road change per so much where a wheel has slid and grips again: ice comes in patches
@@ -237,14 +237,12 @@ class Constants(NamedTuple):
     agreeing_width: float = 0.02
     # [1] speed that agreeing wheels tell, relative: radii and slip
     agreeing_std: float = 0.01
-    # [m/s] the same at standstill
+    # [m/s] the same at standstill: a slower car stands
     agreeing_floor: float = 0.1
     # [1] share by which slip differs from force over load by the nominal stiffness
     agreeing_slip: float = 0.6
     # [1] slip beyond that near the limit, times the cube of force over load
     agreeing_cube: float = 0.05
-    # [s] one independent look at it per so much time
-    agreeing_look: float = 0.25
     # [1] a_y over g up to which the rear axle follows: beyond, sliding may be what it seems
     following_most: float = 0.15
     # [rad] sideslip of a following rear axle beside what the side force asks

@@ -27,6 +27,7 @@ YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample, and its offset
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 SLOWEST_M_S = 1.5
+SLOW_M_S = 2.0 * SLOWEST_M_S  # from here slip counts in full
 
 
 @compiled
