@@ -122,7 +122,7 @@ CAMPAIGNS: Final = {
 
 
 class Table(NamedTuple):
-    """Table with one row per group of figures.
+    """Additional table of the results page, made from some figures of a campaign.
 
     Attributes:
         campaign: key in CAMPAIGNS.
@@ -355,8 +355,8 @@ def results_page() -> str:
 
 
 def _campaign_section(name: str) -> Iterator[str]:
-    """Yield the lines of a campaign's section: command, runs, figures with missed targets first,
-    tables.
+    """Yield the Markdown lines of the results page about one campaign: its command, the runs that
+    measured its figures, the figures (those that miss their targets first), and its tables.
     """
     found = read_kept(name)
     yield f"\n## `{CAMPAIGNS[name].command}`\n"

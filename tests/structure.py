@@ -83,7 +83,9 @@ def loose_modules(root: Path, package: str) -> list[str]:
 
 
 def too_wide(root: Path) -> list[str]:
-    """Return the product's functions with too many positional parameters."""
+    """Return the functions of the product (all code except tests) that have too many positional
+    parameters.
+    """
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in list_nodes(path):

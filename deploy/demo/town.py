@@ -59,7 +59,9 @@ class StreetPlan:
 
 
 def town_of(scenario: Scenario) -> StreetPlan:
-    """Return the shapes of the town that belong to a scenario of the simulator."""
+    """Return the shapes of the demo's town (streets, houses, parks, names) for a scenario of the
+    simulator.
+    """
     found = StreetPlan()
     for number, road in enumerate(scenario.roads):
         name = STREETS[number % len(STREETS)]

@@ -122,7 +122,9 @@ class Lookout:
         self._thread.start()
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Receive the map for a vehicle over its opened Zenoh session."""
+        """Begin to receive the map of the road ahead for the vehicle `name`, over its opened Zenoh
+        session.
+        """
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]

@@ -1,5 +1,5 @@
-"""Functions that open a command's publisher as configured, and close it with a report of the final
-counts.
+"""Functions with which commands open a publisher according to the configuration, and close it. When
+it is closed, the final counts of records are printed.
 """
 
 from __future__ import annotations

@@ -55,7 +55,8 @@ def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
 
 
 def build_shipped_libraries() -> None:
-    """Build the libraries into the installed package, with one process per level; remove others.
+    """Build the shared libraries in the folder of the installed package, one process per level of
+    the processor architecture. Libraries that are there already are removed first.
 
     On a processor of another architecture there is nothing to build, so the agent compiles its
     kernels at its first start.

@@ -111,8 +111,9 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """A parsed file of tuned memberships (fuzzy sets): the validated memberships, and the complete
-    document."""
+    """Content of a file of tuned memberships (parameters of fuzzy sets) after parsing: the
+    validated memberships, and the complete document with scores and origin.
+    """
 
     memberships: Memberships
     document: Document

@@ -1,5 +1,6 @@
-"""Optional components of the agent, for the commands `run` and `fleet`: warnings of the road ahead,
-friction as VSS signals, and warm-up of the simulation.
+"""Optional components of the agent for the commands `run` and `fleet`: warnings of slippery road
+ahead, and friction as VSS signals (vehicle signal specification). The module also compiles the
+functions of the simulation before a run.
 """
 
 from __future__ import annotations

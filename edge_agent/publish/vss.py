@@ -56,7 +56,7 @@ class SignalProvider(Protocol):
         """Accept signals [%] and their time [ns UTC] for sending. The call must not wait."""
 
     def close(self) -> None:
-        """Deliver the signals that still wait, and stop the provider."""
+        """Send the signals that still wait for sending, and stop the provider."""
 
 
 class RoadFrictionOutput:
@@ -85,7 +85,9 @@ class RoadFrictionOutput:
         self._due = 0
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Publish the friction of a vehicle over its opened Zenoh session."""
+        """Publish the friction signals of the vehicle `name` over its opened Zenoh session from now
+        on.
+        """
         self.publishers[name] = session.declare_publisher(
             keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
         )

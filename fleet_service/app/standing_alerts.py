@@ -1,5 +1,6 @@
-"""Active ("standing") alerts of a service for publication: by tile, repeated one after the other
-for clients that start late, and messages that an alert has ended.
+"""Active ("standing") alerts of a service, prepared for publication. All alerts of a tile are the
+answer to a query. Single alerts are published again, one after the other, for clients that start
+late. Ended alerts give a message that states the end.
 """
 
 from __future__ import annotations

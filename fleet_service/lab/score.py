@@ -185,8 +185,8 @@ def coverage(s: Scores) -> float:
 
 
 def safe_share(s: Scores) -> float:
-    """Return the share of the map's answers in which the true friction is above the lower end of
-    the 90 % interval. Readers compute a safe deceleration from this lower end.
+    """Return the share of the map's answers that are safe: the true friction is not below the lower
+    end of the 90 % interval, from which readers compute a safe deceleration.
     """
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 

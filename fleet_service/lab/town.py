@@ -51,8 +51,8 @@ _WEST = 11.90
 
 
 def cell_numbers(cells: int = CELLS) -> IntArray:
-    """Return the grid numbers (quadints) of the town's cells, (cells,). Each road runs east, and
-    the roads are a few cells apart.
+    """Return the grid number (quadint) of each cell of the simulated town, (cells,). The cells of a
+    road lie in a row from west to east, and the roads are a few cells apart.
     """
     x, y = grid.deinterleave(grid.cell_of(_NORTH, _WEST))
     k = np.arange(cells)

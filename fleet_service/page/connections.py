@@ -101,8 +101,8 @@ class RareMessages(logging.Filter):
         self._more: Counter[str] = Counter()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a log message may be logged now, because no equal message was logged
-        within LOG_S.
+        """Return True if a log message may be written now, because no equal message was written
+        within the last LOG_S seconds.
         """
         text = str(record.msg)
         if time.monotonic() - self._passed.get(text, -LOG_S) < LOG_S:

@@ -1,5 +1,5 @@
-"""Metrics of services for the health view. They are read over HTTP, because services do not publish
-them over Zenoh.
+"""Metrics of the fleet services, which the page shows in its health view. They are read over HTTP,
+because services do not publish their metrics over Zenoh.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ class _OpenPage(NamedTuple):
 
 
 class Watchers:
-    """All browsers that watch the map; for use in one event loop.
+    """Set of all browsers that show the live map and receive its changes; for use in one event
+    loop.
 
     Args:
         world: the mirrored map.

@@ -1,5 +1,6 @@
-"""Bucket under the lease and the fence (list of valid objects) of its owner: who may write, and
-which objects are valid.
+"""Bucket (object store) under the lease and the fence of its owner. The lease decides which service
+may write to the bucket, and the fence (list of valid objects) decides which objects readers must
+ignore.
 """
 
 from __future__ import annotations

@@ -158,7 +158,9 @@ class TileCache:
 
 
 def used_once(cells: CellView, now: int) -> ShownTile:
-    """Return cells in the given order, as a tile for a single query that is not cached."""
+    """Return a tile that contains the given cells in their order. It is used for one query only and
+    never put into the cache.
+    """
     batch = batch_of(cells, now)
     return ShownTile(batch, selected_by(batch))
 

@@ -28,7 +28,9 @@ class _Told(event.Listener):
     """
 
     def on_start(self, event: event.Event) -> None:
-        """Report a compilation as the current activity, and once per process as a message."""
+        """Show the user that a function is being compiled: set the spinner's text, and print a
+        message at the first compilation in this process.
+        """
         progress_messages.report_once(progress_messages.COMPILING)
         progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
 

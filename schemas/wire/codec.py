@@ -114,7 +114,7 @@ class Batch:
 
     @property
     def rows(self) -> int:
-        """Return the number of records (reports of a vehicle) in the batch."""
+        """Return the number of records (observations or states) in the batch."""
         return len(self.columns["latitude"])
 
 

@@ -55,7 +55,9 @@ class SerializedReader:
         self._at = 0
 
     def read_number(self, layout: str) -> int:
-        """Return a little-endian number, read with a layout of `struct`."""
+        """Read the next little-endian number and return it; `layout` is its format in the notation
+        of the module `struct`.
+        """
         (found,) = struct.unpack_from("<" + layout, self._data, self._at)
         self._at += struct.calcsize("<" + layout)
         return int(found)

@@ -116,8 +116,9 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """State of the vehicles of a test that is kept between blocks of samples: their tracks (recent
-    positions) and their open visits (passes through cells that they have not left yet).
+    """State that a test keeps between blocks of samples, for several vehicles: the states of the
+    cell tracking ("tracks"), and the open visits (passages of cells that the vehicles have not left
+    yet).
     """
 
     tracks: RecordArray

@@ -180,7 +180,9 @@ def _write_states(root: Path, rows: int) -> None:
 
 
 def _encode_past_query(root: Path) -> bytes:
-    """Return an encoded query about the past that the service would accept."""
+    """Return a query about the map at a past moment, encoded for the program `age_process`. The
+    moment and the box are chosen so that the service would accept the query.
+    """
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
     return encode_question(question)

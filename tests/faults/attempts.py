@@ -127,7 +127,9 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if an honest vehicle opens a session at a router that uses this certificate."""
+    """Attack: run a false router with the certificate `name` in `folder`. Return True if an honest
+    vehicle opens a session at it.
+    """
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
@@ -163,7 +165,9 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish on each key as the attacker; return True if a listener receives any message."""
+    """Publish a message on each of the given keys over the attacker's session; return True if a
+    listener receives any of them.
+    """
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -301,7 +305,9 @@ def spoofed_reply(ground: Ground) -> bool:
 
 
 def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
-    """Return True if a session receives observations or acknowledgements of another vehicle."""
+    """Attack: subscribe to the keys of another vehicle over the attacker's `session`. Return True
+    if the session receives observations or acknowledgements of that vehicle.
+    """
     listener = Listener(
         session,
         (
@@ -363,7 +369,9 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Return True if the attacker can connect as a router or peer, which may forward messages."""
+    """Attack: connect to a router as if the attacker were a router or a peer, which may forward
+    messages of others. Return True if this succeeds.
+    """
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -504,7 +512,9 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Return True if a certificate with a name removed from the access list still connects."""
+    """Attack: connect with the certificate of a vehicle whose name was removed from the access
+    list. Return True if this succeeds.
+    """
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

@@ -182,7 +182,9 @@ def _make_message(one: Batch) -> Message:
 
 
 def _make_text_message(one: Batch) -> Message:
-    """Return a message with a batch as handwritten JSON."""
+    """Return a message that contains the batch `one` as JSON, in the form in which a person would
+    write it.
+    """
     text = {
         "vehicle": one.vehicle,
         "boot": str(one.boot),
@@ -199,8 +201,8 @@ def _make_text_message(one: Batch) -> Message:
 
 
 def _is_insider_only(latitude: float, longitude: float) -> bool:
-    """Return True if a place lies outside the road of the honest cars, so that only the insider
-    reports there.
+    """Return True if a place does not lie on the road of the honest cars; then only the insider
+    reports it.
     """
     return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
 

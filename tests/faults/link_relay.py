@@ -81,7 +81,9 @@ class Direction:
         heapq.heappush(self.flying, (self.free_at + terms.delay_s, self.number, packet))
 
     def deliver_packets(self, now: float) -> None:
-        """Write the packets that have arrived by `now` to the other end."""
+        """Deliver the packets whose delay has ended by the time `now` [s]: write them to the
+        network device at the other end of the link.
+        """
         while self.flying and self.flying[0][0] <= now:
             packet = heapq.heappop(self.flying)[2]
             try:

@@ -2,7 +2,8 @@
 version, and today's service reads it. The other has additional columns, as a newer version would
 write them, and is read by today's service after a rollback.
 
-No file may be set aside, every row must be read, and the map must equal that of the writer.
+No file may be taken for a damaged one, every row must be read, and the map must equal that of the
+writer.
 """
 
 from __future__ import annotations

@@ -173,8 +173,8 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Send alerts by webhooks to all kinds of failing receivers at once, for some seconds, and
-    return the figures.
+    """Send alerts by webhook to all kinds of failing receivers at the same time, for some seconds.
+    Return as figures how many alerts arrived, and how many were lost without being counted.
     """
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(

@@ -1,5 +1,5 @@
-"""`make usability`: measure all figures of a new user's first hour, and write
-`.usability/figures.json`.
+"""`make usability`: measure how easily a new user can use GripMap in the first hour, and write the
+figures to `.usability/figures.json`.
 
 --only NAME ... measures only these parts. A figure that is missing in the file counts as a failure.
 """
@@ -310,7 +310,9 @@ def silent_reasons(house: House) -> float:
 
 
 def bugs_of_the_list(house: House) -> float:
-    """Return the number of bugs found by new users that came back or have no test."""
+    """Return the number of bugs on the list of bugs found by new users that occur again, or for
+    which there is no test.
+    """
     found = listed_bugs.find_open()
     house.print_measured("bugs", f"{len(listed_bugs.TESTS)} listed, open: {found}")
     return float(len(found))

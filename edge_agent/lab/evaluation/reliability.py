@@ -53,8 +53,9 @@ def join_estimates(parts: list[Estimates]) -> Estimates:
 def _rank_of_truth(
     bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
 ) -> FloatArray:
-    """Return, for each of N drives, the rank of the true friction at the sample before index `now`:
-    the posterior probability of a smaller friction.
+    """Return, for each of N drives, the rank of the true friction at the sample before the index
+    `now`. The rank is the probability, according to the estimator's posterior, that the friction is
+    smaller than the true one.
     """
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

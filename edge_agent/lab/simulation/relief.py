@@ -54,8 +54,9 @@ class Wave:
 
 @dataclass(frozen=True)
 class Relief:
-    """Slopes of a scenario's roads: the sum of `waves`, the `crossfall` (sideways slope) of every
-    lane [1], and the `banking` (sideways slope of a bend) per curvature [m].
+    """Slopes of the roads in a scenario. They are the sum of three parts: the slopes `waves`, the
+    `crossfall` (sideways slope) of every lane [1], and the `banking` (sideways slope of a bend)
+    divided by the bend's curvature [m].
     """
 
     waves: tuple[Wave, ...] = ()

@@ -44,8 +44,8 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return a table of slippery stretches of road, the worst first. The score is the length times
-    the lower confidence bound of the share of slippery values.
+    """Return a table of slippery stretches of road, the worst first. The stretches are sorted by
+    their length times the lower confidence bound of their share of slippery values.
     """
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return join_stretches(cells)

@@ -76,8 +76,8 @@ def set_aside(path: Path, problem: str) -> None:
 
 
 def count_set_aside(root: Path) -> int:
-    """Return the number of damaged files that were set aside in an archive. This scans the whole
-    archive.
+    """Return the number of damaged files of an archive that were renamed so that they are not read
+    again. This scans the whole archive.
     """
     return sum(1 for _ in root.rglob(f"*{BAD}"))
 

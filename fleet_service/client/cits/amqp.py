@@ -1,5 +1,6 @@
-"""AMQP 1.0 connection to an interchange, on its own thread. It sends each message until it is
-accepted, and receives messages.
+"""AMQP 1.0 connection to an interchange (server that distributes hazard messages), on a separate
+thread. Each message is sent repeatedly until the interchange accepts it. Messages of others are
+received.
 """
 
 from __future__ import annotations

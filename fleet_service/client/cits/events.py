@@ -150,8 +150,9 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return a message with the fields that all messages (DENM) of a hazard event have; its
-        detection time is `now` [ns UTC].
+        """Return a DENM (hazard message) of an event with those fields set that all its messages
+        have in common. Both its detection time and its reference time (that of this version) are
+        `now` [ns UTC].
         """
         return Denm(
             self.station,

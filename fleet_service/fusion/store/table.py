@@ -188,9 +188,10 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the length of a hash table (number of places) that has room for 25 % more than
-    `entries` when at most a share `most` of the places is in use. Most records of vehicles in cells
-    live an hour, and old ones are deleted each quarter of an hour, in which 25 % are added.
+    """Return the length (number of places) that a hash table with `entries` entries must have. With
+    25 % more entries, at most the share `most` of its places is in use. Reason: most records of a
+    vehicle in a cell are kept for an hour, and old ones are deleted only once per quarter of an
+    hour; in this time 25 % are added.
     """
     return max(LEAST, int(1.25 * entries / most))
 

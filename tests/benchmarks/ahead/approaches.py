@@ -1,5 +1,5 @@
-"""Evaluation of warnings: are simulated cars that approach a slippery stretch warned in time, and
-other cars not?
+"""Evaluation of the warnings that a car gives its driver. It measures how many simulated cars that
+approach a slippery stretch of road are warned in time, and how many warnings are false.
 
 The drivers are simulated; the warning code is that of the agent. The simulated connection never
 fails, and the map contains all roads, with errors of standard deviation SPREAD (see `known_town`).

@@ -53,7 +53,7 @@ class Streets(Scenario):
 
     @property
     def network(self) -> Network:
-        """Return the given lanes as a road network of the simulation."""
+        """Return the road network of this scenario, which consists of the given lanes."""
         assert self.lanes is not None
         return self.lanes
 

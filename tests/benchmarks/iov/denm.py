@@ -59,8 +59,9 @@ def _count_and_send(parcels: list[Parcel], link: AmqpLink, parcel: Parcel) -> No
 
 
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
-    """Raise, change and end hazard events (DENM), restart the gateway after each step, and return
-    the figures.
+    """Simulate hazard events (DENM) that begin, change and end, and restart the gateway after each
+    step. Return as figures the invalid messages, the events that were duplicated or never ended,
+    the events selected by a wrong area, and the message rates.
     """
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 

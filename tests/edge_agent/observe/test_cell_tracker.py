@@ -1,5 +1,6 @@
 """Tests of the division of a drive into visits (passes through a map cell in one heading sector):
-they follow each other, they are robust to jitter, and there is no visit without a position.
+each visit begins where the previous one ends, position noise at a border starts no visit, and there
+is no visit without a position.
 """
 
 from __future__ import annotations

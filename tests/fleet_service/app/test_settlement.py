@@ -1,5 +1,5 @@
-"""Tests of when the service writes segments (files of new rows): waiting rows are written within
-the set period, and a slow disk is not written to continuously.
+"""Tests of the times at which a service writes segments (files of new rows): rows wait no longer
+than the configured period, and on a slow disk the service pauses between writes.
 """
 
 from __future__ import annotations

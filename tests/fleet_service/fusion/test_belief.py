@@ -1,5 +1,5 @@
-"""Tests of the belief about one cell: it stays a probability distribution, time moves it towards
-the prior, and a vote (effect of a single visit) changes it by a bounded factor.
+"""Tests of the belief about one cell: it stays a probability distribution, with time it returns to
+the prior, and a single vote (effect of one visit) changes each probability by a limited factor.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of trust in vehicles: a group that agrees only with itself gains no trust."""
+"""Tests of trust in vehicles: vehicles that agree only with each other, and not with the honest
+majority, gain no trust.
+"""
 
 from __future__ import annotations
 

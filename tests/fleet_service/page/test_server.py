@@ -204,7 +204,9 @@ def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSe
 
 
 def ask_briefly(address: str) -> int:
-    """Return the status of an event stream that is closed at once."""
+    """Open an event stream of the page and close it immediately; return the HTTP status of the
+    answer.
+    """
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", "/events")
     answer = connection.getresponse()

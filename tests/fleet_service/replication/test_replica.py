@@ -1,5 +1,6 @@
-"""Tests of the bucket replica: it contains acknowledged rows, follows deletions, and restores an
-empty disk.
+"""Tests of the bucket replica (copy of an archive in an object store): it contains every
+acknowledged row, files deleted from the archive are deleted from it, and a service with an empty
+disk restores the archive from it.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
 def nothing(
     query: MapQuery, wanted: Callable[[int], bool], only: int | None
 ) -> Iterator[tuple[int, bytes]]:
-    """Return an answer to a map query that contains no tile."""
+    """Return an empty answer to a map query, that is, one that contains no tile."""
     return iter(())
 
 

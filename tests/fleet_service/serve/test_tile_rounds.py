@@ -13,8 +13,8 @@ COST_S = SHARE_S / 2.0  # that a tile takes
 
 
 class Made:
-    """Simulated surroundings of the publication rounds: tiles that change, a clock, and a list of
-    the publications with their times.
+    """Simulated environment for tests of the publication rounds: tiles that change, a clock that
+    the test advances, and a list of the published tiles with their times.
     """
 
     def __init__(self) -> None:

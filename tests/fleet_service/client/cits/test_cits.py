@@ -229,8 +229,8 @@ def stretch(
 
 
 class Run:
-    """Gateway output with a simulated clock. `sent` are its messages; `settles` is True if the
-    interchange accepts them.
+    """Output of the gateway under test, with a simulated clock and interchange. `sent` are the
+    messages that it has sent, and `settles` is True if the interchange accepts messages.
     """
 
     def __init__(self, path: Path, settles: bool = True) -> None:
