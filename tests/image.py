@@ -64,8 +64,8 @@ class Image:
         self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
 
     def localize_paths(self, text: str) -> str:
-        """Return a text with the folders of the image replaced by folders below `root`, and the
-        owner by this user.
+        """Return the text of an instruction in which the image's folders are replaced by folders
+        below `root`, and the owner in `chown` by this user.
         """
         for place in PLACES:
             text = re.sub(rf"(?<![\w.]){re.escape(place)}\b", str(self.root) + place, text)

@@ -203,7 +203,9 @@ def _escape_cell(text: str) -> str:
 
 
 def write_pages(folder: Path) -> None:
-    """Write all reference pages into a folder."""
+    """Write all generated pages of the reference documentation (commands, settings, tables,
+    elements of the papers, metrics) into a folder.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     pages = {f"cli-{program}": command_page(program) for program in COMMAND_LINES}
     pages["configuration"] = settings_page()

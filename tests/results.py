@@ -458,7 +458,9 @@ def with_block(page: str) -> str:
 
 
 def find_stale() -> list[str]:
-    """Return one message per results page that does not agree with the stored figures."""
+    """Return one message for each page with results whose text does not agree with the stored
+    figures.
+    """
     wanted = {PAGE: results_page(), README: with_block(README.read_text(encoding="utf-8"))}
     return [
         f"{path.relative_to(ROOT)} is not current; run `make results`"

@@ -222,7 +222,9 @@ def packed_assignments(root: Path) -> Places:
 
 
 def fmt_skips(root: Path) -> Places:
-    """Return the lines that are excluded from formatting, also in tests."""
+    """Return the places of all lines of source code that a comment excludes from formatting, also
+    in tests.
+    """
     marker = "# fmt: " + "skip"
     return [
         f"{path.relative_to(root)}:{line}"
@@ -233,7 +235,9 @@ def fmt_skips(root: Path) -> Places:
 
 
 def long_lines(root: Path) -> Places:
-    """Return the lines of more than 100 characters, also in tests."""
+    """Return the places of all lines of source code that have more than 100 characters, also in
+    tests.
+    """
     return [
         f"{path.relative_to(root)}:{line}"
         for path in list_sources(root, *PACKAGES, "tests")

@@ -12,7 +12,9 @@ MOST_COMMANDS = 5
 
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
-    """Return the map's cells and the keys of alerts after the recorded minute was published."""
+    """Return the map's cells and the keys of alerts after the tutorial's recorded minute of driving
+    was published.
+    """
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 

@@ -32,8 +32,8 @@ REPORT_S = 5.0
 def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
-    """Let the simulated fleet drive; return the listener with the received data, and the counts
-    that the fleet's process printed.
+    """Let the simulated fleet drive. Return the listener, which holds the received map and alerts,
+    and the counts that the fleet's process printed.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:

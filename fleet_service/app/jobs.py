@@ -224,7 +224,9 @@ class BackgroundJobs:
             due[job] = time.monotonic() + again_s
 
     def _run_job(self, job: Job) -> bool:
-        """Run a job once; return True on success. A failure does not affect the other jobs."""
+        """Run a background job (such as compaction) once; return True on success. A failure does
+        not affect the other jobs.
+        """
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)

@@ -119,7 +119,9 @@ def _sample(sample: zenoh.Sample) -> bytes:
 
 
 class RemoteClient:
-    """WebSocket connection of a client, with its Zenoh session."""
+    """WebSocket connection of a client of the remote API, with the Zenoh session that the server
+    opened for it.
+    """
 
     def __init__(self, link: ServerConnection, session: zenoh.Session) -> None:
         self._link = link

@@ -127,9 +127,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Attack: run a false router with the certificate `name` in `folder`. Return True if an honest
-    vehicle opens a session at it.
-    """
+    """Return True if an honest vehicle opens a session at a false router with this certificate."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
@@ -165,9 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish a message on each of the given keys over the attacker's session; return True if a
-    listener receives any of them.
-    """
+    """Publish on each key as the attacker; return True if a listener receives any message."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -305,9 +301,7 @@ def spoofed_reply(ground: Ground) -> bool:
 
 
 def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
-    """Attack: subscribe to the keys of another vehicle over the attacker's `session`. Return True
-    if the session receives observations or acknowledgements of that vehicle.
-    """
+    """Return True if a session receives observations or acknowledgements of another vehicle."""
     listener = Listener(
         session,
         (
@@ -369,9 +363,7 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
 
 
 def as_router(ground: Ground, mode: str) -> bool:
-    """Attack: connect to a router as if the attacker were a router or a peer, which may forward
-    messages of others. Return True if this succeeds.
-    """
+    """Return True if the attacker can connect as a router or peer, which may forward messages."""
     given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
@@ -512,9 +504,7 @@ def administration_of_the_routers(ground: Ground) -> bool:
 
 @register_attempt
 def revoked_vehicle(ground: Ground) -> bool:
-    """Attack: connect with the certificate of a vehicle whose name was removed from the access
-    list. Return True if this succeeds.
-    """
+    """Connect with a certificate whose name was removed from the access list; True on success."""
     network = ground.network
     lost = {
         f"connect_{part}": str(ground.folder / f"lost.{end}")

@@ -368,8 +368,9 @@ class Machines:
         return self._journals.longest_pause(began)
 
     def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
-        """Stop the load and hand the region over. Return the largest difference between the states
-        of the old and the new service, which are read from their checkpoints (saved states).
+        """Pause the load generators and hand the region over to the standby. Return the largest
+        difference between the states of the old and the new service, which are read from their
+        checkpoints (saved states).
         """
         for part in parts:
             part.send_signal(signal.SIGSTOP)

@@ -124,7 +124,9 @@ class ServiceHistory(Lives[Sent]):
         self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
 
     def _forget_month(self, root: Path) -> None:
-        """Erase one vehicle's month, or a whole month, while no service runs."""
+        """Erase the archived rows of one vehicle in one month, or of all vehicles in it, while no
+        service runs. Month and vehicle are drawn at random.
+        """
         one = self.random.choice(self.sent)
         whole = self.random.random() < 0.3
         key = root / "keys" / f"{one.month}.key"

@@ -258,8 +258,8 @@ def _simulate_unflooded(
 
 
 def _find_difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """Return the largest difference of `mu_lower` or `mu_upper` over the cells of the honest
-    vehicles, or NaN if a cell is missing.
+    """Return the largest difference of `mu_lower` or `mu_upper` between two maps over the cells of
+    the honest vehicles, or NaN if a cell is missing.
     """
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [

@@ -177,7 +177,9 @@ def _ask_query(
 
 
 def _decode_damaged_tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
-    """Decode damaged tiles as a client does. Return the numbers of tiles and of crashes."""
+    """Decode damaged map tiles as a client does. Return the number of tiles, and the number of
+    those at which the decoder crashed.
+    """
     r = np.random.default_rng(site.seed)
     crashes = 0
     count = site.choose_amount(50_000, 1_000)

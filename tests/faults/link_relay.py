@@ -67,7 +67,9 @@ class Direction:
     def accept_packet(
         self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
     ) -> None:
-        """Queue a packet for delivery at the other end, or drop it as the simulated link would."""
+        """Queue an IP packet for delivery at the other end, or drop it as the simulated link
+        would.
+        """
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return
         if draw.random() < terms.loss:
@@ -93,7 +95,7 @@ class Direction:
 
 
 def enter_namespace(namespace: str) -> None:
-    """Move this thread into a named network namespace."""
+    """Move this thread into the Linux network namespace of this name."""
     with Path("/run/netns", namespace).open("rb") as file:
         if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET):
             raise OSError(ctypes.get_errno(), f"cannot enter the network namespace {namespace}")

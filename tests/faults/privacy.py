@@ -87,8 +87,8 @@ def _trip(street: int, house: int) -> Trip:
 
 
 def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> list[Message]:
-    """Return the messages that report the cells numbered `at` of a trip; the last of these cells is
-    left at the time `when` [ns].
+    """Return the messages in which the car `name` reports the cells numbered `at` of a trip, one
+    message per region. The last of these cells is left at the time `when` [ns].
     """
     cell = trip.cell[at]
     latitude, longitude = grid.centre(cell)
@@ -287,8 +287,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _control(folder: Path) -> float:
-    """Return how much more often than by chance the reader finds the car's place if the map shows
-    every report at once, as a control of the method.
+    """Return, as a control of the method, by how much the share of right guesses of the car's place
+    exceeds that of chance if the map shows every report at once.
     """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)

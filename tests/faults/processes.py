@@ -37,8 +37,8 @@ class Part:
         self._writer: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start the process after its previous run has ended. Return without waiting until it is
-        ready.
+        """Start the process, after its previous run (if any) has ended. Return without waiting
+        until the process is ready.
         """
         if self._process is not None:
             self.wait(STOP_S)

@@ -165,8 +165,8 @@ class Verdict:
     margins: dict[str, float]
 
     def is_settled(self, quantity: str) -> bool:
-        """Return True if the fault found for the quantity (or none) is certain: every other
-        explanation is implausible.
+        """Return True if the result for the quantity (a fault or none) is certain: every other
+        explanation of the recording is implausible.
         """
         return self.margins[quantity] >= SETTLED
 

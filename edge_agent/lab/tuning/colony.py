@@ -56,7 +56,9 @@ class Habits:
     trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:
-        """Reject parameters for which equation (31) or (32) is meaningless."""
+        """Reject parameters outside the ranges in which the module's equations (31) and (32) have a
+        meaning.
+        """
         for name in ("evaporation", "elite", "memory", "retrace"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:

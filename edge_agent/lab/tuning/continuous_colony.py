@@ -77,8 +77,8 @@ class SearchTally:
         self.history: list[Iteration] = []
 
     def evaluate(self, vector: FloatArray) -> float:
-        """Return the objective at a vector, and count the evaluation. A value that is not finite
-        counts as the worst.
+        """Return the objective at a vector of variables, and count the evaluation. A value that is
+        not finite counts as the worst.
         """
         value = float(self.problem.objective(vector))
         value = value if np.isfinite(value) else -np.inf

@@ -65,7 +65,9 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
 
 
 def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 cantools has no types
-    """Return the data bytes of all frames of a CAN message on all buses of a recorded log."""
+    """Return the data bytes of each frame of the CAN message `message` in a recorded log, on any
+    bus.
+    """
     wanted = (message.frame_id, message.is_extended_frame)
     return [
         bytes(row[: message.length])

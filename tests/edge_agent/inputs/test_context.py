@@ -124,7 +124,9 @@ def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
 
 
 def assert_filled(log: SignalLog) -> None:
-    """Assert that a log contains all context signals with their true values."""
+    """Assert that a log contains all context signals (such as temperature and wipers) with their
+    true values.
+    """
     assert log.context is not None
     assert len(log.t) > 500
     assert (np.isfinite(log.context).mean(axis=0) >= ENOUGH).all(), np.isfinite(log.context).mean(
