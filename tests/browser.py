@@ -46,7 +46,9 @@ class Opened:
 
     @property
     def drawn_count(self) -> int:
-        """Return the number of shapes that the page reports as painted."""
+        """Return the number of shapes (such as cells and roads) that the map page reports as
+        painted.
+        """
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
     def count_colours(self, panel: int = 0) -> dict[str, int]:

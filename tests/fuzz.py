@@ -241,13 +241,15 @@ class Fuzzer:
 
 
 def seeds_of(name: str) -> list[bytes]:
-    """Return the committed seed inputs for fuzzing a parser."""
+    """Return the initial inputs for fuzzing the parser of this name; they are files in the
+    repository.
+    """
     return [path.read_bytes() for path in sorted((SEEDS / name).glob("*"))]
 
 
 def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
-    """Return a function that writes inputs of the fuzzer into a folder, each distinct input
-    once.
+    """Return a function that writes an input of the fuzzer as a file below `folder`. Equal inputs
+    get the same file, so each distinct input is stored once.
     """
 
     def write_input(kind: str, data: bytes) -> None:

@@ -1,10 +1,10 @@
 """`make image`: runs the steps of deploy/Dockerfile as a script, without a container engine.
 
 Folders of the image become folders below another root. Nothing is installed by apt-get: the tools
-are those of this machine. Python is this machine's interpreter of the
-version that FROM names, in a fresh environment. Then a router and a service of the image are
-started; the service must be ready without compiling anything. The user cannot be changed here, so
-the user of the USER instruction is only checked.
+are those of this machine. The Python version that FROM names is taken from this machine, in a fresh
+environment. Then a router and a service of the image are started; the service must be ready without
+compiling anything. The user cannot be changed here, so the user of the USER instruction is only
+checked.
 """
 
 from __future__ import annotations

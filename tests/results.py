@@ -476,7 +476,9 @@ def write_pages() -> None:
 
 
 def main() -> int:
-    """Store the figures of all campaigns that ran, and write the pages."""
+    """Store the figures of all campaigns that ran, and write the results page and the results block
+    of the root README. Return 0.
+    """
     parser = argparse.ArgumentParser(
         prog="make figures", description=(__doc__ or "").splitlines()[0]
     )

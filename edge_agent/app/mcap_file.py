@@ -54,7 +54,7 @@ class McapTableWriter:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write_table(self, table: pa.Table) -> None:
-        """Write the samples of a table of estimates as messages."""
+        """Write each row of a table of estimates as one JSON message of the MCAP file."""
         for row in table.to_pylist():
             told = {
                 name: value

@@ -124,7 +124,7 @@ class SpoolFile:
 
 
 def batch_checksum(name: Row, payload: bytes) -> int:
-    """Return the CRC-32 of a batch's identifier (the columns NAME) and payload."""
+    """Return the checksum (CRC-32) of a batch's identifier `name` and payload."""
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 
 

@@ -98,8 +98,9 @@ class Engine:
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state with the state of the archive. Use this only in a
-        function that `run_between_segments` calls.
+        """Call `before`, which may change the archive. Then load map, alerts and admitted batches
+        from the archive again, and use them as the state. Use this only in a function that
+        `run_between_segments` calls.
 
         Raises:
             OSError: the archive cannot be read; the state stays unchanged.

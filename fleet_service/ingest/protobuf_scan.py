@@ -167,8 +167,9 @@ def _read_varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Find the fields of all messages and fill the result `scan.out`; `first` is the column whose
-    length gives the number of records.
+    """Find the protobuf fields of all messages, and store where they lie in the result `scan.out`.
+    Message k ends at byte `ends[k]` of the data. `first` is the column whose length gives the
+    number of records of a message.
     """
     data = scan.data
     layout = scan.layout

@@ -123,8 +123,8 @@ def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits (passages of cells) of a drive with the attackers' places replaced: they
-    report correct measurements from a wrong place in the town.
+    """Return the visits (passages of cells) of a drive in which the attackers report wrong cells:
+    their measurements are correct, but all their positions are shifted along the town.
     """
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS

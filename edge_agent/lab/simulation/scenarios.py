@@ -317,8 +317,8 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
 def _lay_patch(
     name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
 ) -> Patch:
-    """Return a patch of `size` (length, width) [m] in the direction of a lane at the point `row`,
-    `left` [m] to the left of its centre.
+    """Return a patch of road of `size` (length, width) [m] with friction `mu`. It is aligned with
+    the lane `points` at its point number `row`, `left` [m] to the left of the lane's centre.
     """
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])

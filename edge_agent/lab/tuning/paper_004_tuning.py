@@ -45,8 +45,9 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """The drive of the tuning at one level of measurement noise, with one copy per seed, and the
-    filter setting whose R (assumed noise variance) equals this noise.
+    """Simulated drive at one level of measurement noise, with one copy per seed of the noise. With
+    it comes the filter setting whose R (assumed noise variance) equals this noise. The tuning runs
+    the filter on it.
     """
 
     batch: DriveSet

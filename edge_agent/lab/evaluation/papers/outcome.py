@@ -61,8 +61,9 @@ class PaperRow(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Return True if the number under the paper's conditions (`matched`) meets its target, or
-        has no target."""
+        """Return True if the reproduced number (`matched`, simulated under the paper's conditions)
+        meets its target, or has no target.
+        """
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
