@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Suspicious regular expression with its file and line."""
+    """Regular expression that may take more than linear time, with its file and line."""
 
     place: str
     pattern: str
@@ -208,7 +208,7 @@ def find_patterns(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def find_all() -> list[Found]:
-    """Return the suspicious regular expressions in the product's code."""
+    """Return the regular expressions in the product's code that may take more than linear time."""
     return [
         Found(f"{path.relative_to(ROOT)}:{line}", pattern)
         for folder in PRODUCT

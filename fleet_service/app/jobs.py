@@ -182,7 +182,9 @@ class BackgroundJobs:
         self._thread = threading.Thread(target=self._keep, name="upkeep")
 
     def health_problems(self) -> list[str]:
-        """Return one message per failed or hanging job."""
+        """Return one message per background job (such as compaction) that has failed or does not
+        end.
+        """
         found = [
             f"{name} failed {times} times in a row" for name, times in list(self.failed.items())
         ]

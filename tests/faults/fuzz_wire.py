@@ -165,7 +165,7 @@ def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> in
 
 
 def _read_metrics(there: Stage) -> dict[str, float]:
-    """Return the service's metrics by name."""
+    """Return the current metrics of the service under attack, by name."""
     address = there.service.line_with("ready: ").split()[-1]
     with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:
         lines = [line for line in page.read().decode().splitlines() if not line.startswith("#")]

@@ -101,7 +101,9 @@ class Mutants:
         self._seq = 0
 
     def make_message(self) -> Message:
-        """Return the next malformed message."""
+        """Return the next malformed message: a valid one in which some bytes or fields were changed
+        at random.
+        """
         r = self._random
         kind = r.choice(list(Kind))
         name = f"rogue-{r.randrange(50):02}"

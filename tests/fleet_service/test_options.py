@@ -277,7 +277,7 @@ def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
 
 
 def options(command: Command) -> set[str]:
-    """Return the names of the options of a command."""
+    """Return the names of the options that a command of `fleet-service` has."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)
     return {

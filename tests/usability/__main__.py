@@ -82,7 +82,9 @@ class House:
         return self._readme
 
     def print_measured(self, what: str, found: object) -> None:
-        """Print the measurements behind a figure."""
+        """Print the name of a measured part, and the measurements from which its figures are
+        computed.
+        """
         print(f"{what}: {found}", flush=True)
 
 
