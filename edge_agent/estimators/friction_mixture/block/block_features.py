@@ -324,7 +324,8 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
         before[axle] = side
-        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + lag**2
+        shape = constants.shape_share * side * side
+        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
         wide = (
             wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
             if design.adaptive

@@ -211,6 +211,8 @@ class Constants(NamedTuple):
     force_share: float = 0.04
     # [1] load transfer between axles and inertia (vehicle)
     axle_share: float = 0.03
+    # [1] shape error of the tyre curve at full demand, in side force over load
+    shape_share: float = 0.05
     # [s] side force behind slip (relaxation, roll), times its rate
     lag: float = 0.02
     # [1] where torque is missing: how unlike the wheels of an axle pull, of the force
