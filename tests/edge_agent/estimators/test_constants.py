@@ -76,8 +76,8 @@ MOVES = {
     "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.92),  # force and slip are new for longer
-    "abrupt_share": Move("upper", "joints", 0.9, LESS),  # a bump reads as slip
-    "abrupt_time": Move("upper", "joints", 0.99, LESS),  # ... sooner
+    "abrupt_share": Move("upper", "joints", 0.93, LESS),  # a bump reads as slip
+    "abrupt_time": Move("upper", "joints", 0.992, LESS),  # ... sooner
     "steady_half": Move("width", "constant-radius", 1.05),
     "steady_share": Move("least probabilities", "constant-radius", 0.95),
     "sliding_slope": Move(
@@ -92,7 +92,7 @@ MOVES = {
         "penalty", "braking", 0.5, LESS
     ),  # nodes may not go to where they would be charged
     "huber": Move(
-        "nis", "stopping", 4.0, LESS
+        "nis", "stopping", 3.0, LESS
     ),  # R is inflated by what is refused, and follows it less
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
@@ -106,7 +106,7 @@ MOVES = {
         "nis", "acceleration", 0.6
     ),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
-    "informing": Move("std LN_KX", "j-turn", 1.05),
+    "informing": Move("std LN_KX", "j-turn", 1.03),
     "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
     "compliance_mean": Move(
         "strain", "constant-radius", 1.1
@@ -126,7 +126,7 @@ MOVES = {
     # sensors
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
-    "leak_x": Move("vx_std", "braking without torque", 1.03),
+    "leak_x": Move("vx_std", "braking without torque", 1.02),
     "return_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
     "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
     "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
@@ -137,19 +137,20 @@ MOVES = {
     "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
-    "drift": Move("std VX", "slalom", 1.19),
+    "drift": Move("std VX", "slalom", 1.15),
     # noise: what is expected to be larger is found to be smaller than expected
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.985),
     "angle_share": Move("vy_std", "constant-radius", 1.25),
-    "floor_x": Move("nis", "acceleration", 0.9),
+    "floor_x": Move("nis", "acceleration", 0.92),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
+    "shape_share": Move("nis", "constant-radius", 0.95),
     "lag": Move("nis", "pulses", 0.85),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
-    "no_torque_floor": Move("nis", "pulses", 0.89),
+    "no_torque_floor": Move("nis", "pulses", 0.91),
     # wheels that tell the motion without a tyre
     "standing_time": Move("stands", "stopping", 0.5),
     "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
