@@ -270,8 +270,8 @@ class LostGrip:
         ]
 
     def line(self) -> str:
-        """Return the shares of passes that lost grip, for warned and unwarned drivers, as one line
-        of text.
+        """Return one line of text that states how many passes over new ice lost grip, out of how
+        many, for warned and for unwarned drivers.
         """
         counts = [
             f"{int(self.lost[rows].sum())} of {int(rows.sum())}"

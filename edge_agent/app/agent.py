@@ -91,7 +91,9 @@ class AgentPart(Protocol):
         """Give this component of the agent the opened Zenoh session of the vehicle `name`."""
 
     def start_part(self) -> None:
-        """Start this component of the agent, before the agent processes the first samples."""
+        """Start this component (for example its thread). The agent calls this before it processes
+        the first samples.
+        """
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
         """Update this component of the agent from the pipeline after a block of samples. `admitted`

@@ -115,7 +115,7 @@ class RareMessages(logging.Filter):
 
 
 def limit_messages() -> None:
-    """Limit repeated log messages of the web server and of its event loop."""
+    """Log each message of the web server and of its event loop at most once per LOG_S."""
     rare = RareMessages()
     for logger in (log, logging.getLogger("uvicorn.error")):
         logger.addFilter(rare)

@@ -214,7 +214,9 @@ def fetch_publication(address: str) -> bytes:
 
 
 def count_features(address: str) -> int:
-    """Return the number of features that the page's OGC API returns, or 0 without an answer."""
+    """Return the number of features (map cells) in the answer of the page's OGC API, or 0 without
+    an answer.
+    """
     try:
         with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:
             return int(json.loads(answer.read())["numberReturned"])

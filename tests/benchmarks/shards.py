@@ -110,8 +110,8 @@ def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
 
 
 def engine(root: str) -> None:
-    """Run an engine (service without network) that ingests one burst of messages for each line of
-    standard input.
+    """Run an engine (service without network) that ingests one burst of stored messages for each
+    line of standard input, and prints "done" after it.
     """
     bursts = [
         [Message(*fields) for fields in burst]

@@ -162,8 +162,8 @@ class Asking:
         self._thread.join(PATIENCE_S)
 
     def _read_cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
-        """Return (cell, heading sector) of each row in the box, and True if the answer reports a
-        missing region.
+        """Query the map in the box. Return (cell, heading sector) of each row of the answer, and
+        True if the answer reports a missing region or the query was refused.
         """
         try:
             answer = map_client.query_map(self._router, {"bbox": self._box})

@@ -356,8 +356,8 @@ _KINDS: Final = """async ([places, least]) => {
 
 
 def _hide_unvalued(table: pa.Table, unvalued: Places) -> pa.Table:
-    """Return a map in the form of older versions: the places `unvalued` have only a lower bound of
-    friction.
+    """Return the map as an older version of the service would answer: for the places `unvalued` it
+    has only a lower bound of friction, and no value of mu.
     """
     rows = table.select(["cell", "sector"]).to_pylist()
     bound = pa.array([_key(row) in unvalued for row in rows])

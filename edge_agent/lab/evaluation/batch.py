@@ -113,7 +113,9 @@ def _simulate_drive(
 
 
 def join_drives(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
-    """Join simulated drives of equal length into one set."""
+    """Join simulated drives of equal length into one set of drives, so that one estimator bank can
+    process all of them together.
+    """
 
     def stack_column(name: str) -> FloatArray:
         return np.stack(

@@ -1,4 +1,6 @@
-"""Test that the example of the documentation runs as described."""
+"""Tests of the example program of the analytics documentation: it writes the files that the
+documentation shows, from a given archive or from a synthetic one.
+"""
 
 from __future__ import annotations
 

@@ -79,8 +79,8 @@ def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[In
 
 @contextmanager
 def separate_interchange(url: str) -> Iterator[Connection]:
-    """Start an interchange in a separate process. The yielded connection answers each request with
-    all received messages.
+    """Start a simulated AMQP interchange in a separate process. Yield a pipe to this process, which
+    answers each request sent into the pipe with all messages received so far.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
