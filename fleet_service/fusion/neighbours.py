@@ -70,6 +70,7 @@ _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
 _X: Final = 0x5555555555555555 & _WHOLE  # those of its column
 _Y: Final = _WHOLE - _X
 _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
+_BEFORE, _BEHIND, _ACROSS = range(3)  # sides; across: the other direction of the road
 
 
 @refcount_free_inlined
@@ -112,6 +113,39 @@ class ReadRule(NamedTuple):
     silence: float
 
 
+class MapParts(NamedTuple):
+    """State of the map and the rule by which beliefs are read, as `road_beliefs` gets them."""
+
+    live: Rows
+    table: IntArray
+    weather: Weather
+    rule: ReadRule
+
+
+class Asked(NamedTuple):
+    """Slot (cell and heading sector) whose belief is read, the time of reading [ns], the row of the
+    prior of its region, and P(slippery) of that prior.
+    """
+
+    slot: int
+    now: int
+    prior: int
+    unknown: float
+
+
+class Buffers(NamedTuple):
+    """Memory for intermediate results: `scratch` for ageing; product of the cell's own belief and
+    all messages, `product` (32), and the same with messages weakened by silence, `quiet` (32); one
+    message (32); belief about the road of a neighbour (32).
+    """
+
+    scratch: FloatArray
+    product: FloatArray
+    quiet: FloatArray
+    message: FloatArray
+    road: FloatArray
+
+
 @compiled
 def road_beliefs(
     live: Rows,
@@ -124,73 +158,100 @@ def road_beliefs(
     """Return the belief about the road for each slot (cell and heading sector), (k, 32), at the
     times `now` (k,) [ns]. `table` is the hash table that finds slots by key.
     """
+    parts = MapParts(live, table, weather, rule)
     out = np.empty((len(slots), _BINS))
-    scratch = np.empty((3, SCRATCH))
-    p = np.empty(_BINS)
-    quiet = np.empty(_BINS)
-    message = np.empty(_BINS)
-    road = np.empty(_BINS)
+    buffers = Buffers(
+        np.empty((3, SCRATCH)),
+        np.empty(_BINS),
+        np.empty(_BINS),
+        np.empty(_BINS),
+        np.empty(_BINS),
+    )
     for k in range(len(slots)):
-        prior = _age_belief(live, weather, slots[k], now[k], scratch)
-        p[:] = scratch[P, :_BINS]
-        quiet[:] = p
-        read_road(rule.kernels, live.cells, slots[k], p, out[k])
+        prior = _age_belief(live, weather, slots[k], now[k], buffers.scratch)
+        buffers.product[:] = buffers.scratch[P, :_BINS]
+        buffers.quiet[:] = buffers.product
+        read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
         slippery = _slippery_probability(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
-        informative = False
-        weakened = False
         unknown = _slippery_probability(weather.prior[prior])
-        key = live.cells[slots[k]].key
-        cell = key // grid.SECTORS
-        sector = key % grid.SECTORS
-        back = (sector + 2) % grid.SECTORS
-        for side in range(3):
-            most = 0.0
-            heard = 1.0
-            there = cell
-            for step in range(1, c.NEIGHBOURS + 1):
-                if side == 2 and step > 3:
-                    break
-                # the other direction: of the same cell, or of the one to the left or right
-                if side == 2:
-                    there = (
-                        cell
-                        if step == 1
-                        else next_cell(cell, (sector + 2 * step - 3) % grid.SECTORS)
-                    )
-                else:
-                    there = next_cell(there, sector if side == 0 else back)
-                row = find_row(
-                    table, live.cells, there * grid.SECTORS + (back if side == 2 else sector)
-                )
-                if row == NONE or live.cells[row].vehicles == 0:
-                    continue
-                kept = _stored_slippery(live, row)
-                if kept < _ASKED and side < 2 and kept < c.NEIGHBOUR_GRIP:
-                    break
-                if kept < _ASKED:
-                    continue
-                _age_belief(live, weather, row, now[k], scratch)
-                read_road(rule.kernels, live.cells, row, scratch[P], road)
-                slippery = _slippery_probability(road)
-                weight = _KEPT[1 if side == 2 else step] * (slippery - unknown) / (1.0 - unknown)
-                if weight > most:
-                    most = weight
-                    _write_message(message, weight, road, weather.prior[prior])
-                    heard = _silence_factor(live.cells, slots[k], row, rule.silence)
-            if most > 0.0:
-                informative = True
-                weakened = weakened or heard < 1.0
-                for i in range(_BINS):
-                    p[i] *= message[i]
-                    quiet[i] *= 1.0 + heard * (message[i] - 1.0)
-        if informative:
-            read_road(rule.kernels, live.cells, slots[k], p, out[k])
-        if weakened:
-            read_road(rule.kernels, live.cells, slots[k], quiet, road)
-            _lower_to_unsure(out[k], road)
+        _multiply_messages(parts, Asked(slots[k], now[k], prior, unknown), buffers, out[k])
     return out
+
+
+@refcount_free_inlined
+def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
+    """Multiply the belief about a cell by the messages of its three sides, and write the belief
+    about the road to `out` (32); `out` stays unchanged without messages.
+    """
+    kernels = parts.rule.kernels
+    cells = parts.live.cells
+    informative = False
+    weakened = False
+    for side in (_BEFORE, _BEHIND, _ACROSS):
+        weight, heard = _choose_message(parts, asked, side, buffers)
+        if weight > 0.0:
+            informative = True
+            weakened = weakened or heard < 1.0
+            for i in range(_BINS):
+                buffers.product[i] *= buffers.message[i]
+                buffers.quiet[i] *= 1.0 + heard * (buffers.message[i] - 1.0)
+    if informative:
+        read_road(kernels, cells, asked.slot, buffers.product, out)
+    if weakened:
+        read_road(kernels, cells, asked.slot, buffers.quiet, buffers.road)
+        _lower_to_unsure(out, buffers.road)
+
+
+@refcount_free_inlined
+def _choose_message(
+    parts: MapParts, asked: Asked, side: int, buffers: Buffers
+) -> tuple[float, float]:
+    """Write the message of the most informative neighbour on one side of a cell to
+    `buffers.message`. Return its weight w, 0 if there is none, and its factor q for silence.
+    """
+    live = parts.live
+    cells = live.cells
+    most = 0.0
+    heard = 1.0
+    key = cells[asked.slot].key
+    sector = key % grid.SECTORS
+    towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
+    there = key // grid.SECTORS
+    for step in range(1, 4 if side == _ACROSS else c.NEIGHBOURS + 1):
+        there = _step_to(key // grid.SECTORS, there, sector, side, step)
+        row = find_row(parts.table, cells, there * grid.SECTORS + towards)
+        if row == NONE or cells[row].vehicles == 0:
+            continue
+        kept = _stored_slippery(live, row)
+        if side != _ACROSS and kept < c.NEIGHBOUR_GRIP:
+            break
+        if kept < _ASKED:
+            continue
+        _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
+        read_road(parts.rule.kernels, cells, row, buffers.scratch[P], buffers.road)
+        slippery = _slippery_probability(buffers.road)
+        kept_surface = _KEPT[1 if side == _ACROSS else step]
+        weight = kept_surface * (slippery - asked.unknown) / (1.0 - asked.unknown)
+        if weight > most:
+            most = weight
+            prior = parts.weather.prior[asked.prior]
+            _write_message(buffers.message, weight, buffers.road, prior)
+            heard = _silence_factor(cells, asked.slot, row, parts.rule.silence)
+    return most, heard
+
+
+@refcount_free_inlined
+def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
+    """Return the cell of the neighbour number `step` on a side of `cell`; `there` is the one before
+    it. The road's other direction is in the same cell (1), or in the one to its left or right.
+    """
+    if side != _ACROSS:
+        return next_cell(there, (sector + 2 * side) % grid.SECTORS)
+    if step == 1:
+        return cell
+    return next_cell(cell, (sector + 2 * step - 3) % grid.SECTORS)
 
 
 @compiled
