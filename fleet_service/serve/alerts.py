@@ -17,17 +17,17 @@ from fleet_service.fusion.witnesses import stretch_slots, stretch_sources, witne
 from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
 from fleet_service.serve.view import LOWER, UPPER, coarse_counts
 from schemas import grid
-from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import CALLED_SHARE, NS, SLIPPERY_MU
 from schemas.wire import Alert
 
-# P(slippery). Of the slippery cell-minutes of twelve tuning towns .951 are under alert, and .943 of
-# the alerts are right. With .9 it is .922 and .943: snow close to SLIPPERY_MU has no alert, however
+# P(slippery). Of the slippery cell-minutes of twelve tuning towns .917 are under alert, and .924 of
+# the alerts are right. With .9 it is .885 and .931: snow close to SLIPPERY_MU has no alert, however
 # many vehicles measured it.
 RAISE_ABOVE: Final = 0.7
-# ... unless unknown tyres may have read so much too low: of 200 tuning fleets that take a wet curve
-# gently on winter tyres, six raise a false alert; with .65, eight of 60
-GOOD_GRIP: Final = 0.6
+# ... of which unknown tyres may explain so much: of 400 tuning fleets that take a wet curve gently
+# on winter tyres, 17 raise a false alert
+TYRE_DOUBT_MOST: Final = 0.08
 # ... and by its own reports alone no less than without any
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 # grip must be as certain as ice was, because clearing too early is the more serious error
@@ -102,8 +102,11 @@ class Alerts:
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         likely = self._suspects(slots[slippery > LIKELY])
-        likely = likely[_excludes_good_grip(self._fusion.beliefs_for_alerts(likely))]
         believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
+        cautious = self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE
+        found = cautious > np.minimum(believed - TYRE_DOUBT_MOST, CALLED_SHARE)
+        likely = likely[found]
+        believed = believed[found]
         # time of an alert that was caused by an update of a neighbouring cell
         now = time.max(initial=0)
         raised = np.where(np.isin(likely, slots), self._fusion.live.time[likely], now)
@@ -213,11 +216,3 @@ class Alerts:
             longitude=float(longitude),
             reason=reason,
         )
-
-
-def _excludes_good_grip(belief: FloatArray) -> BoolArray:
-    """Return a mask of beliefs (k, 32), (k,): True if the upper end of the interval is below
-    GOOD_GRIP, or if nearly all of the belief is below the slippery limit.
-    """
-    upper = quantiles(belief, (UPPER,))[0]
-    return np.asarray((upper < GOOD_GRIP) | (belief @ SLIPPERY_SHARE > CALLED_SHARE))
