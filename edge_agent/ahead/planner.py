@@ -43,14 +43,16 @@ _GID_BYTES: Final = 16
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
-    """Return the highest speed [m/s] at which the vehicle may drive now. From this speed, braking
-    with the deceleration COMFORT after a delay of LATE_S reaches each safe speed ahead in time.
+    """Return the highest speed [m/s] at which the vehicle may drive now; inf if no safe speed is
+    known.
 
-    Return inf if no safe speed is known.
+    Each place ahead has a safe speed. From the returned speed, the vehicle can slow down to that
+    safe speed MARGIN_M before the place, if it begins to brake after a delay of LATE_S with the
+    deceleration COMFORT.
 
     Args:
-        distance: (M,) distance from the vehicle [m].
-        safe_speed: (M,) [m/s]; NaN where unknown.
+        distance: (M,) distance of each place from the vehicle [m].
+        safe_speed: (M,) safe speed at each place [m/s]; NaN where unknown.
     """
     known = np.isfinite(safe_speed)
     if not known.any():

@@ -99,8 +99,8 @@ samples would change v_x by decimetres per second, because no printed measuremen
 def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
-    """Return a bank of paper 001's filters, one per vehicle, which assume a road with the given
-    friction [1].
+    """Return a bank of paper 001's filters, one per vehicle, which assume a road with the friction
+    coefficient `friction`.
     """
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)

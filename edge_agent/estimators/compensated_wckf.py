@@ -115,10 +115,11 @@ class FrictionSet:
 def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, tyre: TyreOption | None = None
 ) -> EstimatorBank:
-    """Return a bank of filters, one per vehicle, on a road with the given friction [1].
+    """Return a bank of paper 002's filters, one per vehicle, which assume a road with the friction
+    coefficient `friction`.
 
-    `tyre` selects the tyre model; the paper's vehicle needs its `rear_slope`, the ratio of the
-    cornering stiffnesses in table 1.
+    `tyre` selects the tyre model. For the vehicle of paper 002, `tyre` must contain `rear_slope`,
+    the ratio of the cornering stiffnesses in the paper's table 1.
     """
     context = records(FrictionSet, 1)
     context["friction"] = friction

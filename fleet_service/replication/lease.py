@@ -92,7 +92,7 @@ class LeaseRecord(NamedTuple):
     Attributes:
         number, epoch: number of the lease, and epoch in the holder's file names.
         holder, service: identity of the holder's folder, and name of the service that runs on it.
-        turn: grows with each renewal.
+        turn: count of renewals of this lease; the lease number stays the same.
         released: True if the holder released the lease.
         before: names of the services that held the lease earlier.
         to: service for which the lease was released; other services wait for one lease time.
@@ -320,8 +320,10 @@ class Lease:
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
-        """Renew the lease (ownership of the archive): write its object in the bucket with the next
-        turn number. The renewal is valid if no higher lease number exists afterwards.
+        """Renew the lease (ownership of the archive): write its object in the bucket again, with
+        the same lease number and a turn (count of renewals) that is one higher. The renewal is
+        valid if no object with a higher lease number exists afterwards, because each service that
+        takes over creates the next lease number.
 
         Raises:
             CopyError: it is unknown whether the renewal is valid.

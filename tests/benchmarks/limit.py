@@ -127,8 +127,9 @@ class Limit:
         self._memory = first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Run all filters over T successive readings (T, N, 11) of the sensors, which are `gone`
-        seconds apart. Return the mean of each filter's state after each reading, (T, N, 6).
+        """Run all filters over T successive sensor readings, (T, N, 11). The time between two
+        readings is `gone` [s]. Return the mean of each filter's state after each reading,
+        (T, N, 6).
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))

@@ -44,9 +44,9 @@ PATIENCE_S: Final = 120.0
 
 
 def shards() -> list[Figure]:
-    """Measure the time in which one service ingests a burst of messages, and the time that two
-    services need that serve one half of its regions each. Both are measured with engines (services
-    without network) and over Zenoh. Return the figures.
+    """Measure how long one service takes to ingest a burst of messages from two regions, and how
+    long two services take if each serves one of the regions. Both are measured with engines
+    (services without network) and over Zenoh. Return the two ratios as figures (named numbers).
     """
     sent = [_make_burst(k) for k in range(ROUNDS + 1)]
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
@@ -129,7 +129,9 @@ def engine(root: str) -> None:
 
 
 def _make_burst(number: int) -> list[Message]:
-    """Return a burst of messages whose observations lie alternately in two regions."""
+    """Return a burst: 2 * BURST messages that are sent without pauses. Every second message is from
+    the western region, the others are from the eastern region.
+    """
     now = time.time_ns()
     west, east = (
         make_messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1)
@@ -138,7 +140,9 @@ def _make_burst(number: int) -> list[Message]:
 
 
 def list_regions(burst: Sequence[Message]) -> list[str]:
-    """Return both regions of a burst, as they appear in the Zenoh keys of the messages."""
+    """Return the western and the eastern region of a burst (see `_make_burst`), as they appear in
+    the Zenoh keys of its first two messages.
+    """
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 
 

@@ -99,7 +99,7 @@ def ground(
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
     """Return a block (signals of some samples) of vehicles that turn at random and now and then
-    receive no position; some vehicles have no yaw signal.
+    receive no position; every third vehicle has no yaw signal.
     """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
@@ -116,9 +116,13 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """State that a test keeps between blocks of samples, for several vehicles: the states of the
-    cell tracking ("tracks"), and the open visits (passages of cells that the vehicles have not left
-    yet).
+    """State of several vehicles that a test keeps from one block of samples to the next.
+
+    Attributes:
+        tracks: for each vehicle the cell in which it is (state of the cell tracking).
+        open: for each vehicle the visit that has not ended. A visit is the passage of a map cell;
+            it ends when the vehicle leaves the cell.
+        config: settings of the agent.
     """
 
     tracks: RecordArray
@@ -127,7 +131,9 @@ class Watch:
 
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
-        """Return the state (tracks and open visits) of vehicles before the first sample."""
+        """Return the state of vehicles before the first sample: no cell is known, and no visit has
+        begun.
+        """
         return Watch(new_tracks(vehicles), OpenVisits.before_any(vehicles), config or AgentConfig())
 
     def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:

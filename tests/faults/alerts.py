@@ -38,8 +38,12 @@ Place = tuple[int, int]  # cell and sector
 
 
 def run(site: Site) -> list[Figure]:
-    """Run eight restarts of the router with twenty alerts each (in a quick run, one with ten
-    alerts), and return the figures.
+    """Restart the watcher's router eight times, and raise twenty more alerts during each outage (in
+    a quick run: one outage, ten alerts).
+
+    Return three figures (named numbers) over all outages: the number of active alerts that the
+    watcher did not receive within SOON_S after it was connected again, the number that it should
+    have received, and the longest time [s] until it received one.
     """
     each = site.choose_amount(20, 10)
     missing = 0

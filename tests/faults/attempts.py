@@ -62,7 +62,7 @@ def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: obj
 def issue_certificate(
     ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0
 ) -> dict[str, Any]:
-    """Issue a certificate with the fleet's own authority, and return its TLS entries."""
+    """Issue a certificate with the fleet's own authority, and return TLS settings that use it."""
     authority = ca.read_pair(ground.folder / "authority" / "ca")
     assert authority is not None
     folder.mkdir(exist_ok=True)
@@ -76,7 +76,7 @@ def issue_certificate(
 
 
 def make_stranger(ground: Ground) -> Path:
-    """Create a foreign certificate authority with the same names, and return its folder."""
+    """Create a foreign authority that certifies the fleet's names, and return its folder."""
     folder = ground.folder / "stranger"
     open_registry(folder).enrol(make_enrolment())
     return folder
@@ -127,7 +127,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if an honest vehicle opens a session at a false router with this certificate."""
+    """Return True if a vehicle connects to a false router that presents the certificate `name`."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),

@@ -201,12 +201,17 @@ def _make_figures(failovers: int, happened: list[Failover], census: list[Census]
 
 
 def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
-    """Return a figure of the campaign, with its target only if the whole campaign ran."""
+    """Return a figure (named number) about the failovers. The figure gets its target from
+    `tests.faults.bars` only if at least FULL failovers were run, because the targets of counts
+    assume a whole campaign.
+    """
     return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 
 
 def _make_median_figures(happened: list[Failover]) -> list[Figure]:
-    """Return the median takeover time [s] per kind of failure, as figures without targets."""
+    """Return the median takeover time [s] per kind of failure, as figures (named numbers) without
+    targets.
+    """
     found = []
     for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
         seconds = [one.seconds for one in happened if one.way in kinds]

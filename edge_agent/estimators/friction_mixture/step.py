@@ -1,12 +1,20 @@
-"""Processing of one sample of one vehicle. The sample is added to the sums of the block (the
-samples within 0.05 s). At the end of a block, one step of the friction mixture (all hypotheses) is
+"""Processing of one sample of one vehicle by the default estimator. The sample is added to the sums
+of the block (the samples within 0.05 s). At the end of a block, one step of the friction mixture is
 run.
 
-A step begins with a possible change of the road. Then, for each group of nodes, it mixes the
-states, applies the measurements at the state of the block's beginning, and predicts to the block's
-end. Finally it updates the node probabilities, adapts the measurement noise R, and computes mean
-and covariance of the mixture. Between the ends of blocks, the velocity is advanced by integrating
-the accelerometers.
+The friction mixture consists of nodes. A node is one hypothesis about the friction, with a
+probability and a filter that assumes this friction. A group is LANES nodes that the processor
+computes together in vector registers. A step has three parts.
+
+1. Road change: the friction may have changed during the block. Therefore part of the probability of
+   each node moves to other nodes.
+2. Filters, for each group: mix the state of each node with the state of the whole mixture according
+   to the probability that has moved, apply the measurements at the state of the block's beginning,
+   and predict to the block's end.
+3. Mixture: update the node probabilities, adapt the measurement noise R, and compute mean and
+   covariance of the whole mixture.
+
+Between the ends of blocks, the velocity is advanced by integrating the measured accelerations.
 """
 
 from __future__ import annotations
@@ -83,8 +91,8 @@ def step(
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Process the block (the samples within 0.05 s) that ends: run one step of the friction mixture
-    (all hypotheses) with the sums over its samples. The next block begins at the time of the last
-    sample.
+    (the filters of all friction hypotheses) with the sums over the block's samples. The next block
+    begins at the time of the last sample.
     """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time

@@ -197,12 +197,12 @@ def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
 def measure_lags_twice(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
 ) -> dict[str, float]:
-    """Return the lags [s] of wheels and steering behind the inertial unit on which both halves of a
-    drive agree. A device is left out if its yaw rate does not follow the gyroscope's throughout the
-    drive.
+    """Return the lags [s] of the wheel speeds and of the steering behind the inertial unit.
 
-    Both tests exclude slides. In a slide, the car turns earlier or later than its steering
-    predicts, by a different time in each slide, so that the lag would be wrong.
+    The lag of a device is returned only under two conditions: the yaw rate computed from the device
+    follows the gyroscope's throughout the drive, and each half of the drive gives about the same
+    lag as the whole drive. The two conditions reject lags that slides have distorted. In a slide,
+    the car turns earlier or later than its steering predicts, by a different time in each slide.
     """
     trusted = [
         name

@@ -1,11 +1,16 @@
-"""Reliability: how often the true friction lies below each stated quantile, for the quantiles
-LEVELS.
+"""Reliability of quantiles: how often the true friction lies below each of the quantiles LEVELS of
+an estimator's posterior. For a reliable estimator, the share equals the level of the quantile.
 
-Estimates contain only three quantiles. The default estimator gives more: the likelihood of friction
-over a visit (passage of a map cell). Here the visit begins with the drive, from a uniform prior, so
-this likelihood is the whole posterior. To read it, the visit must be ended. This is done in a copy
-of the estimators, so that the drive itself continues unchanged. For other estimators, a Gaussian is
-assumed between the quantiles, or a uniform distribution if they report the prior.
+Estimates contain only the quantiles 5, 50 and 95 %. The posterior at other levels is found as
+follows.
+
+- The default estimator can also output the likelihood of friction over a visit (passage of a map
+  cell). Here a visit lasts from the start of the drive until now. The prior of the visit is
+  uniform, so the posterior is proportional to this likelihood. The estimator outputs it only when
+  the visit ends. Therefore the visit is ended in a copy of the estimator, and the original
+  estimator continues the drive.
+- For other estimators, the posterior is assumed to be Gaussian, or uniform if the interval is as
+  wide as the prior's (see `between_quantiles`).
 """
 
 from __future__ import annotations

@@ -58,8 +58,9 @@ class Fleet:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", self._record_alert)
 
     def await_services(self, *regions: int) -> Fleet:
-        """Wait until services for the regions receive published messages and queries. Return this
-        client.
+        """Wait until, for each region number in `regions` (default: REGION), a fleet service
+        receives the observations, vehicle states and map queries that this object sends. Return
+        this object.
         """
         for region in regions or (REGION,):
             for name in (
