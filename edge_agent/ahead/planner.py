@@ -27,11 +27,11 @@ from schemas.thresholds import NS
 
 TOPIC: Final = "planning/scenario_planning/max_velocity_candidates"
 TYPE: Final = "tier4_planning_msgs::msg::dds_::VelocityLimit_"
-ANY_HASH: Final = "TypeHashNotSupported"  # rmw_zenoh's word for a sender without one
+ANY_HASH: Final = "TypeHashNotSupported"  # rmw_zenoh's text for a sender without a type hash
 SENDER: Final = "gripmap"
 HOLD_S: Final = 3.0
-STEP: Final = 1.0  # [m/s] by which a limit rises before a planner hears of it
-FALL_STEP: Final = 0.2  # [m/s] by which it falls
+STEP: Final = 1.0  # [m/s] smallest rise of the limit that is sent to a planner
+FALL_STEP: Final = 0.2  # [m/s] smallest fall that is sent
 LATE_S: Final = 1.3  # a second between two looks ahead, and the way to the planner's brakes
 # One in twenty places has less grip than its lower bound; a machine's limit must hold in 99 %.
 CAUTION: Final = 0.566  # normal quantiles of .5 % over that of 5 %, less 1

@@ -141,7 +141,7 @@ class Watch:
         states that they report.
         """
         self.tracks, located = locate_vehicles(self.tracks, block.t, block.signals)
-        reported = cast("Estimates", output)  # which has more, of what nobody reads here
+        reported = cast("Estimates", output)  # `build_records` reads only the fields of MadeUp
         self.open, observations, states = build_records(
             self.open, block.time, located, reported, self.config
         )

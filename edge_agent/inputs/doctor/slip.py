@@ -14,7 +14,7 @@ from edge_agent.inputs.doctor.lags import find_lags
 from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
-FEWEST_STEPS: Final = 5  # of a wheel away from the others, below which they are no bits
+FEWEST_STEPS: Final = 5  # with fewer steps of a wheel speed, `has_equal_steps` is False
 # of a moving car in which a wheel must have nothing to do with the others
 FOREIGN_ROWS: Final = 3000
 FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
@@ -24,10 +24,10 @@ STEADY_SHARE: Final = 0.75
 
 # correlation of each axle with the yaw rate, from which on their signs count
 AXLES_LIKE: Final = 0.7
-LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
-HALF_LIKE: Final = 0.7  # correlation from which on the lag of a half counts
+LAGS_APART_S: Final = 0.05  # [s] by which the lags of the two halves of a drive may differ
+HALF_LIKE: Final = 0.7  # least correlation at which the lag of a half counts
 LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
-# [1/m] root mean square, from which on an axle shows that it is locked
+# [1/m] least root-mean-square curvature at which a locked axle can be recognised
 LEAST_CURVATURE: Final = 0.004
 LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
 LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's

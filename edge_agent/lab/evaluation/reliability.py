@@ -28,7 +28,7 @@ from schemas.numeric import FloatArray
 
 LEVELS: Final = tuple(round(0.05 * k, 2) for k in range(1, 20))
 EVERY_S: Final = 1.0
-PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # of its 90 % interval
+PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # width of the prior's 90 % interval
 EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
