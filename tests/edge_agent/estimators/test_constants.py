@@ -76,7 +76,7 @@ MOVES = {
     "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.92),  # force and slip are new for longer
-    "abrupt_share": Move("upper", "joints", 0.93, LESS),  # a bump reads as slip
+    "abrupt_share": Move("upper", "joints", 0.95, LESS),  # a bump reads as slip
     "abrupt_time": Move("upper", "joints", 0.992, LESS),  # ... sooner
     "steady_half": Move("width", "constant-radius", 1.05),
     "steady_share": Move("least probabilities", "constant-radius", 0.95),
@@ -168,7 +168,7 @@ MOVES = {
     "strain_prior": Move("strain", "turn and straight", 1.1),  # it takes more to tell how a car is
     "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are surer
     "strain_power": Move("vy_std", "braking", 1.1, LESS),  # a level car's axles are less sure
-    "strain_least": Move("vy_std", "gaining-slalom", 1.15),
+    "strain_least": Move("vy_std", "gaining-slalom", 1.12),
     "strain_most": Move("vy_std", "rough acceleration", 0.92, LESS),
     "odd_least": Move("distrust", "side force without turning", 0.98),  # it is believed later
     "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
