@@ -119,7 +119,7 @@ class Constants(NamedTuple):
     # contradiction
     farthest: float = 3.6
     # [1] innovation in standard deviations beyond which a row is trusted less
-    huber: float = 1.75
+    huber: float = 1.95
     # [m/s] a node farther than this from the most probable one has diverged: accelerometers forbid
     # it
     diverged_x: float = 0.7
