@@ -176,10 +176,12 @@ class _PoolProcess:
 
 
 def _prepare_process() -> None:
-    """Prepare a new worker process: it ends when its parent process ends, Arrow uses one thread in
-    it, and Ctrl-C stops the estimation of its current drive.
+    """Prepare a new worker process: it ends when its parent process ends, SIGTERM ends it even if
+    the parent handles SIGTERM, Arrow uses one thread in it, and Ctrl-C stops the estimation of its
+    current drive.
     """
     end_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     pa.set_cpu_count(1)
     signal.signal(signal.SIGINT, _interrupt_drive)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
