@@ -16,9 +16,8 @@ from fleet_service.lab import town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.town import LENGTH, Town
-from fleet_service.serve.alerts import CLEAR_BELOW
+from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
 from schemas.numeric import FloatArray, IntArray
-from schemas.thresholds import CALLED_SHARE
 
 DRY = 0.85
 ICE = 0.20
@@ -45,9 +44,8 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     """Return the number of excited passes over each cell of the road until the map shows the
     change, (LENGTH,). An excited pass uses enough grip to measure the friction.
 
-    The map shows ice when P(μ < .4) > CALLED_SHARE, and the end of ice when P(μ < .4) <
-    CLEAR_BELOW, which ends an alert. A pass is counted in the cell for which it was reported, even
-    if the position was wrong.
+    The map shows ice when P(μ < .4) > .9, and the end of ice when P(μ < .4) < .1, which ends an
+    alert. A pass is counted in the cell for which it was reported, even if the position was wrong.
     """
     place = changing_town(rng, before, after)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
@@ -71,7 +69,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
 def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
     slot = fusion.slots_of(CELL[cell : cell + 1], np.zeros(1, np.int64))[0]
     slippery = float(fusion.beliefs_at_last_report(np.array([slot]))[0] @ SLIPPERY_SHARE)
-    return slippery > CALLED_SHARE if ice else slippery < CLEAR_BELOW
+    return slippery > RAISE_ABOVE if ice else slippery < CLEAR_BELOW
 
 
 def measure(seeds: range) -> dict[str, float]:

@@ -4,8 +4,6 @@ is certain or nobody confirms the ice.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -47,20 +45,6 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
     _, alerts, raised = icy([1, 2, 3, 4])
     assert raised == [False, True, False, False]
     assert alerts.slots == {0}
-
-
-@pytest.mark.parametrize(("mu", "used", "raised"), [(0.33, 0.9, True), (0.3, 0.18, False)])
-def test_probable_snow_needs_much_grip_used_for_an_alert(
-    mu: float, used: float, raised: bool
-) -> None:
-    fusion = Fusion(120.0)
-    alerts = Alerts(fusion)
-    for vehicle in range(2 if raised else 16):
-        visit = observations([20.0 * vehicle], [vehicle], value([mu]))
-        alerts.update(fusion.update(replace(visit, used=np.array([used], np.float32))).slots)
-    assert slippery(belief(fusion)) < 0.9 or not raised
-    assert slippery(belief(fusion)) > RAISE_ABOVE
-    assert bool(alerts.slots) is raised
 
 
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
