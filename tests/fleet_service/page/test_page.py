@@ -170,7 +170,7 @@ def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive)
             waits(
                 seen,
                 f"document.body.dataset.level === '{level}' && "
-                "document.body.dataset.kinds.split(',')[0] > 0",
+                "document.body.dataset.kinds?.split(',')[0] > 0",
             )
             waits(
                 seen,
@@ -206,7 +206,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
     drive("ice", "passed")
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('[data-value=observations]').length === 2")
         told = read(seen, street.EAST)
@@ -262,7 +262,7 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         assert not seen.page.evaluate("gripmap.state.show.sound"), "off unless it was asked for"
         seen.page.evaluate("gripmap.map.view.go(.1, .1, 5)")
         seen.page.get_by_role("button", name="show on the map").click()
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         look(seen, "alerts")
 
 
@@ -302,7 +302,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
     until(lambda: list_snapshots(page.archive)[-1] > before + 1)
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.evaluate(
             "at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before
@@ -377,7 +377,7 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_map(page) as seen:
         near(seen, cell_of("ice"), 18.5)
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         seen.page.locator("#map").click()
         seen.page.locator("#tab-legend").click()
         seen.page.locator("#show-bounds").click()
@@ -435,7 +435,7 @@ def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
                 break
         assert seen.page.evaluate("document.activeElement.id") == "map"
         seen.page.keyboard.press("a")
-        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
         for key in ("ArrowLeft", "ArrowRight", "+", "-", "Enter"):
             seen.page.keyboard.press(key)
         waits(seen, "document.querySelector('[data-value=basis]')?.textContent === 'measured'")
@@ -450,7 +450,7 @@ def test_a_phone_shows_map_and_words_without_scrolling_sideways(
     drive()
     with open_map(page, phone=True) as seen:
         near(seen, cell_of("ice"), 17)
-        waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
+        waits(seen, "document.body.dataset.kinds?.split(',')[0] > 0")
         size = seen.page.evaluate(
             "[document.documentElement.scrollWidth, innerWidth, gripmap.map.view.height]"
         )

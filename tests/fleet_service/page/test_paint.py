@@ -155,7 +155,9 @@ def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, dr
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
         waits(seen, "document.body.dataset.alerts === '1'")
-        waits(seen, f"document.body.dataset.kinds.split(',')[{ICE}] == {street.count_known('ice')}")
+        waits(
+            seen, f"document.body.dataset.kinds?.split(',')[{ICE}] == {street.count_known('ice')}"
+        )
         seen.page.evaluate("gripmap.state.alerts[0].headings = ['west']")
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('.heading').length === 2")

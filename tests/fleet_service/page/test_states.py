@@ -24,7 +24,7 @@ pytestmark = pytest.mark.campaign  # a browser takes seconds to start
 
 FOLDER: Final = PICTURES / "states"
 LAPTOP: Final[Any] = {"width": 1366, "height": 768}
-_ICE_DRAWN: Final = f"document.body.dataset.kinds.split(',')[0] == {street.count_known('ice')}"
+_ICE_DRAWN: Final = f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}"
 
 
 # Number of buttons at the first picture that a page draws.
@@ -197,7 +197,7 @@ def test_phone_shows_map_and_first_alert_at_once(page: RunningPage, drive: Drive
     drive()
     with open_map(page, phone=True) as seen:
         near(seen, cell_of("ice"), 17)
-        waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
+        waits(seen, "document.body.dataset.kinds?.split(',')[0] > 0")
         waits(seen, "document.querySelector('#panel [data-alert]')")
         first = seen.page.locator("#panel [data-alert]").first
         box = first.bounding_box()
