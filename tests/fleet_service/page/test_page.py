@@ -28,6 +28,8 @@ pytestmark = pytest.mark.campaign  # a browser takes seconds to start
 PICTURES: Final = ROOT / ".page"
 READY: Final = "body[data-ready]"
 ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
+# Script that tells whether all ice is drawn; before the first picture there are no kinds.
+ICE_DRAWN: Final = f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}"
 
 
 def look(seen: Opened, name: str) -> None:
@@ -206,7 +208,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
     drive("ice", "passed")
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.locator("#map").click()
         waits(seen, "document.querySelectorAll('[data-value=observations]').length === 2")
         told = read(seen, street.EAST)
@@ -252,7 +254,7 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         waits(seen, "gripmap.live.state")
         drive("ice")
         waits(seen, "document.body.dataset.alerts === '1'")
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         waits(seen, "document.getElementById('live').dataset.state === 'live'")
         seen.page.locator("#tab-alerts").click()
         said = seen.page.locator("[data-alert]").inner_text()
@@ -262,7 +264,7 @@ def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
         assert not seen.page.evaluate("gripmap.state.show.sound"), "off unless it was asked for"
         seen.page.evaluate("gripmap.map.view.go(.1, .1, 5)")
         seen.page.get_by_role("button", name="show on the map").click()
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         look(seen, "alerts")
 
 
@@ -302,7 +304,7 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
     until(lambda: list_snapshots(page.archive)[-1] > before + 1)
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.evaluate(
             "at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before
@@ -377,7 +379,7 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_map(page) as seen:
         near(seen, cell_of("ice"), 18.5)
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.locator("#map").click()
         seen.page.locator("#tab-legend").click()
         seen.page.locator("#show-bounds").click()
@@ -435,7 +437,7 @@ def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
                 break
         assert seen.page.evaluate("document.activeElement.id") == "map"
         seen.page.keyboard.press("a")
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         for key in ("ArrowLeft", "ArrowRight", "+", "-", "Enter"):
             seen.page.keyboard.press(key)
         waits(seen, "document.querySelector('[data-value=basis]')?.textContent === 'measured'")

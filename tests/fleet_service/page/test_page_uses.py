@@ -26,6 +26,7 @@ from tests.fleet_service.page import scan, street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
 from tests.fleet_service.page.test_page import (
     ICE,
+    ICE_DRAWN,
     cell_of,
     kinds,
     list_snapshots,
@@ -64,7 +65,7 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
     until(lambda: list_snapshots(page.archive)[-1] > first + 2)
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.evaluate(
             "() => { globalThis.played = []; new MutationObserver(() => "
             "played.push([document.body.dataset.at, "
@@ -119,7 +120,7 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(
     drive("ice", "dry")
     with open_map(page) as seen:
         near(seen, cell_of("ice"), 17)
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.emulate_media(media="print")
         seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
         assert re.fullmatch(
@@ -164,7 +165,7 @@ def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(
     with open_map(page) as seen:
         seen.page.set_viewport_size(WALL)  # type: ignore[arg-type]
         near(seen, cell_of("ice"), 18.5)
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         waits(seen, f"document.getElementById('map').width > {WALL['width'] // 2}")
         size = seen.page.evaluate(
             "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, "
@@ -260,7 +261,7 @@ def test_page_exports_triangles_with_columns_of_the_service(
     drive("ice")
     with open_map(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}")
+        waits(seen, ICE_DRAWN)
         seen.page.locator("#tab-share").click()
         with seen.page.expect_download() as waiting:
             seen.page.locator("#geojson").click()

@@ -16,15 +16,21 @@ from PIL import Image
 from schemas.config import ZenohSettings
 from tests.browser import Opened, open_page
 from tests.fleet_service.conftest import running
-from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
-from tests.fleet_service.page.test_page import PICTURES, READY, cell_of, near, open_map, waits
+from tests.fleet_service.page.test_page import (
+    ICE_DRAWN,
+    PICTURES,
+    READY,
+    cell_of,
+    near,
+    open_map,
+    waits,
+)
 
 pytestmark = pytest.mark.campaign  # a browser takes seconds to start
 
 FOLDER: Final = PICTURES / "states"
 LAPTOP: Final[Any] = {"width": 1366, "height": 768}
-_ICE_DRAWN: Final = f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}"
 
 
 # Number of buttons at the first picture that a page draws.
@@ -54,7 +60,7 @@ def show_ice(seen: Opened, zoom: float = 17.2) -> None:
     """Show the stretch with ice, and wait until it is drawn."""
     seen.page.set_viewport_size(LAPTOP)
     near(seen, cell_of("ice"), zoom)
-    waits(seen, _ICE_DRAWN)
+    waits(seen, ICE_DRAWN)
 
 
 def test_empty_map_says_that_no_vehicle_reported_and_what_to_do(page: RunningPage) -> None:
@@ -109,7 +115,7 @@ def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive)
         seen.page.add_init_script(_FIRST_PICTURE)
         seen.page.goto(link)
         seen.page.wait_for_selector(READY, state="attached")
-        waits(seen, _ICE_DRAWN)
+        waits(seen, ICE_DRAWN)
         assert seen.page.evaluate("buttonsBefore") == 0
         blocks = [url for url in seen.requests if "/blocks" in url]
         assert seen.requests.index(blocks[0]) < seen.requests.index(f"{page.address}moments")
@@ -121,7 +127,7 @@ def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive)
         for one in held:
             one.continue_()
         seen.page.unroute("**/blocks*")
-        waits(seen, _ICE_DRAWN)
+        waits(seen, ICE_DRAWN)
 
 
 def test_map_of_a_silent_server_is_called_stale(page: RunningPage, drive: Drive) -> None:

@@ -142,8 +142,8 @@ class Constants(NamedTuple):
     stiffness_power_x: float = 1.4
     # [1] the same for an axle, where both are
     stiffness_power_y: float = 0.3
-    # [1] demand at which a wheel or an axle informs half of what it could of stiffness: below, the
-    # noise of slip does
+    # [1] demand at which a wheel or an axle gives half of its largest information about stiffness:
+    # at less demand, noise of the slip dominates
     informing: float = 0.06
     # [1] torque gain 3 %, mass 3 %, load and radius (vehicle)
     gain_std: float = 0.045
@@ -190,7 +190,7 @@ class Constants(NamedTuple):
     # [s] lag of wheel speeds and of steering against the inertial sensors: devices up to 60 ms late
     lag_std: float = 0.025
 
-    # [m/s/s^.5] white noise of a_x and a_y, and what is not constant in their offsets (vehicle)
+    # [m/s/s^.5] white noise of a_x and a_y, and wander of their offsets (vehicle)
     drift: float = 0.02
 
     # [rad/s] white noise of a wheel speed sample (vehicle)
