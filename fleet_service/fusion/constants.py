@@ -1,5 +1,12 @@
 """Constants of the fusion (the map's computation from the reports of all vehicles), each with the
 reason for its value. `fleet_service/fusion/README.md` explains the mathematics.
+
+Terms
+    visit          one passage of a vehicle through a cell
+    value, bound   report that measures the friction; report that μ is at least the grip used
+    vote           effect of one visit on the belief about a cell
+    tuning town    simulated town (`lab/town.py`) whose seed serves only to choose constants
+    tuning drive   end-to-end drive with the real estimator (`lab/end_to_end.py`), such a seed too
 """
 
 from __future__ import annotations
@@ -9,184 +16,234 @@ from typing import Final
 from schemas import mugrid
 from schemas.thresholds import NS
 
-BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
+BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS  # [μ] width of a friction bin
 
-# Share of reports that say nothing about the road (faulty sensor, wrong cell, wrong tyre model):
-# bounds what one vote can do to a factor of about 60. Fixes in the wrong cell alone are 12 % at the
-# border of a surface.
+# --- Error of one vehicle ---
+
+# Share of values that contain no information about the road: faulty sensor, wrong cell, wrong tyre
+# model. At the border of a surface, 12 % of the position fixes alone are in the wrong cell. Because
+# of this share, one vote changes the ratio of two probabilities by a factor of at most about 60.
 CONTAMINATION: Final = 0.15
 
-# A vehicle's own error: tyres, mass and stiffness off by a few per cent move all its values the
-# same way. It does not average out over its visits, so it widens every vote; only other vehicles
-# narrow it. It is not learned per vehicle: on three tuning towns a fleet and three tuning ways that
-# changed interval scores by 3 % (half biased fleet: 7 %).
+# Standard deviation of a vehicle's constant error, relative to μ. Tyres, mass and stiffness that
+# are wrong by a few per cent shift all its values in the same direction. The vehicle's own visits
+# do not average this error out, so each vote is widened by it. The error is not learned per
+# vehicle: in three tuning towns per fleet and three tuning drives, learning it changed interval
+# scores by 3 % (7 % if half of the fleet had a bias).
 BIAS_RELATIVE: Final = 0.05
-BIAS_ABSOLUTE: Final = 0.01  # .015 of a vehicle, less what half a bin adds by itself
+# [μ] Additive part of the same error. A vehicle has .015; rounding to bins adds the rest.
+BIAS_ABSOLUTE: Final = 0.01
 
-# A vehicle that agreed with many others is wrong as seldom as it was found wrong, but never less
-# than this: fixes in the wrong cell, and what a sensor does that never failed before.
+# Smallest contamination of a vehicle that agreed with many others. Its contamination is then the
+# share of comparisons in which it disagreed, but not less than this. The rest stands for positions
+# in the wrong cell and for the first failure of a sensor that never failed before.
 CONTAMINATION_LEAST: Final = 0.04
 
-# An error that all vehicles of a place share (the same manoeuvre, the same tyre model, the same
-# ruts) does not average out however many they are; see `shared`. Without a value:
+# --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
+# More vehicles do not average this error out; see `shared`.
+
+# Relative standard deviation in cells where vehicles reported only bounds.
 COMMON_RELATIVE: Final = 0.04
-# ... and what does not grow with the grip: crossfall (a road has 2.5 %), slope that no filter
-# knows, drag that is taken for a tyre's force. Of cells on ice (μ ≤ .2) of five tuning ways the
-# intervals held .80 with .01, .86 with .02.
+# [μ] Standard deviation of the part that does not grow with the grip, for readings that are too
+# low. It stands for crossfall (2.5 % on roads), slopes that no filter knows, and drag mistaken for
+# a tyre force. In cells on ice (μ ≤ .2) of five tuning drives, the intervals contained the true μ
+# in .80 of the cases with .01 and in .86 with .02.
 COMMON_ABSOLUTE: Final = 0.02
-# ... of what reads high, which is more: of ice a seventh of the visits tell a grip that lay beside
-# it, in the same cell or the one before. Of towns with the errors of four tuning ways the intervals
-# held .78 of the ice with .02 for both, .81 with this, and no less of anything else.
+# [μ] The same for readings that are too high. It is larger, because one in seven visits to ice
+# reports the grip of the road next to the ice, in the same cell or the one before. In towns with
+# the errors of four tuning drives, intervals contained the true μ in .78 of the icy cells with .02
+# and in .81 with .025; on other surfaces not less often.
 COMMON_HIGH: Final = 0.025
-# ... with values: what every manoeuvre shares, and what one kind of it does.
+# Relative standard deviation of the part that all kinds of manoeuvre share, in cells with values.
 COMMON_ALWAYS: Final = 0.02
+# Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share.
 COMMON_MANOEUVRE: Final = 0.05
-# ... and with the shape of the tyre, where less than SHARED_SHARE of a road's grip was used:
-# relative, downward.
+
+# Share of a road's grip below which the assumed tyre curve matters: a value measured with less grip
+# may be too low. This error widens intervals upwards and corrects no value.
 SHARED_SHARE: Final = 0.8
-# It is as much as vehicles differ from themselves with the grip that they use, and SHAPE_DOUBT for
-# tyres and surfaces of other shapes. It widens intervals upwards and corrects no value. At most
-# this much. Of 60 tuning fleets that took a wet curve gently, on winter tyres, 8 made a false alert
-# with .25, 3 with .275 and 2 with .3. It binds for tyres of an unknown or a round shape only.
+# Largest relative standard deviation of the tyre-curve error. Of 60 tuning fleets on winter tyres
+# that drove gently through a wet curve, 8 raised a false alert with .25, 3 with .275, 2 with .3.
+# The limit takes effect only for tyres whose curve is unknown or round.
 SHARED_MOST: Final = 0.275
+# The tyre-curve error is a slope times the unused share of grip. `trust.shape_of` learns the slope
+# from differences between visits of the same vehicle. This amount is added to the learned slope,
+# because other tyres and surfaces may have other curves.
 SHAPE_DOUBT: Final = 0.1
+# Prior mean and standard deviation of the slope. The prior weighs as much as about 20 comparisons.
 SHAPE_PRIOR: Final = 0.15
-SHAPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons
-# squares by weight beyond which old ones count half: some two hundred comparisons
+SHAPE_STD: Final = 0.15
+# Sum of weights (squared difference of use over variance) per vehicle above which all earlier
+# comparisons count half; almost seven times the weight of the prior.
 SHAPE_MEMORY: Final = 300.0
-SHARED_LEAST: Final = 0.25  # share of a full weight, by its root, that a gentle value has at least
-# relative standard deviation at which a value has half the weight of a sharp one
+# A value from gentle driving gets at least the square of this as its weight in the cell's means.
+SHARED_LEAST: Final = 0.25
+# Relative shared error σ_s at which a value has half the weight of a value without such an error.
 SHARED_WIDE: Final = 0.1
-SHARED_PART: Final = 0.1  # of the stated variance: errors that vehicles of a place have in common
-# part of what is shared that other manoeuvres do not average out: correlations .6 and .4
+# Share of the variance stated by a vehicle that all vehicles in a place have in common.
+SHARED_PART: Final = 0.1
+# Share of the variance σ_s² that other manoeuvres do not average out. On three rough tuning drives,
+# errors in one place had a correlation of .6 for the same kind of manoeuvre, .1 to .5 for others.
 SHARED_ALWAYS: Final = 0.5
 
-# What slippery neighbours tell, see `neighbours`: P(the next cell has the same surface). Of three
-# tuning ways the Brier score of P(slippery) was .0526 with .8, .0471 with .9.
+# --- Evidence from slippery neighbouring cells, see `neighbours` ---
+
+# P(the next cell has the same surface). In three tuning drives the Brier score of P(slippery) was
+# .0526 with .8 and .0471 with .9.
 SAME_SURFACE: Final = 0.9
-NEIGHBOURS: Final = 4  # cells before and behind that may tell
-NEIGHBOUR_GRIP: Final = 0.1  # a neighbour that is slippery with less than this ends the stretch
-# a cell with so little doubt is not asked again: three messages are worth some thousand
+# Number of cells before, and number of cells behind, that may send a message to a cell.
+NEIGHBOURS: Final = 4
+# A neighbour with a smaller P(slippery) ends the slippery stretch: cells beyond it send no message.
+NEIGHBOUR_GRIP: Final = 0.1
+# A cell whose P(slippery) is this close to 0 or 1 gets no messages. The reports of its own visitors
+# decide, and reading the map takes less time.
 DECIDED: Final = 0.001
 
-# A road changes slowly (drying, polishing): random walk of μ, standard deviation after one hour.
+# --- Change of a road with time ---
+
+# Standard deviation of μ after one hour of slow change (drying, polishing), a random walk.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
 
-# ... and at once (ice, snow, a gritter): mean time between changes that leave nothing of what was
-# known. With three hours a lonely measurement fades within a day.
+# [s] Mean time between sudden changes (ice, snow, gritting) after which older reports mean nothing.
+# With three hours, a single measurement fades within a day.
 CHANGE_S: Final = 10800.0
-# Visits may follow each other within the second, and a road may change between them: a new value
-# always finds this much chance of it: two passes turn a firm belief. With .003, ice where all
-# pass at the limit was found after 6 passes (p95 8) of a tuning fleet, with .01 after 5 (6); false
-# ice of three fleets, attacks, ways and value figures are the same. Lower bounds do not: however
-# many there are, they wear nothing away.
+# Smallest probability of a sudden change that is assumed before each new value. Visits may follow
+# each other within a second, and the road may still change between them; with this, two passes
+# reverse a firm belief. In a tuning fleet in which every pass used all the grip, ice was found
+# after 6 passes (95 % quantile 8) with .003, and after 5 (6) with .01. False ice of three fleets
+# and the figures of attacks, drives and value did not change. Bounds do not assume such a change,
+# so that no number of bounds erases a belief.
 CHANGE_LEAST: Final = 0.01
 
-# Time is let pass over a belief in portions of this length: shorter ones would be lost in the
-# rounding of its 16 bits, and none moves an interval by a tenth of a bin.
+# [s] Beliefs are aged in steps of at least this length. A shorter step would be lost in rounding to
+# 16 bits. One step moves an interval by less than a tenth of a bin.
 FORGET_S: Final = 10.0
 
-# A vehicle's vote in a cell counts again in the measure in which the map forgets the first one, by
-# drift as by change; so that no vehicle can hold a cell by driving over it all day.
+# --- Repeated reports of one vehicle in one cell ---
+
+# [s] Time constant with which a vehicle's vote counts again, at the rate at which the map forgets
+# the first vote by slow and sudden change. So no vehicle controls a cell by passing it all day.
 VOTE_RENEWAL_S: Final = 3600.0
 
-# Values so many standard deviations apart are certainly of two roads, or one of them is wrong.
+# Two values this many standard deviations apart come from two different roads, or one is wrong.
 PEERS_DISAGREE: Final = 4.0
 
-# A vote counts again at once, if it says something else: its own bias cancels in the difference to
-# its own last vote. From two standard deviations (noise) to PEERS_DISAGREE (certainly new); no
-# sender's own spread is believed to be below NOVELTY_STD.
+# A value that differs from the vehicle's own last value in the cell counts again at once; the
+# vehicle's bias cancels in the difference. Up to NOVELTY_FROM standard deviations the difference
+# is noise. From NOVELTY_FULL on the vote counts in full.
 NOVELTY_FROM: Final = 2.0
 NOVELTY_FULL: Final = PEERS_DISAGREE
+# [μ] Smallest standard deviation that is believed in such a comparison.
 NOVELTY_STD: Final = 0.05
-# So many whole votes a vehicle has in a cell per VOTE_RENEWAL_S, however often it changes its mind:
-# one and one change. With one and a half, ice takes four passes to be seen instead of three.
+# Number of whole votes that a vehicle has in a cell per VOTE_RENEWAL_S, however often its values
+# change: one vote and one change. With 1.5, ice is found after four passes instead of three.
 VOTES: Final = 2.0
-# ... and only at a visit of its own: nobody drives round a block in less. So a flood of reports is
-# one report.
+# [s] Shortest time between two visits that count as separate, because driving round a block takes
+# longer. So a flood of reports counts as one report.
 REVISIT_S: Final = 20.0
-# ... and so many visits of one vehicle to one cell are kept for the window; more are archived and
-# not fused. Six visits of their own fit into it (REVISIT_S), and their votes would be worth
-# nothing.
+# Number of visits of one vehicle to one cell that the lateness window holds. Further visits are
+# archived and not fused. Only six visits REVISIT_S apart fit into a window of two minutes, and the
+# votes of all others would weigh almost nothing.
 WAITING_MOST: Final = 32
-# So long a vehicle's values in a cell are remembered: by then 95 % of its vote count again
-# (1 - e⁻³). Lower bounds are remembered for VOTE_RENEWAL_S only, when 63 % count again: most visits
-# give bounds, so memory is the visits of one hour and the values of three.
+# [s] Time for which a vehicle's values in a cell are remembered. By then 95 % of its vote counts
+# again (1 - e⁻³). Bounds are remembered for VOTE_RENEWAL_S only, when 63 % counts again. Most
+# visits give bounds, so the memory holds the visits of one hour and the values of three.
 FORGOTTEN_S: Final = 3.0 * VOTE_RENEWAL_S
-FORGOTTEN_EVERY_S: Final = 900  # time between two deletions of what is forgotten
-# For a lower bound, "something else" is this much more grip used.
+FORGOTTEN_EVERY_S: Final = 900  # [s] time between two deletions of reports too old to remember
+# Increase of the grip used from which a new bound counts as new information in full.
 NOVELTY_UTILISED: Final = 0.10
 
-# A visit without a value is evidence against slippery road where visitors gave values before: this
-# share of the cell's own rate of values, since a driver who was warned uses less grip. At 20
-# vehicles an hour .883 of the alerts of four tuning towns were right without it, .914 with it,
-# and the same share of ice was found (.906).
+# --- Visits without a value ---
+
+# A visit without a value is evidence against slippery road if other visits to the cell gave values.
+# The evidence is the cell's share of visits with a value, times this factor; the factor is below 1
+# because a warned driver uses less grip. In four tuning towns with 20 vehicles an hour, the share
+# of correct alerts was .883 without this evidence and .914 with it. The share of ice that alerts
+# found was .906 in both cases.
 SILENCE: Final = 0.4
-FIRST_VISITS: Final = 4.0  # that are too few to know the rate of values
-# P(slippery) down to which that may lead: no longer probable, and not improbable either
+# Added to the number of visits in that share: after so few visits the share is not known well.
+FIRST_VISITS: Final = 4.0
+# Visits without a value lower P(slippery) at most to this: no longer probable, but not improbable.
 UNSURE: Final = 0.45
 
-# An unexcited visit should be flat above the grip it used; senders agree within half a nat
-# (contract of the log-likelihood), so a fall towards the upper end of less than twice that is taken
-# as flat: a bound, not a value.
-VALUE_DROP_NATS: Final = 1.0
-VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)
+# --- From a report to a likelihood ---
 
-# A fix's error spreads a visit over the cells before and behind: each gets the vote in the measure
-# in which the vehicle was there. Shares below this stay with the visit's own cell: receivers of 1.5
-# m leave 6 % to each side, which is part of CONTAMINATION, and thrice the votes would say nothing
-# more.
+# [nat] A likelihood that falls by less than this towards the highest μ is taken as flat there, so
+# it is a bound. The contract allows senders half a nat of slope above the grip used; this is twice
+# that.
+VALUE_DROP_NATS: Final = 1.0
+VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
+
+# Smallest probability that a vehicle was in another cell for which that cell gets a part of its
+# vote; smaller parts stay in the reported cell. Receivers with an error of 1.5 m have 6 % on each
+# side, which CONTAMINATION covers. Spreading these too would cost three times as many votes and add
+# nothing.
 SPREAD_LEAST: Final = 0.08
-SPREAD_CELLS: Final = 2  # to each side; who is further off has no position
-# more probably here than elsewhere: counts as a visit, and is held against others'
+# Number of cells on each side that may get a part. A position that is less accurate has no use.
+SPREAD_CELLS: Final = 2
+# A vote counts as a visit to a cell, and is compared with other vehicles there, only if the vehicle
+# was in this cell with at least this probability.
 HERE_SHARE: Final = 0.5
 
-# error of the grip used: accelerometer and load transfer, about 5 % of g ...
+# Standard deviation of the grip used: accelerometer and load transfer, about 5 % of g.
 UTILISED_STD: Final = 0.05
-# ... and of itself as much as a value: mass over the wheels, roll, gain
+# Relative part of the same error, as large as a value's: mass over the wheels, roll, sensor gain.
 UTILISED_RELATIVE: Final = BIAS_RELATIVE
-# ... and is not believed beyond: of what was above, 29 % was too much by more than .05
+# Largest grip used that is believed. Of the reports above it, 29 % were too high by more than .05.
 UTILISED_MOST: Final = 0.9
-# Share of bounds that are of another road, or are no bound: on two rough ways 2 to 6 % were too
-# high by more than .1, and where the surface changes within a cell all of them.
+# Share of bounds that belong to another road or are no bounds. On two rough tuning drives, 2 to 6 %
+# of the bounds were too high by more than .1, and all were where the surface changes inside a cell.
 BOUND_CONTAMINATION: Final = 0.3
-POSTERIOR_STD: Final = 0.15  # of a posterior without an interval: as wide as wet is from dry
-POSTERIOR_STD_LEAST: Final = 0.02  # half a bin: the grid cannot hold less
+# [μ] Standard deviation of a posterior sent without an interval: the distance from wet to dry road.
+POSTERIOR_STD: Final = 0.15
+POSTERIOR_STD_LEAST: Final = 0.02  # [μ] half a bin: the grid cannot represent less
 
-# Trust: two values agree up to 2.5 standard deviations of their difference (bias included) and
-# disagree from PEERS_DISAGREE on. Honest vehicles then agree in 95 % of their meetings (fixes in
-# the wrong cell, roads that change), whatever the road.
+# --- Trust: comparison of values of different vehicles in the same cell ---
+
+# Two values agree fully up to this many standard deviations of their difference (bias included),
+# and not at all from PEERS_DISAGREE on. Honest vehicles then agree in 95 % of their comparisons on
+# every kind of road; wrong cells and changing roads cause the rest.
 PEERS_AGREE: Final = 2.5
-PEER_S: Final = 900  # values further apart in time may both be right
-PEER_STD: Final = 0.25  # wider ones agree with everything
-# Meetings with one vehicle after which the old count half: who was honest and begins to lie is seen
-# in minutes, and a repaired sensor as soon; the mean over many others keeps it quiet.
+PEER_S: Final = 900  # [s] values further apart in time are not compared: both may be right
+# [μ] Two values are not compared if their difference has a larger standard deviation, because then
+# they would agree with everything.
+PEER_STD: Final = 0.25
+# Number of comparisons with one other vehicle above which the earlier ones count half. A vehicle
+# that begins to lie, or whose sensor was repaired, is noticed within minutes. Noise stays small
+# because trust is a mean over many other vehicles.
 PEER_MEMORY: Final = 3.0
-REPORTERS: Final = 6  # last values of a cell that a new one is held against
-PEERS: Final = 48  # places for others: a sample, which is enough for a mean
-# As a mean over others, beginning with TRUST_PRIOR_PEERS imagined ones that agreed in TRUST_PRIOR.
-# No weight is left to who disagrees with 30 % of those that are trusted; with less than a third of
-# a fleet colluding that is the colluders.
+REPORTERS: Final = 6  # number of latest values per cell with which a new value is compared
+# Number of other vehicles that a vehicle's comparison record holds: a sample of all it met, large
+# enough for a mean.
+PEERS: Final = 48
+# Trust begins as if the vehicle had been compared with TRUST_PRIOR_PEERS others and had agreed
+# with the share TRUST_PRIOR.
 TRUST_PRIOR: Final = 0.85
 TRUST_PRIOR_PEERS: Final = 8.0
+# Share of agreement at or below which a vehicle has no weight: it disagrees with 30 % of the
+# trusted vehicles. If less than a third of a fleet colludes, only the colluders fall below it.
 TRUST_NONE: Final = 0.7
-TRUST_FULL: Final = 0.9
-# how much a vehicle's word about others counts at least: all distrusted is no end
+TRUST_FULL: Final = 0.9  # share of agreement from which trust is 1
+# Smallest weight of another vehicle in this mean, so that comparisons count even if no vehicle is
+# trusted.
 TRUST_HEARD_LEAST: Final = 0.2
-# Once so many vehicles are known (met so many others, and are trusted), one that is not is a
-# newcomer: it votes with this weight, is no corroborating source, and shares one vote per cell with
-# all others that are not trusted.
+# A vehicle is known once it has been compared with this many others, weighted by their trust.
 ESTABLISHED_PEERS: Final = 4.0
+# Number of known and trusted vehicles from which every vehicle that is not known is a newcomer.
 ESTABLISHED_VEHICLES: Final = 10
+# Largest vote weight of a newcomer. It is below SOURCE_TRUST, so a newcomer supports no alert. The
+# vehicles of a cell that are not trusted together count less than two votes.
 NEWCOMER: Final = 0.4
-# less trusted vehicles vote, but are no corroborating sources for an alert
+# Smallest weight with which a vehicle is trusted. A less trusted one votes but supports no alert.
 SOURCE_TRUST: Final = 0.5
-# P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
+# P(slippery) of a single report, under the uniform prior, from which it may be a source of ice.
 SOURCE_SHARE: Final = 0.6
-# ... and its evidence for ice against grip, in nats, with the doubt about the shape of its tyres.
-# Of the visits to ice (< .25) of two tuning ways 20 % have 1.5 nats and 12 % three; of those to wet
-# road .6 % and .2 %, to dry road .08 % and .04 %. With two instead of one, alerts of three ways
-# found .13 of the snow instead of .17, and as much ice (.80).
+# [nat] Evidence for ice against grip that a source of ice also needs, after allowing for the error
+# of the assumed tyre curve. In two tuning drives, 1.5 nats were reached by 20 % of visits to ice
+# (μ < .25), .6 % to wet road and .08 % to dry road; 3 nats by 12 %, .2 % and .04 %. With two nats
+# instead of one, alerts in three drives found .13 of the snow instead of .17, and as much ice
+# (.80).
 WITNESS_NATS: Final = 1.0
-# Trust acts from the next epoch on, so that it depends on the order of time and not of arrival.
+# [ns] Trust is computed once per epoch and used from the next epoch on. So it depends on the order
+# of the times of reports, and not on their order of arrival.
 EPOCH_NS: Final = 60 * NS
