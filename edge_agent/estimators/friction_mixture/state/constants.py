@@ -13,45 +13,55 @@ from typing import NamedTuple
 
 from schemas.runtime.records import LANES
 
-NODES = 20  # friction hypotheses, equidistant in the square root of mu: fine where mu is small
-SPLIT_NODES = 30  # hypotheses of a split road: a low and a high friction, either way round
+# Number of hypotheses of one friction. They are equidistant in the square root of mu, so that the
+# grid is fine where mu is small.
+NODES = 20
+# Number of hypotheses of a split road: a low friction on one side and a high one on the other.
+SPLIT_NODES = 30
 ALL_NODES = NODES + SPLIT_NODES
-# Nodes lie side by side: node j is lane j % LANES of group j // LANES, and the last group has lanes
-# to spare. A node in use and a node that sleeps may share a group.
+# Memory layout: node j is lane j % LANES of group j // LANES. Some lanes of the last group are
+# unused. A group may contain active and inactive nodes.
 GROUPS = -(-ALL_NODES // LANES)
 PLACES = GROUPS * LANES
-PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
-ROWS = 6  # of measurement: four wheels along, two axles across
+PATCH_NODES = 5  # number of nodes that stand for ice: the first ones, up to mu = .195
+ROWS = 6  # number of measurements: four wheels (longitudinal), then two axles (lateral)
 
 
 class NodeState(IntEnum):
     """Index of a state in the state vector of a node (the filter of one friction hypothesis)."""
 
-    VX = 0  # [m/s]
-    VY = 1  # [m/s], at the centre of gravity
-    LN_KX = 2  # log of true over nominal longitudinal stiffness
-    LN_KY = 3  # the same for cornering stiffness
-    STEER = 4  # offset of the front steering against the rear axle [rad]
-    LEAK_Y = 5  # share of measured lateral acceleration that is gravity felt by the rolled body
-    SHAPE = 6  # shape of the tyre curve: spreads by which it is sharper than the usual one
-    GAIN = 7  # error of the longitudinal force over load, relative: torque gain and mass
-    # of a_y, that is no force: offset, tilted mount, yaw-rate offset times speed [m/s^2]
+    VX = 0  # [m/s] forward velocity
+    VY = 1  # [m/s] velocity to the left, at the centre of gravity
+    LN_KX = 2  # [1] ln of true over nominal longitudinal stiffness
+    LN_KY = 3  # [1] ln of true over nominal cornering stiffness
+    STEER = 4  # [rad] offset of the front steering angle relative to the rear axle
+    LEAK_Y = 5  # [1] share of measured lateral acceleration that is gravity, due to body roll
+    SHAPE = 6  # [1] shape of the tyre curve: 0 usual, 1 sharp, -1 round
+    GAIN = 7  # [1] relative error of the longitudinal force over load, from torque gain and mass
+    # [m/s^2] part of a_y that no tyre force causes: sensor offset, tilted mount, and the offset of
+    # the yaw rate times speed
     BIAS_Y = 8
-    BIAS_X = 9  # the same of a_x
-    RADIUS = 10  # relative error of the radius of each of four wheels
-    LAG_WHEEL = 14  # of the wheel speeds behind the accelerometers [s]
-    LAG_STEER = 15  # of the steering behind the gyroscope [s]
-    # slip angle that steering and bushes take from the front axle, per side force over load [rad]
+    BIAS_X = 9  # [m/s^2] part of a_x that no tyre force causes
+    RADIUS = 10  # [1] relative error of the radius of each of four wheels (states 10 to 13)
+    LAG_WHEEL = 14  # [s] delay of the wheel speeds relative to the accelerometers
+    LAG_STEER = 15  # [s] delay of the steering signal relative to the gyroscope
+    # [rad] front slip angle lost to the yield of steering column and bushings, per lateral force
+    # over load
     COMPLIANCE = 16
-    STEER_GAIN = 17  # relative error of the front steering angle
-    SLOPE = 18  # gravity along the road, felt ahead: a force holds it, but it moves nothing [m/s^2]
-    BANK = 19  # gravity across the road, felt to the left [m/s^2]
+    STEER_GAIN = 17  # [1] relative error of the front steering angle
+    # [m/s^2] gravity along the road, as a_x measures it; tyre forces balance it, so it does not
+    # accelerate the car
+    SLOPE = 18
+    BANK = 19  # [m/s^2] gravity across the road, as a_y (to the left) measures it
 
 
-CURVED = int(NodeState.STEER)  # states in which the rows of measurement are not linear
-# states up to this one are differentiated one by one; the others follow from these and from speeds
+# Number of states in which the measurement equations are nonlinear: those before STEER.
+CURVED = int(NodeState.STEER)
+# For the states before this one, the measurements are differentiated one state at a time. The
+# derivatives by the later states follow from these and from the speeds.
 STRAIGHT = int(NodeState.RADIUS)
-ACTIVE = int(NodeState.SLOPE)  # states that the rows see within a block
+# Number of states that affect the measurements of a block: those before SLOPE.
+ACTIVE = int(NodeState.SLOPE)
 STATES = NodeState.BANK + 1
 
 
@@ -60,229 +70,265 @@ class Constants(NamedTuple):
     reason.
 
     Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
-    (separable CMA-ES) for a small interval score and few missed and false reports of ice on drives
-    of two simulators. Its limits: late steering still contradicts the model, tilted sensors strain
-    it, split roads are covered, and logs of real cars hold. Values of the search that told less of
-    the ice in long towns were not taken. For a study, `Constants(name=value)` replaces one value.
+    (separable CMA-ES) on drives of two simulators. It minimised the interval score and the missed
+    and false reports of ice. Its conditions were: late steering still contradicts the model, tilted
+    sensors strain it, split roads are covered, and logs of real cars pass. Values of the search
+    that found less of the ice in long towns were not adopted. For a study, `Constants(name=value)`
+    replaces one value.
     """
 
-    # [s] one measurement update per block: model error is correlated over more, so nothing is lost
+    # --- Time constants of the measurement update ---
+    # [s] length of a block, after which one measurement update is made. Model errors are correlated
+    # over a longer time, so joining samples loses nothing.
     block_time: float = 0.05
-    # [s] one independent measurement of tyre or wheel speeds per so much time: R is inflated by it
-    # over a block (errata)
+    # [s] time within which tyre and wheel-speed errors are correlated (errata). R of a block is
+    # multiplied by this time over the block's length.
     correlation_time: float = 0.28
-    # [s] window of the innovation variances, and of a_x at rest
+    # [s] averaging time of the innovation variances, and of a_x at standstill
     window: float = 1.0
 
-    # [1/m] one road change to anywhere per 270 m (190: beliefs fade before grip is used again)
+    # --- Road changes ---
+    # [1/m] rate of changes to any other friction: one per 270 m. With one per 190 m, the belief
+    # faded before the car used grip again.
     hazard: float = 1 / 270
-    # [1/m] slow change to a neighbouring node
+    # [1/m] rate of slow changes to a neighbouring node
     diffusion: float = 0.0024
-    # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is
-    # covered)
+    # [m] distance over which the probability of an unnoticed ice patch grows to its prior: two car
+    # lengths. With 18 m, .05 less of the ice in town was covered.
     patch_length: float = 9.0
-    # [1] probability of unlike sides at the first sign of them, slip that force does not ask for
-    # (.05: called late)
+    # [1] probability of a split road at its first sign (see `split_asymmetry`). With .05 split
+    # roads were recognised late.
     split_prior: float = 0.2
-    # [1/m] end of such a road
+    # [1/m] rate at which a split road ends: once per 60 m
     split_hazard: float = 1 / 60
-    # [1] left against right, in force over load, that wakes the split nodes
+    # [1] sign of a split road: difference between left and right slip that the forces do not
+    # explain, as force over load of a linear tyre
     split_asymmetry: float = 0.12
 
-    # [1] force over load at which half of the evidence on mu is taken (.12: a gentle slalom reads
-    # as ice)
+    # --- Weight of the evidence on friction ---
+    # [1] force over load at which `charge_penalty` charges half of a node's cost and, without fuzzy
+    # rules, the evidence counts by half. With .12 a gentle slalom was taken for ice.
     demand_half: float = 0.13
-    # [1] steepness of that
+    # [1] exponent of force over load in this weight
     demand_power: float = 4.0
-    # [nat] a larger loss in a block counts whatever the demand: the node has lost the motion
+    # [nat] loss of log-likelihood in a block beyond which the rest counts in full at any force,
+    # because the node's velocity must be wrong
     plausible_loss: float = 1.7
-    # [nat] most that a block may take from a node, or a look from a kind of drive: a spike is
-    # forgiven within two
+    # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
+    # compensate for a spike
     largest_loss: float = 3.0
-    # [s] memory of the usual force, against which a new one is judged
+    # [s] averaging time of the usual force, with which the current force is compared
     steady_time: float = 2.0
-    # [1] change of force over load from the usual at which half of the evidence is new
+    # [1] change of force over load at which the evidence counts as new by half
     steady_half: float = 0.03
-    # [1] evidence left, and weight of the axles, where nothing changes: errors of curve and offsets
-    # are the same again
+    # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
+    # Errors of tyre curve and offsets then repeat from block to block.
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.38
-    # [1] weight of the density that sliding spreads over slip: not every braking car slides on all
-    # wheels
+    # [1] weight of the penalty for sliding wheels, whose slip may have any value. It is below 1
+    # because a braking car seldom slides on all wheels.
     sliding_penalty: float = 0.22
-    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated
-    # one (.28: false ice; .24: less snow is told)
+    # [1] weight of ln det S of the axles in the likelihood. Weight 0 favours nodes with a large S,
+    # weight 1 nodes with saturated tyres. With .28 dry road was reported as ice, and with .24 less
+    # of the snow was found.
     axle_penalty: float = 0.2
 
-    # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a
-    # contradiction
+    # --- Limits of states and innovations ---
+    # [1] limit of vehicle and sensor states: standard deviations from their prior
     farthest: float = 3.6
-    # [1] innovation in standard deviations beyond which a row is trusted less
+    # [1] innovation, in standard deviations, beyond which R of a measurement is increased
     huber: float = 1.95
-    # [m/s] a node farther than this from the most probable one has diverged: accelerometers forbid
-    # it
+    # [m/s] difference of v_x from the most probable node beyond which a node has diverged. The
+    # accelerometers exclude such a difference.
     diverged_x: float = 0.7
-    # [m/s] the same across
+    # [m/s] the same limit for v_y
     diverged_y: float = 1.0
 
-    # [1] Magic Formula c between the lateral 1.3 and the longitudinal 1.65 of passenger tyres
+    # --- Tyre ---
+    # [1] shape factor C of the Magic Formula, between 1.3 (lateral) and 1.65 (longitudinal) of
+    # passenger car tyres
     curve_c: float = 1.45
-    # [1] Magic Formula e, as c
+    # [1] curvature factor E of the Magic Formula, between the lateral and the longitudinal value
     curve_e: float = -0.1
-    # [1] tyres between round and sharp: most of them
+    # [1] standard deviation of the state SHAPE: most tyres lie between -1 (round) and 1 (sharp)
     shape_std: float = 0.85
-    # [1] log of the factor along: files of real cars are a third off (BMW M8, AV-21), which is
-    # within the limit of 3.6 standard deviations
+    # [1] standard deviation of ln of the longitudinal stiffness factor. Vehicle files of real cars
+    # are a third off (BMW M8, AV-21), which is within 3.6 standard deviations.
     stiffness_x_std: float = 0.125
-    # [1] log of the factor across (vehicle)
+    # [1] standard deviation of ln of the cornering stiffness factor (vehicle)
     stiffness_y_std: float = 0.12
-    # [1] power of the stiffness factor that divides a wheel's residual: slip is noisy, force is
-    # quiet
+    # [1] exponent of the stiffness factor by which a wheel's residual is divided. It exceeds 1
+    # because slip is noisier than force.
     stiffness_power_x: float = 1.4
-    # [1] the same for an axle, where both are
+    # [1] the same exponent for an axle, whose slip and force are both noisy
     stiffness_power_y: float = 0.3
-    # [1] demand at which a wheel or an axle gives half of its largest information about stiffness:
-    # at less demand, noise of the slip dominates
+    # [1] force over load at which a wheel or axle has half of its largest effect on the stiffness
+    # states. At smaller forces slip is mostly noise.
     informing: float = 0.06
-    # [1] torque gain 3 %, mass 3 %, load and radius (vehicle)
+    # [1] standard deviation of the force gain: torque 3 %, mass 3 %, load and radius (vehicle)
     gain_std: float = 0.045
-    # [s] return of curve shape, stiffness, leaks, offsets, radii, lags, slope and bank to their
-    # prior: what they stand for changes with load, bend and road (300: twice too sure)
+    # [s] time in which vehicle, sensor and road states return to their prior, because the errors
+    # they describe change with load, bend and road. With 300 s the stated deviations were half of
+    # the actual errors.
     return_time: float = 60.0
 
-    # [1] gravity leak of a rolling body, in measured a_y (errata: .07 of true a_y)
+    # --- Accelerometers and slope of the road ---
+    # [1] mean share of measured a_y that is gravity, due to body roll (errata: .07 of the true a_y)
     leak_y_mean: float = 0.06
-    # [1] its spread (errata)
+    # [1] standard deviation of this share (errata)
     leak_y_std: float = 0.05
-    # [1] gravity leak of a pitching body, in measured a_x: pitch is stiffer than roll
+    # [1] share of measured a_x that is gravity, due to pitch. It is smaller because a body is
+    # stiffer in pitch than in roll.
     leak_x: float = 0.02
-
-    # [m/s^2] offset of a_x: tilted mount and sensor, .22 to .96 on logs of real cars
+    # [m/s^2] standard deviation of the offset of a_x from tilted mount and sensor: .22 to .96 on
+    # logs of real cars
     bias_x_std: float = 0.25
-    # [m/s^2] offset of a_y, .07 to .54 there; a crossfall that the wheels do not steer against
-    # reads the same
+    # [m/s^2] standard deviation of the offset of a_y: .07 to .54 on these logs. A bank that needs
+    # no steering has the same effect.
     bias_y_std: float = 0.2
-    # [m/s^2] slope of the road along and across: 3 % of grade, crossfall of 1 to 3 %
+    # [m/s^2] standard deviation of slope and bank: a grade of 3 %, a crossfall of 1 to 3 %
     slope_std: float = 0.3
-    # [m] over which slope and crossfall are another one: waves of 100 to 400 m
+    # [m] distance over which slope and bank change: road waves are 100 to 400 m long
     slope_length: float = 120.0
-    # [rad] offset of steering and toe: 1 to 17 mrad on logs of real cars, mostly below 4
+
+    # --- Steering ---
+    # [rad] standard deviation of the steering offset, with toe: 1 to 17 mrad on logs of real cars,
+    # mostly below 4
     steer_std: float = 0.004
-    # [1] gain of the steering ratio: vehicle files of real cars are 3 to 8 % off
+    # [1] standard deviation of the steering gain: steering ratios in vehicle files of real
+    # cars are 3 to 8 % off
     steer_gain_std: float = 0.02
-    # [rad] steering compliance per side force over load: production cars have 0 to .035 (front
-    # C/F_z of 10 to 20)
+    # [rad] mean steering compliance per lateral force over load: 0 to .035 on production cars
+    # (front C/F_z of 10 to 20)
     compliance_mean: float = 0.005
-    # [rad] its spread
+    # [rad] standard deviation of the compliance
     compliance_std: float = 0.01
-    # [s] return of gain and compliance to their prior: they are properties of the car
+    # [s] time in which steering gain and compliance return to their prior. It is long because they
+    # are properties of the car.
     steer_time: float = 600.0
-    # [1] radius of a wheel against the others: pressure, wear, and axles whose tyres differ (1 % on
-    # BMW M8 and AV-21)
+
+    # --- Wheel radii and delays ---
+    # [1] standard deviation of one wheel's radius relative to the others: pressure, wear, and
+    # different tyres on the axles (1 % on BMW M8 and AV-21)
     wheel_std: float = 0.011
-    # [1] radius of all wheels together: nominal radii of real cars are up to 1.5 % off; nothing
-    # here tells it
+    # [1] standard deviation of the common radius error: nominal radii of real cars are up to
+    # 1.5 % off. No sensor here measures it.
     radius_std: float = 0.0125
-    # [s] lag that all devices share: 60 ms are common, .2 s are met; no sensor tells it, it is in
-    # the spread of v_x
+    # [s] delay that all sensors share: 60 ms are common, .2 s occur. No sensor measures it, so it
+    # only increases the stated deviation of v_x.
     common_lag: float = 0.05
-    # [s] lag of wheel speeds and of steering against the inertial sensors: devices up to 60 ms late
+    # [s] standard deviation of the delay of wheel speeds and steering relative to the inertial
+    # sensors, which reaches 60 ms
     lag_std: float = 0.025
 
-    # [m/s/s^.5] white noise of a_x and a_y, and wander of their offsets (vehicle)
+    # --- Noise of accelerometers, wheel speeds and steering ---
+    # [m/s/s^.5] white noise of a_x and a_y, and random walk of their offsets (vehicle)
     drift: float = 0.02
-
     # [rad/s] white noise of a wheel speed sample (vehicle)
     omega_noise: float = 0.03
-    # [rad/s] what wheel speeds have wrong beside their noise: steps that cannot be seen, teeth,
-    # tyres that wobble
+    # [rad/s] other errors of the wheel speeds: undetected resolution steps, sensor teeth, wobbling
+    # tyres
     step_noise: float = 0.06
-    # [1] of slip that came just now: a tyre's force needs .3 m, and a bump changes the radius that
-    # it rolls on
+    # [1] share of a sudden change of slip that counts as noise. A tyre builds up force over .3 m,
+    # and a bump changes the rolling radius.
     abrupt_share: float = 0.5
-    # [s] in which it has become usual: a bump lasts .05 s, a wheel locks or spins up in .1 to .3
+    # [s] time in which a change of wheel speed stops being sudden. A bump lasts .05 s; a wheel
+    # locks or spins up in .1 to .3 s.
     abrupt_time: float = 0.15
-    # [rad] white noise of steering in a block (vehicle)
+    # [rad] white noise of the steering angle in a block (vehicle)
     angle_std: float = 0.0003
-    # [1] how the wheels of an axle point, of the angle; the common gain of the steering is a state
+    # [1] relative error of the direction of an axle's wheels. Their common gain is the state
+    # STEER_GAIN.
     angle_share: float = 0.01
-    # [1] rolling resistance, in force over load
-    floor_x: float = 0.006
-    # [1] toe, compliance and what steering and a_y share badly, in force over load
-    floor_y: float = 0.014
-    # [1] torque gain 3 %, mass 3 %, load 3 % (vehicle)
-    force_share: float = 0.04
-    # [1] load transfer between axles and inertia (vehicle)
-    axle_share: float = 0.02
-    # [1] shape error of the tyre curve at full demand, in side force over load
-    shape_share: float = 0.05
-    # [s] side force behind slip (relaxation, roll), times its rate
-    lag: float = 0.015
-    # [1] where torque is missing: how unlike the wheels of an axle pull, of the force
-    no_torque_share: float = 0.1
-    # [m/s^2] where torque is missing: a_x that is not force and not an offset
-    no_torque_floor: float = 0.1
 
-    # [1] of the force that spins a wheel up or down: torque and wheel speed have clocks of their
-    # own, ABS acts at 8 Hz
+    # --- Noise of the forces ---
+    # [1] error of the longitudinal force over load from rolling resistance
+    floor_x: float = 0.006
+    # [1] error of the lateral force over load from toe, compliance, and the imperfect relation of
+    # steering and a_y
+    floor_y: float = 0.014
+    # [1] relative error of the longitudinal force: torque gain, mass and load 3 % each (vehicle)
+    force_share: float = 0.04
+    # [1] relative error of an axle's lateral force: load transfer and inertia (vehicle)
+    axle_share: float = 0.02
+    # [1] error of the tyre curve's shape, per squared lateral force over load
+    shape_share: float = 0.05
+    # [s] delay of lateral force behind slip (relaxation, roll). The error is this time multiplied
+    # by the rate of the force.
+    lag: float = 0.015
+    # [1] without torque: relative difference between the forces of an axle's wheels
+    no_torque_share: float = 0.1
+    # [m/s^2] without torque: part of a_x that is neither force nor offset
+    no_torque_floor: float = 0.1
+    # [1] relative error of the force that accelerates a wheel's rotation. Torque and wheel speed
+    # are sampled at different times, and ABS acts at 8 Hz.
     spin_share: float = 0.3
 
+    # --- Road changes where wheels slide ---
     # [1] probability of a road change where a wheel begins to slide
     slip_change: float = 0.3
-    # [1/m] one road change per so much where a wheel has slid and grips again: ice comes in patches
+    # [1/m] rate of road changes where a wheel has slid and grips again, because ice comes in
+    # patches
     slip_hazard: float = 0.044
     # [1] factor on R of the rear axle until it reaches the place where a front wheel began to slide
     rear_unlike: float = 10.0
 
-    # [s] that wheels stand before the car does
+    # --- Motion according to standing or rolling wheels (`rolling_motion.py`) ---
+    # [s] time for which the wheels must stand before the car counts as standing
     standing_time: float = 0.5
-    # [s] that four wheels agree before they tell the speed
+    # [s] time for which the wheels must agree before the speed is computed from them
     agreeing_time: float = 1.0
-    # [1] within which they agree, of the speed: radii and slip apart
+    # [1] largest difference of agreeing wheels, relative to the speed, from radii and slip
     agreeing_width: float = 0.02
-    # [1] speed that agreeing wheels tell, relative: radii and slip
+    # [1] relative error of the speed computed from agreeing wheels, from radii and slip
     agreeing_std: float = 0.01
-    # [m/s] the same at standstill: a slower car stands
+    # [m/s] smallest error of this speed; a car slower than this counts as standing at the start
     agreeing_floor: float = 0.1
-    # [1] share by which slip differs from force over load by the nominal stiffness
+    # [1] relative error of slip computed from force over load with the nominal stiffness
     agreeing_slip: float = 0.6
-    # [1] slip beyond that near the limit, times the cube of force over load
+    # [1] further slip near the limit, per cubed force over load
     agreeing_cube: float = 0.05
-    # [1] a_y over g up to which the rear axle follows: beyond, sliding may be what it seems
+    # [1] a_y over g up to which the rear axle follows without sliding. Beyond it the axle may slide
+    # unnoticed.
     following_most: float = 0.15
-    # [rad] sideslip of a following rear axle beside what the side force asks
+    # [rad] error of the sideslip of a following rear axle, besides the slip that its lateral force
+    # needs
     following_std: float = 0.004
 
-    # [1] a node's friction may lie so far below the grip in use: offset of the accelerometers,
-    # slope and smoothing
+    # --- Grip in use as a lower limit of friction (`grip_guard.py`) ---
+    # [1] a node's friction may lie this far below the grip in use without penalty: accelerometer
+    # offset, slope, smoothing
     guard_margin: float = 0.06
-    # [1] one standard deviation of that
+    # [1] standard deviation of this margin
     guard_std: float = 0.03
 
-    # [1] degrees of freedom with which a car begins as strained as the model: few rows say nothing
-    # of it yet
+    # --- Strain (`trust.py`) ---
+    # [1] degrees of freedom of the initial strain of 1. A few measurements do not determine the
+    # strain yet.
     strain_prior: float = 2.0
-    # [1] strain at which the axles are as sure as stated: level drives have .2 to .5, rough ones .5
-    # to 2
+    # [1] strain at which R of the axles has its stated value: .2 to .5 on level drives, .5 to 2 on
+    # rough ones
     strain_usual: float = 0.95
-    # [1] power of strain over the usual in R of the axles: what one error says of the next
+    # [1] exponent of strain over `strain_usual` in the factor on R of the axles: how much known
+    # errors say about unknown ones
     strain_power: float = 2.0
-    # [1] least of that factor: a level car's axles had .24 of the stated R as the best of a search
+    # [1] smallest value of this factor. A search for the best R of the axles found .24 on level
+    # drives.
     strain_least: float = 0.25
-    # [1] most of it
+    # [1] largest value of this factor
     strain_most: float = 3.0
 
-    # [nat] likelihood ratio at which contradiction is believed: errors that are three times what is
-    # stated, for 1 s
+    # --- Contradiction of the model (`trust.py`) ---
+    # [nat] log-likelihood ratio at which the model counts as contradicted. Axle errors of three
+    # times the stated size reach it in about 3 s.
     odd_least: float = 12.0
-    # [s] before the model is tried again, the first time: a bend or two of a race track would pass,
-    # a lap does not
+    # [s] time before the model is tried again after the first contradiction. A few bends of a race
+    # track would be over by then, a lap would not.
     patience: float = 120.0
-    # [1] R of the axles while distrusted, over R
+    # [1] factor on R of the axles while distrusted, minus 1
     distrust_noise: float = 1000.0
-    # [m/s/s^.5] walk of v_y while distrusted
+    # [m/s/s^.5] random walk of v_y while distrusted
     distrust_drift: float = 3.0
-    # [s] in which while distrusted what was learned of vehicle, sensors and road goes back to the
-    # prior
+    # [s] time in which vehicle, sensor and road states return to their prior while distrusted
     distrust_forget: float = 5.0
