@@ -15,10 +15,13 @@ from schemas.thresholds import NS
 from schemas.wire import Alert
 from schemas.wire.tile import decode_tile
 
-AHEAD_OF_TIME_S: Final = 60.0  # by which the service's clock may be ahead of the car's
-OLDEST_S: Final = 1e8  # three years: no cell is kept so long, and nanoseconds do not overflow
-MOST_TILE_BYTES: Final = 4 << 20  # a tile with every cell and sector of a dense city is 3 MB
-SLACK: Final = 1e-3  # single precision, and quantiles to the ends of their bins
+AHEAD_OF_TIME_S: Final = 60.0  # [s] largest accepted lead of the service's clock over the car's
+# [s] largest accepted age of a cell: three years. In nanoseconds it still fits into an int64.
+OLDEST_S: Final = 1e8
+MOST_TILE_BYTES: Final = 4 << 20  # a tile with every cell and sector of a dense city has 3 MB
+# Tolerance of range checks: values arrive in single precision, and quantiles may be rounded to the
+# edges of their bins.
+SLACK: Final = 1e-3
 _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
@@ -71,9 +74,9 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
     place = cell * grid.SECTORS + sector
     if len(np.unique(place)) < len(place):
         raise WireError("cell", "occurs twice", "send each cell and sector once")
-    heard = np.minimum(
-        last + (age * NS).astype(np.int64), now
-    )  # when the tile was made: a reader may have kept it
+    # Time at which the service made the tile. It may lie well in the past, because the answer may
+    # come from a cache.
+    heard = np.minimum(last + (age * NS).astype(np.int64), now)
     return tile, ReceivedCells(
         place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard
     )

@@ -18,20 +18,23 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.stopping import stopping_speed
 from schemas.thresholds import GRAVITY, REACTION_S
 
-MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
-# [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
+# [m] safety margin of one cell: the map gives the start of a stretch no better
+MARGIN_M: Final = 10.0
+# [m/s^2] braking that passengers do not feel as hard. Adaptive cruise control may brake with up to
+# 3.5 m/s^2 (ISO 15622).
 COMFORT: Final = 3.0
-COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
-SIGHT_M: Final = 60.0  # within which one wants to be able to stop, in a town
-UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (
-    mugrid.UPPER - mugrid.LOWER
-)  # lower end of a road that no vehicle has measured
+COMFORT_ACROSS: Final = 3.0  # [m/s^2] comfortable lateral acceleration in bends
+SIGHT_M: Final = 60.0  # [m] distance within which a car in a town must be able to stop
+# Assumed lower end of the friction of a road that no vehicle has measured: the 5 % quantile of the
+# uniform prior.
+UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (mugrid.UPPER - mugrid.LOWER)
 SHORTEST_M: Final = 150.0
 LONGEST_M: Final = 1000.0
-# Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an
-# hour without a link.
+# P(slippery) from which the car warns. The service raises an alert at 0.9; without a link, such a
+# belief fades to about 0.8 within half an hour.
 WARN_ABOVE: Final = 0.8
-LEAST_VEHICLES: Final = 2  # as for an alert: one bad sensor warns nobody
+# required vehicles, as for an alert, so that one bad sensor causes no warning
+LEAST_VEHICLES: Final = 2
 
 
 class Horizon(NamedTuple):
@@ -82,8 +85,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
     there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
-    # the first place that is measured, else the first of which anything is known; an alert goes
-    # before both
+    # For each metre take the first place with an alert, else the first measured place, else the
+    # first place of which the map knows anything.
     rank = np.where(
         there,
         np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)),

@@ -21,18 +21,24 @@ from schemas.wire import Alert
 
 UNKNOWN, BOUND, MEASURED, BORROWED = range(4)
 BASES: Final = ("unknown", "bound", "measured", "borrowed")
-# mean time between changes that leave nothing of what was known, as in the map
+# [s] mean time between changes of the road, as in the fleet's map. After a change, nothing is known
+# about the friction.
 CHANGE_S: Final = 10800.0
-# what was not heard again for so long is unknown: by then 28 % of it has changed
+# [s] time after which a cell that was not received again counts as unknown. By then, the road has
+# changed with a probability of 28 %.
 HELD_S: Final = 3600.0
-ALERT_HELD_S: Final = 600.0  # alerts that stand are put again every few seconds
-MOST_CELLS: Final = 20_000  # 6 MB: fifty kilometres of road with its side streets
+# [s] time after which an alert that was not received again counts as ended. The service repeats
+# active alerts every few seconds.
+ALERT_HELD_S: Final = 600.0
+MOST_CELLS: Final = 20_000  # 6 MB of memory: fifty kilometres of road with its side streets
 MOST_ALERTS: Final = 4096
-# bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
+# Bit of a place's key that differs between the two directions of one road: sectors 0 and 2 are
+# opposite headings, and so are 1 and 3.
 OTHER_WAY: Final = 2
+# Share of each friction bin that lies below SLIPPERY_MU.
 SLIPPERY_BINS: Final[FloatArray] = np.clip(
     (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
-)  # share of each bin that is slippery
+)
 
 
 class ReceivedCells(NamedTuple):
@@ -44,8 +50,8 @@ class ReceivedCells(NamedTuple):
     belief: FloatArray
     basis: IntArray
     vehicles: IntArray
-    last_time: IntArray  # [ns] of the last observation
-    # [ns] when the map said so: when the car heard of it, or before, where an older tile came
+    last_time: IntArray  # [ns UTC] time of the last observation
+    # [ns UTC] time at which the service made the tile, at most the time of receipt
     heard: IntArray
 
 
@@ -87,7 +93,7 @@ def belief_of(
         above = f[k, min(at, 4)]
         knots = np.insert(x[k], at, SLIPPERY_MU)
         shares = np.insert(f[k], at, min(max(slippery[k], below), above))
-        knots += np.arange(6) * 1e-9  # strictly upward
+        knots += np.arange(6) * 1e-9  # makes the knots strictly increasing, as `interp` requires
         upto = np.interp(mugrid.EDGES, knots, shares, left=0.0, right=1.0)
         upto[0], upto[-1] = 0.0, 1.0
         out[k] = np.diff(upto)
@@ -108,7 +114,7 @@ class LocalMap:
         self._most = most_cells
         self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        # of all tiles, by key; None when it must be built again
+        # cells of all tiles, sorted by key; None if it must be rebuilt
         self._all: ReceivedCells | None = NOTHING
 
     @property
@@ -196,12 +202,11 @@ class LocalMap:
             grip = (
                 basis[k] == MEASURED or mugrid.quantiles(belief[k : k + 1], 0.05)[0] >= SLIPPERY_MU
             )
-            alerted[k] = (
-                own or alert.time > last[k] or not grip
-            )  # who found grip since, on this side, knows better
-            if alerted[k] and (
-                alert.time >= last[k] or basis[k] != MEASURED
-            ):  # a bound tells no value
+            # An alert of the opposite direction does not count if a vehicle has found grip on this
+            # side afterwards.
+            alerted[k] = own or alert.time > last[k] or not grip
+            # A lower bound contains no value of the friction, so the alert's values replace it.
+            if alerted[k] and (alert.time >= last[k] or basis[k] != MEASURED):
                 shown = (
                     np.array([value])
                     for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery)

@@ -30,8 +30,8 @@ from schemas.wire.ahead import GripWarning, Outlook, Runs, encode_ahead
 
 log = logging.getLogger(__name__)
 LOOK_S: Final = 1.0
-STALE_S: Final = 3.0  # a car that has not said for so long where it is, is nowhere
-AGAIN_S: Final = 0.1  # at the soonest after a look: a burst of alerts is one look
+STALE_S: Final = 3.0  # [s] age of a car's last position from which the lookout ignores the car
+AGAIN_S: Final = 0.1  # [s] shortest time between two look-ups, so that a burst of alerts causes one
 
 Hear = Callable[[str, GripWarning], None]
 RouteOf = Callable[[int], GivenRoute | None]
@@ -45,7 +45,7 @@ class _Watcher:
     due: float = 0.0
     looked: float = -1.0
     urgent: bool = False
-    places: frozenset[int] = frozenset()  # of the ways on
+    places: frozenset[int] = frozenset()  # keys of the places on the possible paths ahead
     outlook: Outlook | None = None
 
 
@@ -58,7 +58,7 @@ class LookoutCounts:
     looks: int = 0
     warnings: int = 0
     failures: int = 0
-    busy_s: float = 0.0  # of the processor, by the thread that looks
+    busy_s: float = 0.0  # [s] processor time of the lookout's thread
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
@@ -154,9 +154,9 @@ class Lookout:
             subscriber = self._watchers[k].subscriber if k in self._watchers else None
             if subscriber is None or places[k] < 0:
                 map_beliefs[k] = None
-            elif subscriber.map_lock().acquire(
-                blocking=False
-            ):  # the loop does not wait: it asks again at the next
+            # The estimation loop must not wait. If the lock is taken, the loop tries again at its
+            # next step.
+            elif subscriber.map_lock().acquire(blocking=False):
                 try:
                     map_beliefs[k] = subscriber.local_map.belief_at(int(places[k]), time.time_ns())
                 finally:
@@ -197,7 +197,7 @@ class Lookout:
             for k in sorted(ready, key=lambda k: not self._watchers[k].urgent):
                 self._watch_vehicle(k, now)
                 if any(watcher.urgent for watcher in self._watchers.values()):
-                    break  # who heard an alert goes first
+                    break  # start again with the vehicles that received an alert
             self.counts.busy_s += time.thread_time() - began
             if not ready:
                 urgent = any(watcher.urgent for watcher in self._watchers.values())
@@ -208,7 +208,8 @@ class Lookout:
 
     def _watch_vehicle(self, k: int, now: float) -> None:
         watcher = self._watchers[k]
-        # in turns, so that a thousand cars of one process do not look in the same moment
+        # Spread the first look-ups over LOOK_S, so that a thousand cars of one process do not look
+        # at the same moment.
         first = watcher.looked < 0.0
         watcher.due = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
         watcher.looked = now
@@ -223,7 +224,7 @@ class Lookout:
             return
         try:
             self._look_ahead(k, watcher, watcher.subscriber, pose)
-        except Exception:  # whatever it is: the car drives on, and so must this thread
+        except Exception:  # the thread must survive any error, because the car drives on
             self.counts.failures += 1
             log.exception(
                 "looking ahead for %s failed; it is tried again with the next position",

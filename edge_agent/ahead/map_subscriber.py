@@ -27,9 +27,9 @@ from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING
 
 log = logging.getLogger(__name__)
-ANSWER_S: Final = 5.0  # for an answer; the next look asks again
-# After a session came back a car asks once more if nobody answered yet: the service may come back
-# later: Zenoh looks for a router every 4 s at the latest.
+ANSWER_S: Final = 5.0  # [s] timeout of a query; the next look-up repeats an unanswered query
+# [s] times after a reconnection at which the car repeats its queries while nobody answers. The
+# service may reconnect later than the car: Zenoh looks for a router at least every 4 s.
 AGAIN_S: Final = (1.0, 3.0, 9.0)
 _TOPIC: Final = keys.TOPICS["ahead"]
 
@@ -60,7 +60,7 @@ class MapSubscriber:
         self._tiles = Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
-        # [ns] when to ask once more; since the router is there
+        # [ns UTC] times at which to repeat the queries after a reconnection
         self._again = list[int]()
         self._answered = False
         self._publisher = session.declare_publisher(
@@ -119,9 +119,8 @@ class MapSubscriber:
             back = not self._answered
         if back:
             self._asked.request_again()
-        for tile in (
-            self._tiles.subscribed_tiles if back else fresh
-        ):  # after the subscription: none is missed in between
+        # Query the active alerts only after subscribing, so that no alert is missed in between.
+        for tile in self._tiles.subscribed_tiles if back else fresh:
             self._send_query(keys.alert_key(tile), self._on_standing)
         for path in paths:
             for box in self._asked.missing_boxes(path, pose, within):

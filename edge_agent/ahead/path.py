@@ -23,21 +23,28 @@ from schemas.thresholds import METRES_PER_DEGREE
 from schemas.wire.ahead import Way
 
 NONE: Final = -1
-# a lane's width and a receiver's error; no other carriageway of the same direction is as near
+# [m] lateral offset of the places that also count: a lane's width and a receiver's error. The other
+# carriageway of the same direction is further away.
 BESIDE_M: Final = 4.0
-# in which a corner of a given route is driven: 9.5 m of radius at a right angle
+# [m] length over which a corner of a given route is rounded: at a right angle this gives a radius
+# of 9.5 m.
 SMOOTH_M: Final = 15
-# from the line of a route: a receiver's error, a wide road, a coarse route
+# [m] largest distance from the line of a route: error of the receiver, width of the road and a
+# coarsely drawn route.
 OFF_ROUTE_M: Final = 20.0
-BACK_M: Final = 20.0  # a fix may jump back by so much
-ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
-# Unless the route heads like that so near, for corners are cut and turned into late; or begins so
-# near: a navigation system leaves out what has been driven, and how a route came to its beginning
-# nobody knows.
+BACK_M: Final = 20.0  # [m] distance by which a position may jump back along the route
+# [rad] a car whose heading differs by more from the route is on another road
+ASTRAY: Final = np.radians(60.0)
+# [m] The heading may differ by more than ASTRAY if the route turns into it within this distance.
+# Drivers cut corners or turn late.
+# The same holds this close to the start of the route. Navigation systems leave out the part already
+# driven, so the direction into the start is unknown.
 CORNER_M: Final = 20.0
-# a road without bends in sight; beyond, where it leads is anybody's guess
+# [m] length of a straight path if no road is known. Nobody can tell where the road leads beyond it.
 CORRIDOR_M: Final = 150.0
-CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
+# [m/m] growth of the corridor's half width. After 100 m it covers a bend with a radius of a
+# kilometre.
+CORRIDOR_WIDENS: Final = 0.05
 
 
 class Pose(NamedTuple):
@@ -188,8 +195,8 @@ class GivenRoute:
             return None
         onward = fits & (at >= self._metre - BACK_M)
         among = np.flatnonzero(onward if onward.any() else fits)
-        # the nearest of those a little further on; a loop that is driven twice is not jumped ahead
-        # in
+        # Prefer the nearest point, but penalise progress along the route. Thus the match does not
+        # jump ahead where the route passes the same street twice.
         cost = off[among] + 0.1 * np.maximum(at[among] - self._metre, 0.0)
         return float(at[among[int(cost.argmin())]])
 

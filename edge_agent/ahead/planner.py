@@ -27,17 +27,22 @@ from schemas.thresholds import NS
 
 TOPIC: Final = "planning/scenario_planning/max_velocity_candidates"
 TYPE: Final = "tier4_planning_msgs::msg::dds_::VelocityLimit_"
-ANY_HASH: Final = "TypeHashNotSupported"  # rmw_zenoh's text for a sender without a type hash
+# text that rmw_zenoh uses for a sender without a type hash
+ANY_HASH: Final = "TypeHashNotSupported"
 SENDER: Final = "gripmap"
 HOLD_S: Final = 3.0
 STEP: Final = 1.0  # [m/s] smallest rise of the limit that is sent to a planner
 FALL_STEP: Final = 0.2  # [m/s] smallest fall that is sent
-LATE_S: Final = 1.3  # a second between two looks ahead, and the way to the planner's brakes
-# One in twenty places has less grip than its lower bound; a machine's limit must hold in 99 %.
-CAUTION: Final = 0.566  # normal quantiles of .5 % over that of 5 %, less 1
+# [s] delay of the braking: one second between two look-ups, and the reaction of the planner's
+# brakes
+LATE_S: Final = 1.3
+# Factor that extends the distance from the median to the 5 % quantile to the 0.5 % quantile: ratio
+# of the normal quantiles, less 1. One place in twenty has less grip than its 5 % quantile, but a
+# planner's limit must hold in 99 % of the places.
+CAUTION: Final = 0.566
 LEAST_GRIP: Final = 0.02
-FREE: Final = 1e3  # [m/s] no limit: above any planner's own
-MIN_JERK: Final = -1.0  # [m/s^3] of the braking that a limit asks for
+FREE: Final = 1e3  # [m/s] value sent for "no limit": above any planner's own limit
+MIN_JERK: Final = -1.0  # [m/s^3] jerk limits of the braking, as the message requires
 MAX_JERK: Final = 1.0
 _GID_BYTES: Final = 16
 
@@ -59,7 +64,7 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
         return math.inf
     way = np.maximum(distance[known] - MARGIN_M, 0.0)
     safe = safe_speed[known]
-    # v^2 = safe^2 + 2 COMFORT (way - v LATE_S), solved for v
+    # Solve v^2 = safe^2 + 2 COMFORT (way - v LATE_S) for the speed v.
     late = COMFORT * LATE_S
     braked = np.sqrt(late**2 + safe**2 + 2.0 * COMFORT * way) - late
     return float(np.maximum(braked, safe).min())

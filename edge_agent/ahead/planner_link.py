@@ -17,7 +17,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 
-REPEAT_S: Final = 2.0  # for a planner that starts later
+REPEAT_S: Final = 2.0  # [s] period of repetition, for a planner that starts later
 
 log = logging.getLogger(__name__)
 

@@ -35,13 +35,17 @@ import numpy as np
 from schemas import mugrid
 from schemas.numeric import FloatArray, IntArray
 
-# of cells in which a map that says something sure is wrong: tyres, patches, fixes in the wrong cell
+# Share of cells in which a map with narrow intervals is wrong, because of other tyres, small
+# patches or positions assigned to the wrong cell.
 SHARE: Final = 0.2
 MOST: Final = 0.98
-# per cell: ten cells, a hundred metres, after which a map that was wrong may be right again
+# Share of the distrust that passes to the next cell. After ten cells (a hundred metres), a map that
+# was wrong is mostly trusted again.
 KEPT: Final = 0.9
 BLIND: Final = 0.5
-LEAST_CHANGE: Final = 0.05  # in a cell of ten metres, as the estimator's own road change of 190 m
+# Least probability that the friction changes at the border of a cell. For cells of ten metres, it
+# corresponds to the estimator's mean of 190 m between changes.
+LEAST_CHANGE: Final = 0.05
 NOWHERE: Final = -1
 
 
@@ -53,11 +57,14 @@ class MapPrior:
     def __init__(self, vehicles: int) -> None:
         self._key = np.full(vehicles, NOWHERE)
         self._map: list[FloatArray | None] = [None] * vehicles
-        self._entry = np.tile(mugrid.PRIOR, (vehicles, 1))  # q
-        self._border = np.tile(mugrid.PRIOR, (vehicles, 1))  # w at the border
-        self._own = np.tile(mugrid.PRIOR, (vehicles, 1))  # w at the last step
-        self._wrong = np.full(vehicles, SHARE)  # at the border
-        self._found = np.full(vehicles, SHARE)  # now
+        # q of the legend: belief with the map, at the border
+        self._entry = np.tile(mugrid.PRIOR, (vehicles, 1))
+        # w⁻ of the legend: the filter's own belief at the border
+        self._border = np.tile(mugrid.PRIOR, (vehicles, 1))
+        # w of the legend: the filter's own belief at the last step
+        self._own = np.tile(mugrid.PRIOR, (vehicles, 1))
+        self._wrong = np.full(vehicles, SHARE)  # β of the legend, at the border
+        self._found = np.full(vehicles, SHARE)  # β' of the legend, now
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
         """Return the indices of the vehicles that entered another place (one map cell and heading

@@ -19,18 +19,22 @@ from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS
 
-# of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
+# [m] margin of a box around the path: about one cell, so that it contains neighbouring lanes,
+# position errors and coarse routes.
 BESIDE_M: Final = 12.0
-AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 bytes
+# [m^2] largest area of a box. Every answer has 3.2 kB of schema, and a cell has 130 bytes.
+AREA_M2: Final = 7000.0
 LONGEST_M: Final = 300.0
-# than one looks is asked for at once, or each second would ask for its own ten metres
+# [m] distance beyond the horizon that is requested together with it. Without this reserve, the car
+# would request ten new metres every second.
 FURTHER_M: Final = 300.0
-# a map ahead is asked for again; what changes at once comes as an alert
+# [s] time after which the map ahead is requested again. Sudden changes arrive as alerts.
 REFRESH_S: Final = 300.0
-STEP: Final = 4  # metres between the points that are looked at
+STEP: Final = 4  # [m] distance between the checked points of a path
 MOST_BOXES: Final = 128
-MOST_TILES: Final = 6  # whose alerts are heard at a time
-# a tile that is not ahead any more is heard for so long: a car at a border goes to and fro
+MOST_TILES: Final = 6  # largest number of tiles to whose alerts a car subscribes
+# [s] time for which the subscription to a tile continues after the tile is no longer ahead. A car
+# near a border may cross it repeatedly.
 LEAVE_S: Final = 20.0
 
 
@@ -85,7 +89,7 @@ class Tiles:
     """
 
     def __init__(self) -> None:
-        self._wanted: dict[int, int] = {}  # tile -> when it was wanted last [ns]
+        self._wanted: dict[int, int] = {}  # tile -> last time at which it was ahead [ns UTC]
 
     @property
     def subscribed_tiles(self) -> list[int]:

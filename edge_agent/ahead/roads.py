@@ -19,18 +19,21 @@ from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_p
 from schemas import grid
 from schemas.numeric import IntArray
 
-# sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
+# [cell sides] largest distance between successive places of a road: the next cell, a diagonal
+# neighbour, or one cell skipped because no position fell into it.
 LINK_CELLS: Final = 2.3
-BEGIN_CELLS: Final = 1.6  # from the car to the first
-TURN: Final = math.radians(95.0)  # between two links: the right angle of a junction within a cell
-LEAN: Final = math.radians(
-    70.0
-)  # of a link from the axis of the sector that it leads to: 45 and what a cell's corner adds
-FORK: Final = math.radians(50.0)  # links that differ by more lead to different roads
+BEGIN_CELLS: Final = 1.6  # [cell sides] largest distance from the car to the first place
+# [rad] largest angle between two successive links: the right angle of a junction within one cell.
+TURN: Final = math.radians(95.0)
+# [rad] largest angle between a link and the heading sector to which it leads: half a sector (45
+# degrees), and the error from using cell centres.
+LEAN: Final = math.radians(70.0)
+# [rad] links whose directions differ by more lead to different roads
+FORK: Final = math.radians(50.0)
 MOST_WAYS: Final = 3
-LEAST_OWN: Final = 2  # places of a way that no other has
+LEAST_OWN: Final = 2  # number of places that a road must not share with the other roads
 MOST_STEPS: Final = 120
-STEP_M: Final = 10.0  # a cell
+STEP_M: Final = 10.0  # [m] about one cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
@@ -60,9 +63,9 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     done: list[list[int]] = []
     while ways and len(done) < MOST_WAYS:
         done.append(_follow_way(graph, ways.pop(0), pose, length, ways))
-    for way in (
-        done[::-1] if len(done) > 1 else []
-    ):  # one that joins another, or ends where another bends, is no way of its own
+    # Remove roads that have almost no places of their own: they join another road, or end where
+    # another road bends.
+    for way in done[::-1] if len(done) > 1 else []:
         if len(set(way).difference(*(other for other in done if other is not way))) < LEAST_OWN:
             done.remove(way)
     return [_as_path(way, places, pose, length, beyond=k == 0) for k, way in enumerate(done)]

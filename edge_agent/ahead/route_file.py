@@ -20,7 +20,7 @@ from schemas.grid import MAX_LATITUDE
 
 MOST_POINTS: Final = 100_000
 MOST_BYTES: Final = 32 << 20
-_POINTS: Final = ("trkpt", "rtept", "wpt")  # what a GPX file may hold, in this order of choice
+_POINTS: Final = ("trkpt", "rtept", "wpt")  # kinds of points in a GPX file, in order of preference
 
 
 def read_route(path: Path) -> GivenRoute:
@@ -103,7 +103,7 @@ def _parse_geojson(data: bytes) -> list[tuple[float, float]]:
         ) from error
 
 
-def _find_line(document: Any) -> list[Any]:  # noqa: ANN401 whatever JSON holds
+def _find_line(document: Any) -> list[Any]:  # noqa: ANN401 any JSON value
     """Return the coordinates of the first LineString in a GeoJSON document."""
     kind = document["type"]
     if kind == "LineString":

@@ -22,14 +22,18 @@ from schemas.numeric import BoolArray
 from schemas.thresholds import NS, REACTION_S
 from schemas.wire.ahead import GripWarning, WarningState
 
-UPDATE_S: Final = 1.0  # between two looks: a stretch may come by so much nearer before it is told
-GAIN: Final = 3.0  # [m/s] that a car may gain until the next look: 3 m/s^2 is a swift start
-LINK_M: Final = 30.0  # nearer stretches are one
-ABSENT_S: Final = 2.0  # for which a stretch is not seen before it is over: fixes jump
-NEAR_M: Final = 30.0  # who was so near to a stretch that is no longer ahead has passed it
+# [s] time between two look-ups, during which the car comes nearer without a warning
+UPDATE_S: Final = 1.0
+GAIN: Final = 3.0  # [m/s] speed that a car may gain until the next look-up, at 3 m/s^2
+LINK_M: Final = 30.0  # [m] slippery stretches with a smaller gap are joined
+# [s] time for which a stretch may be missing from the horizons before its warning ends, because
+# positions jump.
+ABSENT_S: Final = 2.0
+# [m] if a stretch disappears from the horizons when it is nearer than this, the car has passed it.
+NEAR_M: Final = 30.0
 CHANGED_MU: Final = 0.05
 CHANGED_PLACES: Final = 2
-SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
+SLOWEST: Final = 0.5  # [m/s] below this speed no time to a stretch is given
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,8 @@ class _Stretch:
     start: float
     end: float
     worst: int
-    braking_energy: float  # half the square of the speed that can be braked away before it
+    # [m^2/s^2] half the square of the speed that the car can brake away before the stretch
+    braking_energy: float
     horizon: Horizon
 
 
@@ -70,7 +75,7 @@ def update_warnings(
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
     stretches = [stretch for horizon in horizons for stretch in _slippery_stretches(horizon, speed)]
     kept: dict[str, Active] = {one.warning.id: one for one in active}
-    here: set[str] = set()  # those that lie ahead now
+    here: set[str] = set()  # names of the warnings whose stretches lie ahead now
     for places, ways in _by_place(stretches):
         nearest = min(ways, key=lambda stretch: stretch.start)
         before = next((one for one in kept.values() if one.places & places), None)
@@ -109,9 +114,8 @@ def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
     """Return the slippery stretches of a horizon (knowledge of the map about each metre ahead);
     stretches at most LINK_M apart are joined."""
     brakes = np.concatenate([[0.0], braking_from(horizon)])
-    begins = math.ceil(
-        speed * (REACTION_S + UPDATE_S) + MARGIN_M
-    )  # where the brakes bite at the latest
+    # Metre at which the car begins to brake at the latest.
+    begins = math.ceil(speed * (REACTION_S + UPDATE_S) + MARGIN_M)
     found = []
     for first, last in _find_runs(horizon.slippery):
         places = frozenset(

@@ -46,7 +46,7 @@ def _read_source(path: Path, profile: Profile | None, database: Database | None)
     suffix = path.suffix.lower()
     if not path.exists():
         raise InputError("source", f"{path} does not exist", "give the path of a recording")
-    if not path.is_file() and not path.is_dir():  # reading a pipe may never end
+    if not path.is_file() and not path.is_dir():  # a pipe, for example, may never end
         raise InputError("source", f"{path} is not a file", "write the recording to a file first")
     if rosbag.is_bag(path):
         with rosbag.open_bag(path) as reader:
@@ -148,9 +148,9 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
         whole = merged.start_ns + np.rint(merged.t * NS).astype(np.int64)
         columns["timestamp"] = pa.array(whole, pa.int64()).cast(pa.timestamp("ns", tz="UTC"))
     else:
-        columns["t"] = pa.array(
-            np.rint(merged.t * NS) / NS
-        )  # as dated ones read: one drive is one log in all formats
+        # Round to nanoseconds, as in logs with a date, so that the same drive gives the same log
+        # from every format.
+        columns["t"] = pa.array(np.rint(merged.t * NS) / NS)
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
     provenance: Mapping[str, object] = {
         "profile": json.loads(profile.to_json()),

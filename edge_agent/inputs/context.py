@@ -19,13 +19,16 @@ from edge_agent.inputs.recording import Series
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CONTEXT, FLAGS
 
-# Design parameters. A controller's flag comes at 10 to 100 Hz and lives as long as the intervention
-# does; the air and the wipers change slowly and come once or twice a second.
+# [s] age up to which a reading is valid. A controller's flag is sent at 10 to 100 Hz and lasts as
+# long as the intervention. Air temperature and wiper change slowly and are sent once or twice a
+# second.
 HELD_S: Final = {name: 1.0 if name in FLAGS else 30.0 for name in CONTEXT}
+# [degC] range of air temperatures on roads. Values outside are codes for "no value", or come from
+# broken sensors.
 AIR_C: Final = (
     -60.0,
     65.0,
-)  # beyond what was ever measured on a road: codes for "no value" and broken sensors
+)
 
 
 def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:

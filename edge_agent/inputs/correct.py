@@ -16,7 +16,7 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, WHEELS, S
 from schemas.vehicle import Calibration, Vehicle
 
-# first channel of a device, and the first behind it
+# Channels of each device: its first channel, and the first channel after it.
 INERTIAL = (S.AX, S.YAW_RATE + 1)
 STEERING = (S.DELTA, S.DELTA + 4)
 TURNING = (S.OMEGA, S.OMEGA + 4)

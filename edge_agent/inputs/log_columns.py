@@ -8,7 +8,7 @@ from typing import Final
 from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
 
-GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
+GROUND: Final = "gnss_speed"  # column in addition to the channels; only the signal doctor reads it
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]
 REAR_STEERING: Final = per_wheel("delta")[2:]

@@ -13,9 +13,10 @@ from typing import Final
 
 from schemas.errors import InputError
 
-# of the machine's, so that it stays usable
+# Half of the machine's memory, so that the machine stays usable.
 MOST_BYTES: Final = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-_PAGES: Final = Path("/proc/self/statm")  # address space of this process, in pages
+# file with the size of this process's address space [pages]
+_PAGES: Final = Path("/proc/self/statm")
 
 
 @contextmanager

@@ -29,23 +29,26 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
-GNSS: Final = {  # channels that a receiver's recording fills by itself
+# Channels that the recording of a position receiver fills without a profile.
+GNSS: Final = {
     "latitude": Channel(signal="latitude"),
     "longitude": Channel(signal="longitude"),
     "yaw": Channel(signal="course", unit="deg", course=True),
     GROUND: Channel(signal="speed"),
 }
-RECEIVED: Final = {"latitude", "longitude", "speed", "course"}  # signals of a receiver's recording
+# signals in the recording of a position receiver
+RECEIVED: Final = {"latitude", "longitude", "speed", "course"}
 SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
-COURSE_SPEED: Final = 3.0  # [m/s] below it a receiver's course is noise
+COURSE_SPEED: Final = 3.0  # [m/s] below this speed, the course of a receiver is noise
 RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
-FEWEST: Final = 20  # readings from which on a period means something
-# readings further apart than the larger of the two are not joined
-GAP_PERIODS = 3.0
+FEWEST: Final = 20  # least number of readings for the estimate of a period
+# No interpolation between readings that are further apart than the larger of the two limits.
+GAP_PERIODS = 3.0  # [periods of the signal]
 GAP_S = 0.1
 ZONE_S: Final = 900.0
-LARGEST_ZONE: Final = 56  # quarters of an hour
-SMOOTH: Final = 50  # readings to either side over which bursts of arrival are straightened
+LARGEST_ZONE: Final = 56  # largest difference of time zones [quarters of an hour]
+# Readings before and after each reading over which the times of arrival in bursts are smoothed.
+SMOOTH: Final = 50
 
 
 @dataclass
@@ -60,9 +63,8 @@ class Merged:
     columns: dict[str, FloatArray]
     start_ns: int | None
     notes: list[str] = field(default_factory=list)
-    origins: dict[str, dict[str, object]] = field(
-        default_factory=dict
-    )  # per channel: source, rate, missing, jitter
+    # Properties per channel: source, rate, missing readings, jitter.
+    origins: dict[str, dict[str, object]] = field(default_factory=dict)
 
 
 def merge_recordings(
@@ -123,7 +125,7 @@ def merge_recordings(
     merged = _build_rows(series, profile, recordings, found)
     for name, one in context.items():
         if len(one.t) == len(merged.t) and np.array_equal(one.t, merged.t):
-            merged.columns[name] = one.values  # a table's own rows stay as they are
+            merged.columns[name] = one.values  # from the same table: keep its rows unchanged
         else:
             merged.columns[name] = held_readings(
                 name, one, merged.t, lasting=profile.channels[name].lasting
@@ -209,7 +211,8 @@ def _align_clocks(
                 "probably because of another time zone"
             )
             if dated is not None and recording.start_ns == dated:
-                start_ns = base - round(meets[0] * ZONE_S * NS)  # the receiver is right
+                # The date of a position receiver is correct, so the other date is shifted.
+                start_ns = base - round(meets[0] * ZONE_S * NS)
         offsets.append(lead + shift + meets[0] * ZONE_S)
     return offsets, start_ns
 

@@ -23,9 +23,8 @@ PLACES: Final = {
     "rl": ("rl", "lr", "hl", "bl", "rear left"),
     "rr": ("rr", "hr", "br", "rear right"),
 }
-# channel -> what its name must contain (any of), and must not (any of); the first that fits is
-# taken a name fits when the first is found in it and the second is not; the first channel that fits
-# is taken
+# Pair of regular expressions for a name. The name fits a channel if the first expression matches it
+# and the second does not. The first fitting channel in RULES is used.
 Rule: TypeAlias = tuple[str, str]
 STATES: Final = "stat|diag|valid|q bit|fault|counter|check|alive|cov|std|v z|sta$"
 ROLLS: Final = (

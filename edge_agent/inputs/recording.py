@@ -61,14 +61,14 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
         raise InputError(
             "source", f"{path} does not exist", "give the path of a recording"
         ) from error
-    except Exception as error:  # a reader of others may raise anything over a hostile file
+    except Exception as error:  # a library may raise any error on a hostile file
         reason = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise InputError(
             "source", f"{path} is not a valid {kind} file ({reason})", "record or convert it again"
         ) from error
 
 
-# modules of optional libraries have no common type
+# Modules have no common type.
 def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401
     """Import an optional library and return it.
 

@@ -36,7 +36,8 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
-# 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
+# 2.4 MB of signals. This bounds the memory, and is long enough to make the cost per block
+# negligible.
 BLOCK_ROWS: Final = 16_384
 
 
@@ -49,9 +50,10 @@ class SignalLog:
     t: FloatArray
     signals: FloatArray
     start_ns: int | None
-    # speed over ground (T,) [m/s], where a receiver's was imported
+    # speed over ground (T,) [m/s], if the log contains the speed of a position receiver
     ground: FloatArray | None = None
-    context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
+    # context signals (T, len(CONTEXT)), if the log has a column of them
+    context: FloatArray | None = None
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
         """Yield the samples of the signal log in order, in blocks of at most `rows` samples.
@@ -163,7 +165,7 @@ def _read_time(table: pa.Table) -> tuple[FloatArray, int | None]:
     return t, start_ns
 
 
-# pyarrow's column types are not generic
+# Arrow columns have no generic type.
 def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401
     """Convert the column `timestamp` of a signal log. Return the seconds (n,) since the first
     sample, and the time of that sample [ns UTC], or None if it is not finite.

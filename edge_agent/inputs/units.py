@@ -10,7 +10,7 @@ from schemas.signals import CHANNELS, CONTEXT, FLAGS, per_wheel
 from schemas.thresholds import GRAVITY
 
 DEG: Final = math.pi / 180.0
-# quantity -> unit -> factor to SI; the first is SI itself
+# Factor to SI by unit, for each quantity; the first unit is SI itself.
 ACCELERATION: Final = {"m/s^2": 1.0, "g": GRAVITY}
 TURN_RATE: Final = {"rad/s": 1.0, "deg/s": DEG, "rpm": 2.0 * math.pi / 60.0}
 ANGLE: Final = {"rad": 1.0, "deg": DEG}
@@ -20,11 +20,12 @@ DEGREES: Final = {"deg": 1.0}
 FLAG: Final = {"1": 1.0}
 TEMPERATURE: Final = {"degC": 1.0, "degF": 5.0 / 9.0, "K": 1.0}
 SHARE: Final = {"1": 1.0, "%": 0.01}
+# Value of 0 degC in other units; it is subtracted before the factor is applied.
 ZEROS: Final = {
     "degF": 32.0,
     "K": 273.15,
-}  # what is taken off before the factor: 0 degC in these units
-# as written by others, in lower case without blanks -> ours
+}
+# Other spellings of units, in lower case without blanks -> the standard spelling.
 SPELLINGS: Final = {
     "m/s2": "m/s^2",
     "m/s²": "m/s^2",

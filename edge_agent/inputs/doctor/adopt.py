@@ -59,7 +59,8 @@ def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
     delays = {
         device: seconds for device, seconds in delays.items() if seconds and device in OF_DEVICE
     }
-    if any(finding.channel == "t" for finding in diagnosis.findings):  # a time in another unit
+    if any(finding.channel == "t" for finding in diagnosis.findings):
+        # The time is in another unit, so delays cannot be corrected.
         return Adopted(log, vehicle, diagnosis, [])
     notes = [
         f"note: the data of {device} are {abs(seconds):.3f} s "

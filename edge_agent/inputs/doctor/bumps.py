@@ -17,14 +17,16 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-STEP_M: Final = 0.25  # of the distance over which wheel speeds are compared
-WINDOW: Final = 4.0  # wheelbases over which the mean is taken off
+STEP_M: Final = 0.25  # [m] step of the distance at which wheel speeds are compared
+WINDOW: Final = 4.0  # [wheelbases] length of the running mean that is subtracted
 FAST_M_S: Final = 5.0
-LEAST_M: Final = 300.0  # of driving
-LEAST_LIKE: Final = 0.2  # correlation of a peak
-NEAR_M: Final = 0.5  # that a peak may be off the wheelbase
-RIVAL: Final = 0.6  # share of the peak that the other direction, and other distances, stay below
-CLIPPED: Final = 3.0  # standard deviations beyond which a reading is a pothole or an error
+LEAST_M: Final = 300.0  # [m] least driven distance at more than FAST_M_S
+LEAST_LIKE: Final = 0.2  # least correlation at a peak
+NEAR_M: Final = 0.5  # [m] largest difference between the peak's shift and the wheelbase
+# Largest correlation at the mirrored shift (rear axle first), as a share of the peak.
+RIVAL: Final = 0.6
+# Limit of the readings in standard deviations: larger ones come from potholes or errors.
+CLIPPED: Final = 3.0
 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:

@@ -13,9 +13,10 @@ from edge_agent.inputs.doctor.slip import measure_lags_twice
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
 
-# by which devices may be apart: standard deviation of the filter's own prior
+# [s] delay between devices that the filter tolerates: standard deviation of its prior
 FILTER_BEARS_S: Final = 0.025
-LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
+# [s] a larger delay is a fault; in cars without faults it is below 0.06 s
+LARGEST_LAG_S: Final = 0.085
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:

@@ -45,15 +45,12 @@ class Diagnosis:
     unknown: list[str] = field(default_factory=list)
     fits: dict[str, Fit] = field(default_factory=dict)
     drive: EvenDrive | None = None
-    lags: dict[str, float] = field(
-        default_factory=dict
-    )  # [s] behind the gyro, by quantity, where turns tell it
-    locked: list[str] = field(
-        default_factory=list
-    )  # axles whose wheels turn as one: "front", "rear"
-    doubts: set[str] = field(
-        default_factory=set
-    )  # quantities that only some parts of the drive speak against
+    # [s] delay of each device behind the gyroscope, by quantity, if turns show it
+    lags: dict[str, float] = field(default_factory=dict)
+    # axles ("front", "rear") whose two wheels always turn at the same speed
+    locked: list[str] = field(default_factory=list)
+    # quantities for which a fault appears only in some parts of the drive
+    doubts: set[str] = field(default_factory=set)
 
     @property
     def is_passed(self) -> bool:

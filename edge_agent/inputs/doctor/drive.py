@@ -24,16 +24,20 @@ from schemas.thresholds import EARTH_RADIUS_M
 from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 50.0
-SMOOTH_S: Final = 0.5  # of a running mean, taken twice: motion of cars lies below 1 Hz
-JOINED_S: Final = 1.5  # readings further apart are not joined
-FIX_S: Final = 1.0  # over which speed and course are taken from fixes
-LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
-# share by which a wheel may be off its neighbour on the same side before it is said to slip
+# [s] width of the running mean, which is applied twice: the motion of cars lies below 1 Hz
+SMOOTH_S: Final = 0.5
+JOINED_S: Final = 1.5  # [s] no interpolation between readings that are further apart
+FIX_S: Final = 1.0  # [s] interval between the two positions that give a speed and a course
+LONGEST_S: Final = 1800.0  # [s] only this first part of a drive is examined; more adds little
+# A wheel slips if it differs by more than this share from the other wheel on its side.
 UNLIKE: Final = 0.1
-# share by which the wheels' speed may leave that over ground before they are said to slip
+# All wheels slip if the ratio of their speed to the speed over ground is unusual by more than this
+# share.
 LEFT: Final = 0.2
-SLIP_S: Final = 1.0  # before and behind a moment of slip, which is left out as well
-CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever the unit
+SLIP_S: Final = 1.0  # [s] time before and after a moment of slip that is also left out
+# Share of the drive's high speed below which the car counts as standing. It does not depend on the
+# unit of the wheel speeds.
+CREEP: Final = 0.15
 
 
 @dataclass(frozen=True)
@@ -52,16 +56,17 @@ class EvenDrive:
     r_wheels: FloatArray
     v_ground: FloatArray
     course: FloatArray
-    course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
-    # 1 where the car moves and no wheel slips by what the wheels say of each other, else 0
+    course_yaw: FloatArray  # yaw angle of the log at the same times, not smoothed [rad]
+    # 1 where the car moves and no wheel slips relative to the other wheels, else 0
     moving: FloatArray
+    # 0 where all wheels spin or lock together: their speed differs from the one over ground
     grips: (
         FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
     )
-    yaw_front: FloatArray  # yaw rate by the front wheels alone [rad/s]
-    yaw_rear: FloatArray  # the same by the rear wheels
+    yaw_front: FloatArray  # yaw rate from the front wheels alone [rad/s]
+    yaw_rear: FloatArray  # yaw rate from the rear wheels alone [rad/s]
     wheelbase: float
-    torque: FloatArray  # of all wheels [N m]
+    torque: FloatArray  # sum over all wheels [N·m]
 
     @property
     def v_dot(self) -> FloatArray:

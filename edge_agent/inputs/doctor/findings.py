@@ -40,31 +40,35 @@ from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
 
-# beyond these a constant error is a fault and not the ordinary tilt or zero of a device (std met:
-# .35, .15 m/s^2, .003 rad/s, .003 to .015 rad; radii .15 to 1.6 % apart) [m/s^2]
-LARGEST_AX = 1.3
-LARGEST_AY = 0.75
+# Largest constant errors that come from the ordinary tilt or zero error of a device; larger ones
+# are faults. In usual cars the standard deviations are 0.35 m/s^2 (a_x), 0.15 m/s^2 (a_y),
+# 0.003 rad/s (yaw rate) and 0.003 to 0.015 rad (steering). Wheel radii differ by 0.15 to 1.6 %.
+LARGEST_AX = 1.3  # [m/s^2]
+LARGEST_AY = 0.75  # [m/s^2]
 LARGEST_RATE = 0.02  # [rad/s]
 LARGEST_STEER = 0.02  # [rad]
-LARGEST_RADIUS = 0.025
-JUMPS = 0.01  # share of readings that may jump off the other wheels
+LARGEST_RADIUS = 0.025  # [1] relative difference from the other wheels
+JUMPS = 0.01  # share of a wheel's readings that may differ strongly from the other wheels
 SLOWEST_HZ = 5.0
 FASTEST_HZ = 2000.0
-# [m/s^2] and the way over which slopes average to less than 8 %
-LARGEST_AX_FAR = 0.9
+# Limit of a_x for drives of at least AVERAGED_M, over which the mean slope is below 8 %.
+LARGEST_AX_FAR = 0.9  # [m/s^2]
 AVERAGED_M = 300.0
-# [m/s^2] up to which wheels hardly slip, on ice too
-CALM = 0.5
-CALM_ACROSS = 0.5
-GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
-# (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
+# Accelerations up to which wheels hardly slip, even on ice.
+CALM = 0.5  # [m/s^2] along the car
+CALM_ACROSS = 0.5  # [m/s^2] across the car
+# [m/s^2] largest lateral acceleration of turns in which the speeds of the two axles are compared
+GENTLE_ACROSS: Final = 3.5
+# (L r / v)^2 on a circle with a radius of eight wheelbases. On larger circles, slip hides the
+# difference between the axles.
 TIGHT = 0.015
 TIGHT_S = 1.5
 FEWEST_OFFSET_S: Final = 8.0
-NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
+# |ln factor| up to which slip may explain a wrong wheel speed. Slip is not larger for long.
+NEAR_ONE: Final = 0.35
 SURE: Final = 2.0
-WHOLE: Final = 0.35  # in logarithms, by which the whole drive's gain may be off that of a fault
-NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
+WHOLE: Final = 0.35  # largest difference between ln gain of the whole drive and of the fault
+NOISIEST: Final = 1.0  # largest difference of ln gain between parts that may come from noise
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
 
 
@@ -118,12 +122,12 @@ def diagnose(
     diagnosis.fits = found
     diagnosis.drive = drive
     _find_scales(verdict, found, diagnosis)
-    scaled = any(
-        fault is not None for fault in verdict.faults.values()
-    )  # offsets and radii in wrong units say nothing
+    # Offsets and radii are not evaluated for quantities in a wrong unit.
+    scaled = any(fault is not None for fault in verdict.faults.values())
     late = late_clocks(found)
     if "wheels" in late and not wheels_speak_late(found["axle"], late["wheels"][0]):
-        # in a slide wheels slow down before the car does; their yaw rate is not late then
+        # In a slide, the wheels slow down before the car does. A late speed without a late yaw rate
+        # of the wheels is therefore no fault of their clock.
         late = {}
     for device, (seconds, margin) in late.items():
         if margin < CLOCK_SETTLED:
@@ -300,7 +304,8 @@ def _holds_throughout(
             if other is not None:
                 gain *= other.factor**member.power
         off = abs(np.log(abs(gain / law.centre)))
-        noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)  # of a part's gain
+        # Noise of ln gain in one part of the drive.
+        noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)
         within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
         if name == "ground" and off > 0.0:
             within = min(STEADY, max(0.04, 0.4 * off))
@@ -360,7 +365,8 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
             [float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)]
         )
         off = float(np.median(parts))
-        rolls = drive.v_dot[good] < -0.1  # a wheel that spins does so only while it is driven
+        # A wheel can spin only while it is driven, so check its error while the car coasts.
+        rolls = drive.v_dot[good] < -0.1
         if rolls.sum() < 2 * RATE_HZ or abs(float(np.nanmedian(ratio[rolls])) - off) > 0.3 * abs(
             off
         ):
@@ -370,9 +376,9 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
         if abs(off) > LARGEST_RADIUS and np.all(np.abs(parts - off) < 0.3 * abs(off)):
             words = f"turns {off:+.1%} faster than the other wheels: another tyre, or its own scale"
             findings.append(Finding(f"omega_{wheel}", "radius", words, 1.0 / (1.0 + off)))
-    if (
-        len(findings) > 1
-    ):  # three cannot all be off the median: that is a slip they share, or an axle of other tyres
+    # Three wheels cannot all differ from the median of the others. Such a result means common slip,
+    # or an axle with other tyres.
+    if len(findings) > 1:
         findings = findings if len(findings) == 2 else []
     return findings + _compare_axles(drive)
 
@@ -417,9 +423,8 @@ def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     lateral = found["lateral"]
     axle = found["axle"]
     steering = found["steering"]
-    listed: list[
-        tuple[str, float, float, float, str]
-    ] = []  # channel, value, its error, largest, unit
+    # Items: channel, measured offset, its standard deviation, largest usual offset, unit.
+    listed: list[tuple[str, float, float, float, str]] = []
     beside = (drive.ax - drive.v_dot)[moving]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
@@ -439,9 +444,8 @@ def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
         error = float(
             np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving]))
         )
-        if (
-            np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ
-        ):  # one way round, a gain is an offset as well
+        # If the car always turns the same way, an offset cannot be separated from a gain.
+        if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:
             error = np.inf
         listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
     elif lateral.is_known and np.isfinite(drive.r).any():

@@ -24,21 +24,25 @@ from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 
 LONGEST_LAG_S: Final = 1.0
-FEWEST_S: Final = 8.0  # of excitation, below which nothing is said
-SLOW_SHARE: Final = 0.3  # of the regressor's 95 % size, from which on a moment counts as excited
-LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
-# another peak of the correlation that far off, as high as that share, leaves no lag known
+FEWEST_S: Final = 8.0  # [s] least time with excitation for any conclusion
+# Excitation is a deviation of the regressor by more than this share of its 95 % quantile.
+SLOW_SHARE: Final = 0.3
+LEAST_LIKE: Final = 0.5  # least correlation at which a lag is used
+# A lag is unknown if another peak of the correlation, further away than APART_S, is higher than the
+# share RIVAL of the main peak.
 APART_S = 0.3
 RIVAL = 0.85
-# of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
+# Number of parts of the excited time; a gain is computed for each. A fault of a sensor appears in
+# all parts, a slide only in some.
 PARTS: Final = 8
-# understeer's share of the steering at the drive's fast speed: mean and std of cars
+# Share of the steering that understeer needs at the drive's high speed: mean and standard deviation
+# over cars.
 USUAL_BEND = 0.3
 BEND_SPREAD = 0.4
-BENDS: Final = np.linspace(-0.3, 1.8, 22)  # shares that are tried
-# [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
+BENDS: Final = np.linspace(-0.3, 1.8, 22)  # candidates for this share
+# [1/m] yaw rate of the wheels per speed, from unequal radii: standard deviation over cars
 UNLIKE_RADII: Final = 0.004
-CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
+CORRELATED_S: Final = 1.0  # [s] two moments count as independent if they are this far apart
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,8 @@ class Fit:
     lag_error_s: float
     left: FloatArray
     right: FloatArray
-    beside: tuple[float, ...] = ()  # gains of what else the left holds
-    parts: tuple[float, ...] = ()  # gains of the parts of the excited time
+    beside: tuple[float, ...] = ()  # gains of the further terms of the left side
+    parts: tuple[float, ...] = ()  # gain in each part of the excited time
     offset_error: float = np.inf  # standard deviation of the offset
 
     @property
@@ -91,7 +95,7 @@ class Relation(NamedTuple):
     per: FloatArray | None = None
     bend: FloatArray | None = None
     loose: tuple[float, ...] = ()
-    length: float = 1.0  # [m] wheelbase in the right side, where there is one
+    length: float = 1.0  # [m] wheelbase, if the right side contains it
 
 
 def _lateral_relation(d: EvenDrive) -> Relation:
@@ -99,14 +103,14 @@ def _lateral_relation(d: EvenDrive) -> Relation:
 
 
 def _longitudinal_relation(d: EvenDrive) -> Relation:
-    # slope, offset and drift lie below .1 Hz; what is left of both sides is braking and
-    # accelerating
+    # Remove slope, offset and drift, which lie below 0.1 Hz. What remains on both sides is braking
+    # and accelerating.
     return Relation(d.ax - smooth_twice(d.ax, 10.0), d.v_dot - smooth_twice(d.v_dot, 10.0))
 
 
 def _steering_relation(d: EvenDrive) -> Relation:
-    # times v: turns at walking speed, where the angle is large and its map bent, would else
-    # outweigh all others
+    # Multiply the equation by v. Otherwise turns at walking speed would outweigh all others; there
+    # the angle is large and the steering linkage is not linear.
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
     v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
     return Relation(
@@ -170,7 +174,8 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     """
     left = sides.left
     right = sides.right
-    if level:  # what is large all along has no edge of its own: its change has
+    # A speed is large all the time and shows a lag only when it changes. So compare derivatives.
+    if level:
         lag, lag_error = lag_of(
             np.gradient(smooth_twice(left, 1.0)), np.gradient(smooth_twice(right, 1.0)), moving
         )
@@ -383,9 +388,8 @@ def _correlation_peak(
     far = np.abs(np.arange(len(across)) - top) > round(APART_S * RATE_HZ)
     inner = np.arange(1, len(across) - 1)
     peaks = inner[(across[1:-1] >= across[:-2]) & (across[1:-1] > across[2:])]
-    if np.any(
-        across[peaks[far[peaks]]] > RIVAL * here
-    ):  # periodic: lags by half a period fit as well
+    # In a periodic drive, lags that differ by half a period fit equally well.
+    if np.any(across[peaks[far[peaks]]] > RIVAL * here):
         return 0.0, False
     sharp = (
         across[max(top - 15, 0)] < 0.985 * here or across[min(top + 15, 2 * most)] < 0.985 * here

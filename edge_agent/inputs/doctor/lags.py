@@ -28,21 +28,24 @@ from schemas.signals import S
 from schemas.vehicle import Vehicle
 
 LONGEST_S: Final = 0.5
-LEAST_S: Final = 10.0  # of driving
-SLOW_S: Final = 5.0  # what changes more slowly is offset and bank
-LEAST_LIKE: Final = 0.9  # correlation from which on a lag is believed
-LEAST_RATE: Final = 1e-5  # [rad/s] of yaw; less is rounding
-ALIKE: Final = 0.02  # of two correlations
-SMOOTH_S: Final = 0.1  # of a running mean, taken twice
+LEAST_S: Final = 10.0  # [s] least time of driving
+# [s] slower changes are removed, because they come from offset and road bank
+SLOW_S: Final = 5.0
+LEAST_LIKE: Final = 0.9  # least correlation at which a lag is used
+LEAST_RATE: Final = 1e-5  # [rad/s] a smaller standard deviation of the yaw rate is rounding
+ALIKE: Final = 0.02  # correlations that differ by less than this count as equal
+SMOOTH_S: Final = 0.1  # [s] width of the running mean, which is applied twice
 LONGEST_DRIVE_S: Final = 1800.0
-DRIVEN: Final = 4.0  # [m/s]
-SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
-NEGLIGIBLE: Final = 1e-18  # share of a past motion that a float64 no longer shows
-NEAR_PEAK: Final = 1e-6  # of a correlation: more than the error of its computation by spectra
-# How fast a body answers to its wheels goes with the file's stiffness: .01 s at 10 % (BIAS of
-# steer_lag in learn.py). [s] that wheels and steering are ahead of the gyro where no device is
-# late: force behind slip. Both are what twenty simulated rough cars showed, with other seeds than
-# those of the figures
+DRIVEN: Final = 4.0  # [m/s] lags are measured above this speed
+SLOWEST: Final = 3.0  # [m/s] below this speed the model's slip angle has no meaning
+NEGLIGIBLE: Final = 1e-18  # share of an earlier motion that disappears in a float64
+# Difference of correlations that exceeds the error of their computation by Fourier transforms.
+NEAR_PEAK: Final = 1e-6
+# [s] lead of wheels and steering over the gyroscope in a car without delays, because a tyre's force
+# builds up after its slip. The values were measured on twenty simulated rough cars, with other
+# seeds than those of the figures.
+# The reaction of the body depends on the cornering stiffness in the vehicle file: an error of 10 %
+# shifts it by 0.01 s (BIAS of steer_lag in learn.py).
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 
@@ -86,9 +89,9 @@ def find_lags(
         )
         peaks = [_find_delay(side, turning, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
-        if (
-            told
-        ):  # the mean of the axles comes first: a locked axle says nothing, and spoils the mean
+        # Prefer the mean of both axles. If an axle is locked, its own yaw rate shows nothing and
+        # falsifies the mean, so that the other axle agrees best with the gyroscope.
+        if told:
             likest = max(peak.likeness for peak in told)
             found[name] = (
                 next(peak for peak in told if peak.likeness > likest - ALIKE).seconds + LEAD[name]
@@ -120,7 +123,7 @@ def _find_delay(
         return None
     left = side - smooth_twice(side, SLOW_S)
     spread = np.nanstd(left[among]), np.nanstd(turning[among])
-    if any(size < LEAST_RATE for size in spread):  # a locked axle, or straight on
+    if any(size < LEAST_RATE for size in spread):  # a locked axle, or a straight drive
         return None
 
     def correlate_at(k: int) -> float:
@@ -179,13 +182,12 @@ def _bicycle_yaw_rate(speed: FloatArray, steering: FloatArray, vehicle: Vehicle)
     inertia = vehicle.yaw_inertia
     a = vehicle.cg_to_front_axle
     b = vehicle.cg_to_rear_axle
-    per_share = (
-        4.0 * vehicle.cornering_stiffness / (a + b)
-    )  # of all wheels, shared out by their static load
+    # Stiffness of all four wheels, divided between the axles by their static load.
+    per_share = 4.0 * vehicle.cornering_stiffness / (a + b)
     c_f = b * per_share
     c_r = a * per_share
     half = 0.5 / RATE_HZ
-    drives = (speed > SLOWEST) & (np.abs(steering) < 1.0)  # not standing, and not NaN
+    drives = (speed > SLOWEST) & (np.abs(steering) < 1.0)  # also False where a value is NaN
     v = np.where(drives, speed, 1.0)
     delta = np.where(drives, steering, 0.0)
     coupling = b * c_r - a * c_f

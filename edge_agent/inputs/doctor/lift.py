@@ -18,14 +18,15 @@ from schemas.numeric import FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-TURNS_M_S: Final = 5.0  # at the rim
+TURNS_M_S: Final = 5.0  # [m/s] rim speed from which an axle turns
 STANDS_M_S: Final = 0.3
-LEAST_S: Final = 5.0  # of such turning
-# of the time in which a wheel turns: wheels that spin on ice do so for moments
+LEAST_S: Final = 5.0  # [s] least time in which an axle turns
+# Least share of this time in which the other axle stands. Wheels that spin on ice do so only for
+# moments.
 LEAST_SHARE: Final = 0.8
-RESTS_M_S2: Final = 0.3  # deviation of the accelerometers from their median
+RESTS_M_S2: Final = 0.3  # [m/s^2] deviation of the accelerometers from their median at rest
 RESTS_RAD_S: Final = 0.01
-GAINS_M_S2: Final = 0.4  # root mean square of the wheels' acceleration
+GAINS_M_S2: Final = 0.4  # [m/s^2] root mean square of the wheels' acceleration
 
 
 def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:

@@ -14,14 +14,17 @@ from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, over_ground
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
-FEWEST: Final = 200  # moments, four seconds
-# by which another reading of yaw must fit the course better (mean resultant length)
+FEWEST: Final = 200  # least number of samples, four seconds
+# Required gain in agreement with the course (mean cosine) by another interpretation of the yaw.
 BETTER: Final = 0.25
-SOUND: Final = 0.9  # agreement from which on another reading of yaw is the true one
-# [rad] of yaw and of the course; a car that slides turns and its course does not
+SOUND: Final = 0.9  # least agreement with the course at which another interpretation is reported
+# [rad] least change of both yaw and course. In a slide, the yaw changes but the course does not.
 LEAST_TURN: Final = 0.5
-STEADIER: Final = 0.5  # of the spread of ground speed over wheel speed, that exchanging must leave
-# what the log's yaw may be instead: how to make ours of it
+# Exchanging latitude and longitude must reduce the spread of ground speed over wheel speed to this
+# share.
+STEADIER: Final = 0.5
+# Angles that a log may contain in place of yaw [rad, counter-clockwise from east], each with its
+# conversion to yaw.
 COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
     "compass": lambda yaw: np.pi / 2.0 - yaw,
     "deg": np.radians,

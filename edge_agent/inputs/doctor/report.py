@@ -22,15 +22,16 @@ AXES: Final = {
     "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
     "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
 }
+# Properties of a fitted identity in the machine-readable report.
 SHOWN: Final = (
     "gain",
     "offset",
     "correlation",
     "lag_s",
     "excited_s",
-)  # of an identity, to a program
+)
 POINTS: Final = 600
-SIDE: Final = 260  # of a plot [pixel]
+SIDE: Final = 260  # width and height of a plot [pixel]
 EDGE: Final = 36
 STYLE: Final = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 "

@@ -35,11 +35,14 @@ from edge_agent.inputs.units import ANGLE, DEG, SPEED
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-FAULT_COST: Final = 12.0  # a fault must explain three and a half standard deviations
-CLOCK_SETTLED: Final = 3.0  # beside LATE_S, which no sound clock reaches
-SETTLED: Final = 9.0  # odds of 90 to 1
-ALIKE: Final = 0.08  # of factors in logarithms
-WRONG_SIGN: Final = 60.0  # cost of a sign that nothing explains, at full correlation
+FAULT_COST: Final = 12.0  # cost of a fault: it must explain a deviation of 3.5 standard deviations
+# Margin from which a late clock is certain. It is small, because a late clock must also exceed
+# LATE_S, which no sound clock reaches.
+CLOCK_SETTLED: Final = 3.0
+SETTLED: Final = 9.0  # margin from which a fault is certain: odds of 90 to 1
+ALIKE: Final = 0.08  # faults with a smaller difference of ln factor have the same effect
+# cost of a wrong sign that no fault explains, times the squared correlation
+WRONG_SIGN: Final = 60.0
 
 
 class Mistake(NamedTuple):
@@ -72,8 +75,9 @@ class Law(NamedTuple):
     members: tuple[Member, ...]
 
 
-# centres and spreads: bodies that roll make a_y larger (4 to 7 degrees a g), pitch a_x; steering
-# bends by understeer
+# Expected gain of each identity, and the spread of ln gain over cars. Roll of the body makes a_y
+# larger (4 to 7 degrees per g), and pitch makes a_x larger. Understeer widens the spread of the
+# steering.
 LAWS: Final = {
     "lateral": Law(1.03, 0.06, (Member("ay", 1), Member("v", -1), Member("r", -1))),
     "longitudinal": Law(1.02, 0.10, (Member("ax", 1), Member("v", -1))),
@@ -84,7 +88,7 @@ LAWS: Final = {
 }
 FLIPPED: Final = Mistake("sign", -1.0)
 QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
-# the clocks of the devices: identity -> (device on the left, device on the right)
+# Clocks that an identity compares: identity -> (device on the left, device on the right).
 CLOCKS: Final = {
     "longitudinal": ("imu", "wheels"),
     "axle": ("wheels", "imu"),
@@ -106,10 +110,13 @@ CLOCK_CENTRE_S: Final = {
     "ground": 0.0,
     "turning": -0.06,
 }
-LATE_S: Final = 0.15  # a clock this far off is a fault; sound logs lie within .1
-# correlation from which on an identity's lag counts: slides move both sides apart
+LATE_S: Final = 0.15  # [s] a larger delay is a fault; in sound logs it is below 0.1 s
+# Least correlation at which the lag of an identity is used. Slides shift the two sides relative to
+# each other.
 CLOCK_LIKE: Final = 0.8
-CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by chance
+# Cost of a late clock. It is below FAULT_COST, because delays have no table of faults from which
+# one could fit by chance.
+CLOCK_COST: Final = 4.0
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
@@ -143,7 +150,7 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     }
 
 
-# several quantities that go wrong for one reason count as one fault
+# Faults of several quantities with one common cause; such a group costs about as much as one fault.
 JOINT: Final = (
     (("ay", "sign"), ("r", "sign")),
     (("ax", "g"), ("ay", "g")),
@@ -214,9 +221,8 @@ def _enumerate_guesses(
     for count in (1, 2):
         for quantities in combinations(QUANTITIES, count):
             for faults in product(*(choices[quantity] for quantity in quantities)):
-                odd = sum(
-                    fault.name == "radius" for fault in faults
-                )  # a known unit is the likelier of two alike
+                # If a unit and a wheel radius explain the drive equally well, prefer the unit.
+                odd = sum(fault.name == "radius" for fault in faults)
                 yield dict(zip(quantities, faults, strict=True)), FAULT_COST * count + odd
     for joint in JOINT:
         chosen = {q: next(f for f in choices[q] if f.name == name) for q, name in joint}

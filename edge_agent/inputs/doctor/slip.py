@@ -14,24 +14,25 @@ from edge_agent.inputs.doctor.lags import find_lags
 from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
-FEWEST_STEPS: Final = 5  # with fewer steps of a wheel speed, `has_equal_steps` is False
-# of a moving car in which a wheel must have nothing to do with the others
+FEWEST_STEPS: Final = 5  # least number of steps in a wheel speed that count as equal steps
+# Least number of samples in motion before a wheel that disagrees with the others counts as foreign.
 FOREIGN_ROWS: Final = 3000
-FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
+FOLLOWED: Final = 0.25  # relative difference allowed between the driven and the steered curvature
 RADIUS_PARTS: Final = 4
 STEADY: Final = 0.4
 STEADY_SHARE: Final = 0.75
 
-# correlation of each axle with the yaw rate, from which on their signs count
+# Least correlation of each axle's yaw rate with the gyroscope at which the signs are compared.
 AXLES_LIKE: Final = 0.7
-LAGS_APART_S: Final = 0.05  # [s] by which the lags of the two halves of a drive may differ
+LAGS_APART_S: Final = 0.05  # [s] largest difference between the lags of the two halves of a drive
 HALF_LIKE: Final = 0.7  # least correlation at which the lag of a half counts
-LAGS_APART: Final = 0.25  # likewise, as a share of the lag: bends and straights do not weigh alike
-# [1/m] least root-mean-square curvature at which a locked axle can be recognised
+# The same difference as a share of the lag. The halves may contain different numbers of bends.
+LAGS_APART: Final = 0.25
+# [1/m] least root mean square of the curvature at which a locked axle can be recognised
 LEAST_CURVATURE: Final = 0.004
-LOCKED_LIKE: Final = 0.75  # correlation of the other axle with the yaw rate
-LOCKED_GAIN: Final = 0.2  # of the locked axle's own yaw rate over the gyro's
-# correlation of the yaw rate with steering or course, below which the car may spin
+LOCKED_LIKE: Final = 0.75  # least correlation of the other axle's yaw rate with the gyroscope
+LOCKED_GAIN: Final = 0.2  # largest ratio of the locked axle's yaw rate to the gyroscope's
+# Least correlation of the yaw rate with steering or course; below it the car may spin.
 TURNS_LIKE: Final = 0.8
 
 
@@ -99,7 +100,8 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
                 * np.sum(drive.delta[steered] * drive.r[steered])
             )
         )
-    if sign < 0.0:  # one of a_y, yaw rate and steering is flipped: nobody knows which axle is right
+    if sign < 0.0:
+        # The sign of a_y, yaw rate or steering is wrong, so the correct axle is unknown.
         return []
     return [("front", (0, 1))] if front < 0.0 else [("rear", (2, 3))]
 

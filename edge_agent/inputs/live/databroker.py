@@ -14,7 +14,8 @@ from edge_agent.inputs.live.kuksa.connection import BrokerConnection
 from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
 
-BUFFER: Final = 1000  # updates that the broker keeps for a slow subscriber, the most it allows
+# Updates that the broker buffers for a slow subscriber: the largest number that it accepts.
+BUFFER: Final = 1000
 ASK_S: Final = 5.0
 NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double")
 

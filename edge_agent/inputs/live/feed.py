@@ -22,12 +22,12 @@ from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
 
 BELIEVED_S: Final = 1.0
-EARLY_S: Final = 0.01  # that a stamp of the host's own clock may lie ahead
+EARLY_S: Final = 0.01  # [s] largest lead of a stamp by the host's own clock over its arrival
 WHILE_S: Final = 10.0
 RETRY_S: Final = 0.5
-TICK_S: Final = 0.1  # within which a thread sees that it is to stop
-SILENT_S: Final = 2.0  # after which a source counts as lost
-MOST_WAITING: Final = 200_000  # messages that wait for the loop, minutes of a bus
+TICK_S: Final = 0.1  # [s] longest time until a thread notices that it must stop
+SILENT_S: Final = 2.0  # [s] silence after which a source counts as lost
+MOST_WAITING: Final = 200_000  # messages that may wait for the estimation loop: minutes of a bus
 LEAVE_S: Final = 2.0
 
 Heard: TypeAlias = tuple[float, Any]
@@ -99,8 +99,8 @@ class Feed(ABC):
         self.heard = self.lost = self.broken = self.openings = self.losses = 0
         self.stopping = threading.Event()
         self.stamps = Stamps()
-        self.last = 0.0  # host's time of the last message
-        self.newest = 0.0  # the latest stamp, on the host's clock
+        self.last = 0.0  # time of the last message [s of the host's clock]
+        self.newest = 0.0  # latest time stamp [s of the host's clock]
         self._reasons: set[str] = set()
         self._waiting: deque[Heard] = deque()
         self._thread = threading.Thread(target=self._listen_loop, name=name, daemon=True)
@@ -174,7 +174,8 @@ class Feed(ABC):
             reason = "the source ended"
             try:
                 self.listen()
-            # a driver or a peer may raise anything; a lost source is no crash
+            # A driver or a remote service may raise any error, and a lost source must not stop the
+            # agent.
             except Exception as error:  # noqa: BLE001
                 reason = (str(error) or type(error).__name__).splitlines()[0][:200]
             if not self.stopping.is_set():

@@ -28,10 +28,10 @@ from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 
 DDS: Final = "::dds_::"
-ATTACHMENT: Final = struct.Struct("<qq")  # sequence number, ns; the publisher's identity follows
-OLDEST_NS: Final = (
-    946_684_800 * NS
-)  # the year 2000: an earlier stamp counts from the start of a simulation
+# Sequence number and time [ns]; the publisher's identity follows.
+ATTACHMENT: Final = struct.Struct("<qq")
+# The year 2000 [ns UTC]. An earlier stamp counts from the start of a simulation.
+OLDEST_NS: Final = 946_684_800 * NS
 CAN_FRAME: Final = "\n".join(
     (
         "std_msgs/Header header",
@@ -46,9 +46,10 @@ CAN_FRAME: Final = "\n".join(
 )
 
 
-MOST_MESSAGE: Final = 1 << 20  # bytes; motion and bus messages have some hundred
-MOST_IDENTITY: Final = 64  # bytes of a publisher's identity that matter
-MOST_PUBLISHERS: Final = 1000  # whose sequence numbers are followed
+# [byte] largest accepted message; motion and bus messages have some hundred
+MOST_MESSAGE: Final = 1 << 20
+MOST_IDENTITY: Final = 64  # [byte] part of a publisher's identity that is used
+MOST_PUBLISHERS: Final = 1000  # publishers whose sequence numbers are followed
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Ros2Feed(Feed):
             )
         self._store = _load_typestore(topics.types)
         self._leaves: dict[str, list[Leaf]] = {}
-        self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
+        self._after: dict[bytes, int] = {}  # publisher -> next expected sequence number
 
     def listen(self) -> None:
         """Receive messages until the source is stopped. The method does not handle a lost router,
@@ -143,11 +144,10 @@ class Ros2Feed(Feed):
         }
 
     def _make_listener(self, topic: str) -> Any:  # noqa: ANN401
-        # Zenoh's sample type is not exported
-        def receive_sample(sample: Any) -> None:  # noqa: ANN401
+        def receive_sample(sample: Any) -> None:  # noqa: ANN401 Zenoh exports no type for it
             try:
                 self._take_sample(topic, sample)
-            # hostile bytes may raise anything, and Zenoh would swallow it
+            # Hostile bytes may raise any error, which Zenoh would discard silently.
             except Exception as error:  # noqa: BLE001
                 self.unreadable(f"{topic}: a message that cannot be read ({type(error).__name__})")
 
@@ -217,7 +217,7 @@ def _load_typestore(folder: Path | None) -> Any:  # noqa: ANN401
     try:
         for kind, text in texts.items():
             store.register(typesys.get_types_from_msg(text, kind))
-    except Exception as error:  # what a parser of others raises
+    except Exception as error:  # the library's parser may raise any error
         raise InputError(
             "source", f"a message definition is invalid ({error})", "correct it"
         ) from error

@@ -35,10 +35,14 @@ from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
 BLOCK_S: Final = 0.1
-DELAY_S: Final = 0.3  # a channel of 10 Hz has its next reading by then
+DELAY_S: Final = 0.3  # [s] a channel of 10 Hz has delivered its next reading by then
 PATIENCE_S: Final = 1.0
-KEPT_S: Final = 3.0  # of readings before a row: bursts are straightened over a second
-MOST_BEHIND_S: Final = 5.0  # rows of a host that slept are left out: the estimator is told of a gap
+# [s] time for which readings before a row are kept; time stamps that arrive in bursts are smoothed
+# over a second.
+KEPT_S: Final = 3.0
+# [s] If the host slept longer, the rows of this time are left out, and the estimator receives a
+# gap.
+MOST_BEHIND_S: Final = 5.0
 OLDEST_FIX_S: Final = 2.0
 STEERING: Final = per_wheel("delta")
 UNSTEERED: Final = STEERING[2:]
@@ -80,14 +84,16 @@ class LiveRows:
             )
         self.rate_hz = profile.rate_hz or RATE_HZ
         self._readings: list[dict[str, Series]] = [{} for _ in feeds]
-        self._context = context_signals(profile)  # their last readings hold, and are kept
-        self._used = dict.fromkeys(SPARSE, -math.inf)  # time of the last fix that has its row
-        self._next = 0  # row
+        # context signals; their last readings stay valid and are kept
+        self._context = context_signals(profile)
+        # time of the last fix that was written into a row
+        self._used = dict.fromkeys(SPARSE, -math.inf)
+        self._next = 0  # number of the next row
         self._date_ns: int | None = None
-        self.skipped = self.late = 0  # rows left out; readings that came after their row
-        self.ground: FloatArray = np.zeros(
-            0
-        )  # speed over ground of the last block's rows (T,) [m/s]
+        # Number of rows left out, and of readings that arrived after their row was sent.
+        self.skipped = self.late = 0
+        # Speed over ground of the rows of the last block (T,) [m/s].
+        self.ground: FloatArray = np.zeros(0)
 
     def blocks(self) -> Generator[Block]:
         """Yield blocks of samples in real time until the caller stops, then close the sources."""
@@ -139,7 +145,8 @@ class LiveRows:
         self.ground = np.full(size, np.nan)
         fixes: dict[str, Series] = {}
         for name, (place, channel) in found_in(recordings, self._profile).items():
-            sparse = name in SPARSE  # a fix has its own date, all else the time at which it came
+            # Position fixes have their own times; other readings have the time of their arrival.
+            sparse = name in SPARSE
             try:
                 series, _ = make_channel(
                     name,
@@ -148,7 +155,7 @@ class LiveRows:
                     self._radius,
                     self._ratio,
                 )
-            except InputError:  # what says its sign has not come yet
+            except InputError:  # the signal with the sign of this channel has not arrived yet
                 continue
             series = Series(series.t - channel.delay_s, series.values)
             if name in CONTEXT:

@@ -128,9 +128,8 @@ def _open_can(
     interface, slash, channel = address.partition("/")
     if not slash or not channel:
         raise InputError("source", f"{source!r} has no channel", "write it like can:socketcan/can0")
-    number = re.fullmatch(
-        r"[a-zA-Z]+(\d{1,3})", channel
-    )  # can1 tells its number, an address does not
+    # A name such as can1 contains the number of the bus, an address does not.
+    number = re.fullmatch(r"[a-zA-Z]+(\d{1,3})", channel)
     given_bus = options.pop("bus", number[1] if number else "")
     bus = int(given_bus) if given_bus.isdigit() else None
     given = {name: _parse_option(value) for name, value in options.items()}

@@ -26,7 +26,8 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".blf", ".asc", ".log", ".trc")
 MICRO: Final = 1_000_000
-DATED_S: Final = 946_684_800.0  # the year 2000; a smaller time is counted from the start of the log
+# The year 2000 [s UTC]. A smaller time counts from the start of the log.
+DATED_S: Final = 946_684_800.0
 Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 
 
@@ -114,9 +115,8 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
     """
     log: Log = defaultdict(Frames)
     first = np.inf
-    logging.getLogger("can").setLevel(
-        logging.ERROR
-    )  # it reports versions of traces at INFO and WARNING
+    # The library reports versions of traces at the levels INFO and WARNING.
+    logging.getLogger("can").setLevel(logging.ERROR)
     with import_optional("can").LogReader(path) as reader:
         for message in reader:
             time = message.timestamp
@@ -132,7 +132,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
     return log, float(first) if np.isfinite(first) else 0.0
 
 
-def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a name or None
+def bus_of(channel: Any) -> int:  # noqa: ANN401 a number, a name or None
     """Return the number of a CAN bus from its channel in a log: 1 for "can1" and for 1, 0 for a
     name without a number.
     """

@@ -22,19 +22,20 @@ from edge_agent.inputs.profile import FOLDER, Profile
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-EXTENDED: Final = 1 << 31  # flag of a 29-bit identifier in a DBC
-LONGEST: Final = 64  # bytes of a CAN FD frame
-MOST_BYTES: Final = 16_000_000  # of a database; the largest public one has 2 MB
+EXTENDED: Final = 1 << 31  # flag in a DBC file of an identifier with 29 bits
+LONGEST: Final = 64  # [byte] size of a CAN FD frame
+MOST_BYTES: Final = 16_000_000  # size of a database; the largest public one has 2 MB
 
 _MESSAGE: Final = re.compile(r"^\s*BO_\s+(\d+)\s+([^:\s]+)\s*:\s*(\d+)")
-# No two neighbouring parts match the same characters, so that the time is linear in the length of a
-# line.
+# No two neighbouring parts match the same characters. Therefore the time of a match is linear in
+# the length of a line.
 _SIGNAL: Final = re.compile(
     r"^\s*SG_\s(?P<label>[^:]+):\s*(?P<start>\d+)\|(?P<size>\d+)@(?P<order>[01])(?P<sign>[+-])"
     r"\s*\(\s*(?P<factor>[^,\s][^,]*),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?"
     r"\s*(?:\"(?P<unit>[^\"]*)\")?"
 )
-_MULTIPLEXED: Final = re.compile(r"M|m\d+M?")  # the last word before the colon, after the name
+# Multiplexing mark of a signal: the last word after its name and before the colon.
+_MULTIPLEXED: Final = re.compile(r"M|m\d+M?")
 Bytes: TypeAlias = NDArray[np.uint8]
 
 
@@ -52,7 +53,7 @@ class Signal:
     factor: float
     offset: float
     unit: str
-    switch: int | None = None  # value of the multiplexer at which it is present
+    switch: int | None = None  # value of the multiplexer at which the signal is present
 
     def decode(self, data: Bytes) -> FloatArray:
         """Return the physical values (n,) of the signal in n CAN frames, data bytes (n,

@@ -24,9 +24,10 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mf4", ".mdf")
 MOST_BLOCKS: Final = 1_000_000
-MOST_CPU_S: Final = 600  # a file of 10 GB takes less
-HEADER: Final = 64  # bytes of the identification block
-# block -> places of its links that lead on (next first, then what hangs on it)
+MOST_CPU_S: Final = 600  # [s] processor time; a file of 10 GB takes less
+HEADER: Final = 64  # [byte] size of the identification block
+# Numbers of the followed links in each kind of block: first the next block, then its subordinate
+# blocks.
 LINKS: Final = {
     b"##HD": (0,),
     b"##DG": (0, 1, 2),
@@ -47,10 +48,8 @@ def check_blocks(path: Path) -> None:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        if file.read(3) not in (
-            b"MDF",
-            b"UnF",
-        ):  # a logger that lost its power left "UnFinMF"; asammdf reads that
+        # A file of a logger that lost its power begins with "UnFinMF"; asammdf can read it.
+        if file.read(3) not in (b"MDF", b"UnF"):
             raise InputError(
                 "source", f"{path} is not an MDF file", "give a measurement of version 4"
             )
@@ -88,7 +87,7 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
     links = struct.unpack(f"<{count}Q", file.read(8 * count).ljust(8 * count, b"\0"))
     if kind == b"##CG":
         _, cycles = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
-        if cycles > 1000 * size:  # deflate makes at most a thousand bytes of one
+        if cycles > 1000 * size:  # deflate expands a byte to about a thousand at most
             raise InputError(
                 "source", f"{path} declares {cycles} records in {size} bytes", "record it again"
             )

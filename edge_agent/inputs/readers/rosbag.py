@@ -22,7 +22,7 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 FRAME: Final = "can_msgs/msg/Frame"
-LONGEST_ARRAY: Final = 36  # elements that are taken apart; longer ones are images and scans
+LONGEST_ARRAY: Final = 36  # longer arrays are images and scans, and their elements are not read
 DEEPEST: Final = 5
 SKIPPED: Final = ("header", "covariance")
 Leaf = tuple[str, Callable[[Any], Any]]

@@ -37,9 +37,9 @@ TIMES: Final = (
     "seconds",
 )
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-MOST_NAMES: Final = 20  # in an error
+MOST_NAMES: Final = 20  # names of columns listed in an error
 RACECHRONO: Final = "racechrono"
-LONGEST_PREAMBLE: Final = 50  # lines
+LONGEST_PREAMBLE: Final = 50  # [lines]
 _WORD: Final = re.compile(r"[a-z]+")
 _UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 
@@ -101,7 +101,7 @@ def _read_csv(path: Path) -> pa.Table:
         return _read_racechrono(path, lines)
     mark = max(",;\t", key=lines[0].count)
     table = pc_csv.read_csv(path, parse_options=pc_csv.ParseOptions(delimiter=mark))
-    if mark == ";":  # decimal commas go with semicolons
+    if mark == ";":  # files separated by semicolons may use decimal commas
         for index, name in enumerate(table.column_names):
             if pa.types.is_string(table[name].type):
                 text = pc.replace_substring(table[name], ",", ".")
@@ -175,7 +175,7 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     for name in TIMES:
         if name in lower:
             return lower[name]
-    for name in named:  # "# time", "INS_time_sec": the first that has the word in it
+    for name in named:  # the first name with the word "time", such as "INS_time_sec"
         if "time" in _WORD.findall(name.lower()):
             return name
     seen = ", ".join(list(named)[:MOST_NAMES])
@@ -210,7 +210,7 @@ def _parse_seconds(
     factor = TIME_UNITS[unit or "s"]
     first = float(raw[0]) * factor
     exact = (raw - raw[0]) * factor if factor != 1.0 or abs(first) > NS / 10 else raw * 1.0
-    dated = 946_684_800.0 < first < 4_102_444_800.0  # between 2000 and 2100, counted from 1970
+    dated = 946_684_800.0 < first < 4_102_444_800.0  # between the years 2000 and 2100, Unix time
     start = (
         int(raw[0])
         if dated and unit == "ns" and pa.types.is_integer(column.type)

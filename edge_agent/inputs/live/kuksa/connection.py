@@ -38,7 +38,7 @@ class BrokerConnection:
 
     def __init__(self, option: str, address: str, files: Mapping[str, str]) -> None:
         self.grpc = import_optional("grpc")
-        # protobuf's runtime is there with the core; the messages are made only for a broker
+        # The core installs protobuf itself, but only a connection to a broker needs these messages.
         self.messages = import_optional("edge_agent.inputs.live.kuksa.broker_pb2")
         self._address = address
         try:
