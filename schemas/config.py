@@ -25,7 +25,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, serialize_by_alias=True
-    )  # what is written can be read
+    )  # `serialize_by_alias` writes settings with the names that the reader expects
 
 
 class ZenohSettings(Settings):
@@ -189,11 +189,13 @@ class ServiceConfig(MonitoringSettings):
     clock_ahead_s: Positive = Field(
         default=30.0, description="records further in the future are refused"
     )
+    # At its start the service reads the identities of the batches of the last 31 days. It would
+    # accept an older batch a second time.
     oldest_s: Positive = Field(
         default=30 * 86400.0,
         le=30 * 86400.0,
         description="records older than this are refused; at most 30 days",
-    )  # a start reads 31 days back for what it holds: an older batch would be taken twice
+    )
     compact_s: float = Field(
         default=3600.0,
         ge=0.0,

@@ -32,12 +32,11 @@ REGION_ZOOM: Final = 10
 ZONE_ZOOM: Final = 7
 MAX_LATITUDE: Final = 85.05112877980659
 SECTORS: Final = 4
-HEADINGS: Final = ("east", "north", "west", "south")  # of the sectors
-SECTOR_MARGIN: Final = np.radians(
-    15.0
-)  # a heading this near to a sector's edge belongs to both sectors
+HEADINGS: Final = ("east", "north", "west", "south")  # name of each heading sector, by its number
+# [rad] A heading within this angle of a sector's edge belongs to both sectors.
+SECTOR_MARGIN: Final = np.radians(15.0)
 
-# spreading the bits of a 32-bit number to the even places of a 64-bit one: shift, then keep
+# Shifts and masks that move the bits of a 32-bit number to the even positions of a 64-bit number.
 _SPREAD: Final = (
     (16, 0x0000FFFF0000FFFF),
     (8, 0x00FF00FF00FF00FF),
@@ -46,7 +45,7 @@ _SPREAD: Final = (
     (1, 0x5555555555555555),
 )
 
-# the two base-4 digits of each hexadecimal one
+# The two base-4 digits of each hexadecimal digit.
 _BASE_4: Final = {ord(f"{digit:x}"): f"{digit >> 2}{digit & 3}" for digit in range(16)}
 
 
@@ -158,9 +157,9 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
     if sector is None:
         return x, y
     latitude, longitude = centre(cell)
-    first = np.mod(
-        np.asarray(sector, dtype=np.int64) + 1, SECTORS
-    )  # east: from the south-east to the north-east
+    # First corner of each sector. East, for example, reaches from the south-east to the north-east
+    # corner.
+    first = np.mod(np.asarray(sector, dtype=np.int64) + 1, SECTORS)
     row = np.arange(len(first))
     sides = [(side[row, first], side[row, (first + 1) % SECTORS]) for side in (x, y)]
     return np.stack([longitude, *sides[0]], axis=-1), np.stack([latitude, *sides[1]], axis=-1)

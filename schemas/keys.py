@@ -16,11 +16,14 @@ from schemas.config import NAME_PATTERN, REGION_PATTERN
 from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
-SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `ServiceToken`
-# likewise of who has it for itself, from before it answers until it does no more
+# Liveliness tokens of the services that serve a region, see `ServiceToken`.
+SERVES: Final = f"{ROOT}/serves"
+# Tokens of the services that own a region. A service holds this token from before its first answer
+# until after its last one.
 CLAIMS: Final = f"{ROOT}/claims"
-WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
-PRIVATE: Final = ("ahead", "vss")  # topics of one vehicle, for itself and its owner
+WAITS: Final = f"{ROOT}/waits"  # tokens of the standby services of a region
+# Topics of one vehicle, which only the vehicle and its owner may read.
+PRIVATE: Final = ("ahead", "vss")
 _ALL: Final = "all"
 _CHUNKS: Final = (4, 3, 3, 4)
 

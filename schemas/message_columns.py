@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 from schemas import grid
 from schemas.thresholds import SLIPPERY_MU
 
-# types, by their names in NumPy where it has them
-TIME: Final = "time"  # int64 [ns] in a message
-LIKELIHOOD: Final = "likelihood"  # uint8 (n, 32) in a message
+# Types of columns. Types that NumPy has are called by their NumPy names.
+TIME: Final = "time"  # a column of this type is int64 [ns] in a message
+LIKELIHOOD: Final = "likelihood"  # a column of this type is uint8 (n, 32) in a message
 F32: Final = "float32"
 F64: Final = "float64"
 I8: Final = "int8"
@@ -34,12 +34,12 @@ class MessageColumn(NamedTuple):
     range: tuple[float, float] | None = None
 
 
-# 2^-23 degrees of latitude are 13 mm
+# Steps to which a sender rounds values. 2^-23 degrees of latitude are 13 mm.
 _MU_STEP = 2.0**-10
 _DEGREE_STEP = 2.0**-23
 _RADIAN_STEP = 2.0**-9
 _SPEED_STEP = 2.0**-6
-_MU_RANGE: Final = (0.0, 2.0)  # 2 is more than a road tyre reaches on any road
+_MU_RANGE: Final = (0.0, 2.0)  # no road tyre has a friction coefficient above 2
 _SPEED_RANGE: Final = (-100.0, 100.0)
 _MAX_I32: Final = 2**31 - 1
 
@@ -68,7 +68,7 @@ _POSE = (
     ),
 )
 
-# One visit of one vehicle to one cell.
+# One visit: the passage of one vehicle through one cell.
 OBSERVATION: Final = (
     MessageColumn("enter_time", TIME, "ns since 1970, UTC", "time of the first sample in the cell"),
     MessageColumn("leave_time", TIME, "ns since 1970, UTC", "time of the last sample in the cell"),

@@ -13,10 +13,11 @@ from schemas import wire
 from schemas.errors import InputError
 
 MAX_ROUTE_POINTS: Final = 500
-MAX_TEXT: Final = (
-    32 * 1024
-)  # of all parameters; a route of 500 points with seven decimals takes 13 kB
-FIRST_YEAR: Final = 1971  # nanoseconds since 1970 stay positive, whatever the zone
+# [characters] Largest length of all parameters together. A route of 500 points with seven decimals
+# takes 13 kB.
+MAX_TEXT: Final = 32 * 1024
+# Earliest year of a query; nanoseconds since 1970 are then positive in every time zone.
+FIRST_YEAR: Final = 1971
 _FIXES: Final = {
     "bbox": "give bbox=west,south,east,north in degrees, west < east and south < north",
     "route": f"give route=lon,lat|lon,lat with 2 to {MAX_ROUTE_POINTS} points in degrees",

@@ -17,10 +17,13 @@ from schemas.numeric import IntArray
 from schemas.query import MapQuery
 from schemas.thresholds import METRES_PER_DEGREE
 
-ROUTE_STEP_M: Final = 4.0  # less than half a cell at 60° of latitude: no cell on the way is missed
+# Distance between sampled points of a route. It is less than half a cell at 60° of latitude, so
+# that no cell on the route is missed.
+ROUTE_STEP_M: Final = 4.0
 ROUTE_MOST_M: Final = 500_000.0
 EVERYWHERE: Final = "*/*/*"
-_ZOOMS: Final = (4, 7, grid.REGION_ZOOM)  # of an expression of one, two and three chunks
+# Zoom of the region that an expression of one, two or three chunks denotes.
+_ZOOMS: Final = (4, 7, grid.REGION_ZOOM)
 
 Box = tuple[float, float, float, float]
 

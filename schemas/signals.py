@@ -20,7 +20,7 @@ def per_wheel(name: str) -> tuple[str, ...]:
     return tuple(f"{name}_{wheel}" for wheel in WHEELS)
 
 
-# name -> unit, in the order of the last axis of a block
+# Unit of each channel. The order is that of the last axis of a signal block.
 UNITS: Final = {
     "ax": "m/s^2",
     "ay": "m/s^2",
@@ -35,14 +35,14 @@ UNITS: Final = {
 CHANNELS: Final = tuple(UNITS)
 
 
-# Context: what a car's controllers and its surroundings say, beside the channels that estimators
-# read. A block of it is a float array (T, N, len(CONTEXT)); NaN is unknown. All of it is optional:
-# most cars have some, some have none.
+# Context: flags and values that cars report in addition to the estimators' channels. A context
+# block is a float array (T, N, len(CONTEXT)); NaN means unknown. Every value is optional.
+# Flags of slip controllers: anti-lock brakes, stability control, traction control.
 FLAGS: Final = (
     "abs_active",
     "esc_active",
     "tcs_active",
-)  # slip controllers: anti-lock, stability, traction control
+)
 CONTEXT_UNITS: Final = {
     **dict.fromkeys(FLAGS, "0 no, 1 yes"),
     "air_temperature": "degC outside",
@@ -83,14 +83,15 @@ class Health(IntFlag):
     """Reasons why an estimate is less reliable, as bit flags; 0 means no such reason."""
 
     OK = 0
-    NO_TORQUE = 1  # wheel torque missing: longitudinal force from the accelerometer alone
+    NO_TORQUE = 1  # wheel torque is missing; the accelerometer alone gives the longitudinal force
     NO_WHEEL_SPEED = 2
-    NO_INERTIAL = 4  # ax, ay or yaw rate missing
+    NO_INERTIAL = 4  # ax, ay or yaw rate is missing
     NO_STEERING = 8
     NO_POSITION = 16
-    TIME_GAP = 32  # more than half a second without a sample, or time not increasing
-    OUTLIER = 64  # a reading that was refused
-    SLIDING = 128  # a wheel past its peak (locked or spinning)
-    RESET = 256  # the filter was started anew
-    # no friction explains what is measured: friction is the prior's, and its evidence flat
+    TIME_GAP = 32  # more than 0.5 s without a sample, or time did not increase
+    OUTLIER = 64  # at least one reading was rejected
+    SLIDING = 128  # a wheel is locked or spins: its slip is beyond the tyre's force peak
+    RESET = 256  # the filter was reset
+    # No friction value explains the measurements. The estimate is the prior and its likelihood
+    # flat.
     CONTRADICTION = 512

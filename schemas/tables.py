@@ -34,8 +34,9 @@ class Field(NamedTuple):
 
 
 NS = pa.timestamp("ns", tz="UTC")
-US = pa.timestamp("us", tz="UTC")  # unit of the archive: Spark refuses nanoseconds in Parquet
-US_STEP: Final = 1_000  # [ns]
+# Resolution of archived times: Spark cannot read nanoseconds from Parquet.
+US = pa.timestamp("us", tz="UTC")
+US_STEP: Final = 1_000  # [ns] one microsecond
 LIKELIHOOD = pa.binary(mugrid.BINS)
 F32 = pa.float32()
 F64 = pa.float64()
@@ -62,7 +63,7 @@ def _make_field(column: message_columns.MessageColumn) -> Field:
 OBSERVATION: Final = tuple(_make_field(column) for column in message_columns.OBSERVATION)
 STATE: Final = tuple(_make_field(column) for column in message_columns.STATE)
 
-# Origin of a row: the identity of its batch. In the archive the vehicle is a keyed hash.
+# Identity of the batch that a row came from. In the archive the vehicle name is a keyed hash.
 IDENTITY: Final = (
     Field("vehicle", pa.string(), "-", "enrolled name in a message; keyed hash in the archive"),
     Field(
@@ -110,7 +111,7 @@ BOOKKEEPING: Final = (
     ),
 )
 
-# True if mu was measured. Otherwise mu is mostly the prior, and only `mu_utilised` is known.
+# True if mu was measured. Otherwise mu is mostly the prior and only `mu_utilised` is informative.
 VALUE: Final = Field(
     "value",
     pa.bool_(),
@@ -118,7 +119,7 @@ VALUE: Final = Field(
     f"true if mu was measured: at least {EXCITED_SHARE:g} of it was used; false: lower bound only",
 )
 
-# Road weather of a region, as received and as used by the map.
+# Road weather of a region: as received, and as the map uses it.
 WEATHER: Final = (
     Field("region", I64, "quadint z10", "region"),
     Field("time", NS, "ns since 1970, UTC", "start of validity"),
@@ -172,8 +173,8 @@ MAP_CELL: Final = (
     ),
 )
 
-# Partial statistics of one cell, sector and hour. Rows of the same hour are merged as the meaning
-# of each column says.
+# Statistics of one cell, sector and hour. Several rows of the same hour are merged; each column's
+# meaning says how.
 CELL_HOUR: Final = (
     Field("cell", I64, "quadint z21", "map cell, about 19 m wide at the equator"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
@@ -240,7 +241,7 @@ SIGNAL_LOG: Final = (
     Field("t", F64, "s", "time of the sample, increasing"),
     *(Field(name, F64, unit, "null or NaN: missing reading") for name, unit in UNITS.items()),
 )
-# Columns that a signal log may have in addition.
+# Optional additional columns of a signal log.
 SIGNAL_LOG_CONTEXT: Final = tuple(
     Field(name, F64, unit, "null or NaN: unknown; the column may be missing")
     for name, unit in CONTEXT_UNITS.items()

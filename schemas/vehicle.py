@@ -16,8 +16,9 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle_classes import PREFIX, fields_of_class
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
-# Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et
-# al., SAE 1999-01-1336). A mass in tonnes makes it thirty times that.
+# Accepted range of the radius of gyration about the vertical axis, divided by the wheelbase. Cars
+# have .43 to .5 (Heydinger et al., SAE 1999-01-1336). A mass in tonnes would give a ratio thirty
+# times too large.
 LEAST_GYRATION: Final = 0.1
 MOST_GYRATION: Final = 2.0
 

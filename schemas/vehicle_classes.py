@@ -16,11 +16,12 @@ from schemas.errors import InputError
 from schemas.thresholds import GRAVITY
 
 PREFIX: Final = "class:"
-FRONT_PER_LOAD: Final = 13.0  # [1/rad] cornering stiffness over load, rim angle to side force
+FRONT_PER_LOAD: Final = 13.0  # [1/rad] cornering stiffness per wheel load; slip angle at the rim
 REAR_PER_LOAD: Final = 20.0
-ALONG_PER_LOAD: Final = 20.0  # [1] longitudinal slip stiffness over load
-WHEEL_INERTIA: Final = 1.3  # [kg m^2]
-# yaw inertia over mass times both arms (Heydinger et al., SAE 1999-01-1336: .9 to 1.05)
+ALONG_PER_LOAD: Final = 20.0  # [1] longitudinal slip stiffness per wheel load
+WHEEL_INERTIA: Final = 1.3  # [kg m^2] of one wheel
+# [1] yaw inertia over (mass x front arm x rear arm): .9 to 1.05 in Heydinger et al., SAE
+# 1999-01-1336.
 INERTIA_SHARE: Final = 0.97
 
 

@@ -17,14 +17,14 @@ from schemas import mugrid, wire
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
-# What a road of this earth can have; anything else is a fault of the sender (a unit, a filler like
-# -9999).
+# Values that are possible on Earth. Anything else is a sender's fault, such as a wrong unit or a
+# filler like -9999.
 RANGES: Final = {
     "air_temperature": (-90.0, 60.0),
     "road_temperature": (-90.0, 90.0),
     "precipitation": (0.0, 500.0),
 }
-PRIOR_SUM_ERROR: Final = 0.01  # single precision and a few digits of text
+PRIOR_SUM_ERROR: Final = 0.01  # tolerance of the sum: float32 values, or a few digits of text
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,10 @@ from schemas.runtime.installing import install_command
 
 FAILED: Final = 1
 BAD_INPUT: Final = 2
-INTERRUPTED: Final = 130  # 128 + SIGINT, as shells have it
+INTERRUPTED: Final = 130  # exit code 128 + SIGINT, as shells use it
 SHELLS: Final = ("bash", "zsh", "tcsh")
-EXTRA_OF: Final = {"scipy": "analytics", "matplotlib": "analytics"}  # that installs a package
+# Optional extra of this project that installs a package.
+EXTRA_OF: Final = {"scipy": "analytics", "matplotlib": "analytics"}
 _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
@@ -157,7 +158,8 @@ def run_guarded(run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of our output left: nobody to tell
+    except BrokenPipeError:
+        # The reader of standard output has ended (`| head`), so nobody reads an error message.
         sys.stderr.close()
         return 0
 

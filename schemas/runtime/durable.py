@@ -42,9 +42,10 @@ def open_durably(
     draft = draft_of(path)
     try:
         if mode is not None:
-            draft.unlink(missing_ok=True)  # of a process that died; its permissions may be others
+            # A crashed process may have left this file with other permissions.
+            draft.unlink(missing_ok=True)
             draft.touch(mode, exist_ok=False)
-            draft.chmod(mode)  # whatever the process's mask took away
+            draft.chmod(mode)  # `touch` applies the umask, `chmod` does not
         with draft.open("wb") as file:
             yield file
             file.flush()

@@ -43,7 +43,7 @@ class Figure:
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
-            return bool(self.bar[0] <= self.value <= self.bar[1])  # NumPy's own is no JSON
+            return bool(self.bar[0] <= self.value <= self.bar[1])  # json cannot write a NumPy bool
         return bool(self.value <= self.bar if self.better == "less" else self.value >= self.bar)
 
 

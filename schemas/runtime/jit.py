@@ -20,8 +20,8 @@ from typing import Final, ParamSpec, TypeVar, cast
 
 from schemas.runtime.native_kernels import Library, NativeIntrinsic, NativeKernel
 
-LINE: Final = 64  # bytes that a processor reads at once
-# fields of /proc/cpuinfo by which LLVM chooses instructions
+LINE: Final = 64  # [bytes] size of a cache line
+# Fields of /proc/cpuinfo that decide which instructions LLVM uses.
 PROCESSOR: Final = ("vendor_id", "cpu family", "model", "flags", "CPU", "Features")
 
 P = ParamSpec("P")
@@ -206,7 +206,7 @@ def cache_root() -> Path | None:
         with suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             own = folder.stat()
-            # what lies there is executed: nobody else may be able to put it there
+            # The files in this folder are executed, so no other user may be able to write to it.
             if (
                 os.access(folder, os.W_OK | os.X_OK)
                 and own.st_uid == os.getuid()
@@ -219,7 +219,7 @@ def cache_root() -> Path | None:
 def _roots() -> Iterator[Path]:
     if given := os.environ.get("XDG_CACHE_HOME"):
         yield Path(given) / "gripmap"
-    with suppress(RuntimeError):  # a user without a home
+    with suppress(RuntimeError):  # the user has no home directory
         yield Path.home() / ".cache" / "gripmap"
     with suppress(OSError):
         yield Path(tempfile.gettempdir()) / f"gripmap-{os.getuid()}"

@@ -27,10 +27,10 @@ VECTOR: Final = ir.VectorType(DOUBLE, LANES)
 LONG_VECTOR: Final = ir.VectorType(LONG, LANES)
 POINTER_VECTOR: Final = ir.VectorType(ir.PointerType(), LANES)
 BIT_VECTOR: Final = ir.VectorType(ir.IntType(1), LANES)
-ANY_BYTE: Final = 8  # alignment of numbers in memory, which a vector there also has
+ANY_BYTE: Final = 8  # [bytes] alignment of vectors in memory: that of a single number
 INVERSE_BITS: Final = 0x7FDE623822FC16E6
 INVERSE_ROOT_BITS: Final = 0x5FE6EB50C7B537A9
-FUSED: Final = ("contract",)  # a*b + c may be rounded once
+FUSED: Final = ("contract",)  # LLVM flag: a*b + c may become one instruction, which rounds once
 
 
 class LanesType(types.Type):

@@ -31,31 +31,33 @@ def intrinsic_of(name: str) -> object:
     return load_intrinsic("schemas.runtime.lane_types", name)
 
 
-# lanes_at(array, place): the vector of `array` (..., LANES) at a place, one index per axis before
-# the lanes; of a flat array, the vector number `place`
+# lanes_at(array, place): load a vector from `array` (..., LANES). `place` has one index for each
+# axis before the lanes. For a flat array it is the number of the vector.
 lanes_at = cast(Callable[[FloatArray, Any], float], intrinsic_of("type_load"))
-# put_lanes(array, place, value): write a vector or, into all lanes, a number
+# put_lanes(array, place, value): store a vector; a single number is stored in every lane.
 put_lanes = cast(Callable[[FloatArray, Any, float], None], intrinsic_of("type_store"))
-# select(where, first, other): `first` where the mask is true; both are computed
+# select(where, first, other): `first` where the mask is true, else `other`. Both are computed.
 select = cast(Callable[[bool, float, float], float], intrinsic_of("type_select"))
 any_lane = cast(Callable[[bool], bool], intrinsic_of("type_any"))
 sum_lanes = cast(Function, intrinsic_of("type_sum"))
 largest_lane = cast(Function, intrinsic_of("type_largest"))
-# gather(table, cell): elements of a table at whole numbers, which must lie inside
+# gather(table, cell): the elements of a table at integer indices. The indices must lie inside it.
 gather = cast(Callable[[FloatArray, float], float], intrinsic_of("type_gather"))
 floor = cast(Function, intrinsic_of("type_floor"))
-# power_of_two(k): 2^k of a whole k; exponent_of(x): the whole k with 2^k <= x < 2^(k+1) of x > 0
+# power_of_two(k): 2^k for an integer k. exponent_of(x): the integer k with 2^k <= x < 2^(k+1), for
+# x > 0.
 power_of_two = cast(Function, intrinsic_of("type_power_of_two"))
 exponent_of = cast(Function, intrinsic_of("type_exponent"))
-# 1/x and 1/sqrt(x) of a positive x with errors below 13 % and 3.5 %
+# Approximations of 1/x and 1/sqrt(x) for positive x. Their errors are below 13 % and 3.5 %.
 guess_inverse = cast(Function, intrinsic_of("type_guess"))
 guess_inverse_root = cast(Function, intrinsic_of("type_root_guess"))
 
 LOG2_E: Final = 1.4426950408889634
-# ln 2 in two parts, so that whole multiples of the first are exact
+# ln 2 as the sum of two numbers. The first has trailing zero bits, so that its products with
+# integers are exact.
 LN_2_HIGH: Final = 6.93147180369123816490e-01
 LN_2_LOW: Final = 1.90821492927058770002e-10
-MOST_EXPONENT: Final = 700.0  # beyond it 2^k has no exponent of a float
+MOST_EXPONENT: Final = 700.0  # largest |x| of exp(x): beyond it 2^k overflows or underflows
 ROOT_2: Final = math.sqrt(2.0)
 EXP_TERMS: Final = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))
 LOG_TERMS: Final = tuple(2.0 / k for k in range(21, 0, -2))

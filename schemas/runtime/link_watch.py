@@ -17,11 +17,12 @@ import zenoh
 
 from schemas.runtime.metrics import Metric
 
+# Protocols that the metrics always list, even without a link, so that an alarm rule can name them.
 PROTOCOLS: Final = (
     "quic",
     "tls",
     "tcp",
-)  # shown even where nothing uses them, so that an alarm can name them
+)
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,8 @@ class LinkWatch:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._routers = set[str]()
-        self._links = dict[tuple[str, str], str]()  # protocol by identity of the router and address
+        # Protocol of each link. The key is the identity of the router and its address.
+        self._links = dict[tuple[str, str], str]()
         self.epoch = self.lost = 0
         info = session.info
         self._listeners = (

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from prometheus_client.registry import CollectorRegistry
 
 PREFIX: Final = "gripmap_"
-READ_S: Final = 5.0  # a client whose request is not complete is cut off
+READ_S: Final = 5.0  # longest time for receiving a request; then the connection is closed
 
 
 class Metric(NamedTuple):
@@ -113,7 +113,7 @@ def _make_exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
 
 
 class _MetricsServer(ThreadingHTTPServer):
-    # the base class has these types
+    # The base class declares these types.
     def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         deadline = Timer(READ_S, _stop_reading, (request,))
         deadline.daemon = True
@@ -125,7 +125,7 @@ class _MetricsServer(ThreadingHTTPServer):
 
 
 def _stop_reading(connection: socket) -> None:
-    with suppress(OSError):  # it has just ended
+    with suppress(OSError):  # the connection has just been closed
         connection.shutdown(SHUT_RD)
 
 

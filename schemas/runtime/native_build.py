@@ -7,7 +7,7 @@ recorded kernel becomes a C function of the library, with the machine code that 
 run.
 """
 
-# the types are Numba's and LLVM's own
+# Numba and LLVM provide no types.
 # ruff: noqa: ANN401
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ from schemas.runtime.native_kernels import (
 
 LINKED: Final = ("-shared", "-nostartfiles", "-Wl,-z,noexecstack")
 ADAPTER: Final = "call_kernel"
+# Prefixes of functions of the Numba and Python runtimes. A kernel calls them only when it fails.
 RUNTIME: Final = (
     "NRT_",
     "numba_",
     "Py",
-)  # of Numba and Python: only a kernel that fails calls them
+)
 RESULTS: Final = (types.none, types.int64)
 
 
@@ -107,7 +108,7 @@ def _stop_before_machine_code() -> None:
     library.get_pointer_to_function = lambda *_: 0
     target: Any = cpu.CPUContext
     target.create_cpython_wrapper = lambda *_, **__: None
-    target.get_executable = lambda *_: [].append  # of the type that Numba asks for, and new
+    target.get_executable = lambda *_: [].append  # Numba needs a new built-in function here
 
 
 def _mark_finalized(library: Any) -> None:

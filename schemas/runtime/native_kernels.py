@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 LINKER: Final = "cc"
-HEADER: Final = 2  # words before the arguments: the mark, and the result
+HEADER: Final = 2  # words before the arguments: success mark and result
 LARGEST: Final = 1 << 63
 
 

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-FOUR: Final = ("#2f005b", "#a3195b", "#f47a3d", "#f2e63e")  # ice, snow, wet, good grip
-TWO: Final = ("#a36f63", "#f3b49b")  # rather slippery, rather not
+# Colours of ice, snow, wet and good grip.
+FOUR: Final = ("#2f005b", "#a3195b", "#f47a3d", "#f2e63e")
+TWO: Final = ("#a36f63", "#f3b49b")  # colours of "rather slippery" and "rather not slippery"
 LITTLE: Final = "#b4b8bf"
 GROUND: Final = "#f6f5f2"
 DARK_FOUR: Final = ("#f6e0ff", "#f3b8b3", "#e05219", "#65310b")
@@ -45,14 +46,16 @@ GRIP: Final = (
     "#f6ec73",
     "#f7f2a0",
 )
-GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
+# Friction coefficient mu of the colour scale's ends: wet ice and dry asphalt.
+GRIP_RANGE: Final = (0.1, 1.0)
+# Typical peak friction coefficients, as marks on the colour scale.
 SURFACES: Final = {
     "ice": 0.15,
     "snow": 0.35,
     "wet": 0.6,
     "dry": 0.9,
-}  # peak adhesion that a reader knows them by
-HATCH: Final = "//////"  # of what was not measured, on white
+}
+HATCH: Final = "//////"  # hatching, on white, of places that were not measured
 UNKNOWN: Final = "not measured: only lower bounds"
 
 
@@ -64,8 +67,8 @@ class LineStyle(NamedTuple):
 
 
 TRUTH: Final = LineStyle("#000000")
-# One colour an estimator, in every plot: Okabe and Ito (2008), with a red brown for black, which is
-# the truth's.
+# Colour of each estimator in all plots, from Okabe and Ito (2008). Black belongs to the true value,
+# so a red-brown replaces it.
 ESTIMATORS: Final = {
     "aco-fckf": LineStyle("#0072b2"),
     "fckf": LineStyle("#56b4e9", "--"),
@@ -76,7 +79,7 @@ ESTIMATORS: Final = {
     "sr-ukf": LineStyle("#7e210d", "--"),
     "paper-aco-fckf": LineStyle("#d55e00"),
 }
-OTHER: Final = LineStyle("#777777", ":")  # an estimator from outside
+OTHER: Final = LineStyle("#777777", ":")  # style of an estimator that is not part of this project
 
 
 def line_of(estimator: str) -> LineStyle:

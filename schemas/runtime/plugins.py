@@ -41,7 +41,7 @@ def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever sta
     """
     try:
         return entry_points_of(group)[name].load()
-    except (Exception, SystemExit) as error:  # a module of others may raise anything
+    except (Exception, SystemExit) as error:  # the import of foreign code may raise anything
         field = group.rpartition(".")[2].removesuffix("s")
         where = entry_points_of(group)[name].value
         raise InputError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.runtime.jit import LINE
 
 
-# the types are Numba's own
+# Numba provides no types.
 def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001
     def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
         kind = signature.args[0]
@@ -32,13 +32,13 @@ def _prefetch(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: AN
         function = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
             builder.module, hint, "llvm.prefetch.p0"
         )
-        # to read, into every cache, data
+        # Arguments of llvm.prefetch: 0 for reading, 3 for all cache levels, 1 for the data cache.
         builder.call(function, [address, whole(0), whole(3), whole(1)])
         return target.get_dummy_value()
 
     return types.void(array, types.int64, types.int64), generate
 
 
-# `prefetch(array, row, line)` in compiled code: let a LINE of `array[row]` come meanwhile. For
-# arrays of one or two dimensions; a hint, so that `row` may lie outside.
+# `prefetch(array, row, line)`, for compiled code: start to load cache line `line` of `array[row]`,
+# for an array of one or two dimensions. It is only a hint, so `row` may lie outside the array.
 prefetch = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_prefetch))

@@ -14,7 +14,7 @@ import zenoh
 from schemas.errors import InputError
 from schemas.keys import SERVES, ServiceToken, parse_served
 
-ANSWER_S: Final = 2.0  # for a router to tell which tokens there are
+ANSWER_S: Final = 2.0  # longest wait for a router's list of the active tokens
 _ALL: Final = f"{SERVES}/**"
 
 
@@ -26,7 +26,7 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
         if reply.ok is not None:
-            with suppress(InputError):  # a stranger's
+            with suppress(InputError):  # ignore tokens of other programs
                 found.add(parse_served(str(reply.ok.key_expr), root))
     return found
 
@@ -100,14 +100,14 @@ def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
                 parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT
             )
 
-    # at once, on the thread that receives: what fell is known before the answer to any later
-    # question is
+    # `indirect=False`: the callback runs on Zenoh's receiving thread. A lost token is thus recorded
+    # before the answer of any later query arrives.
     subscriber = session.liveliness().declare_subscriber(
         _ALL, zenoh.handlers.Callback(hear, indirect=False)
     )
-    for token in active_tokens(
-        session
-    ):  # a get ends when all were told, which a subscription's history does not
+    # A query is used instead of the subscription's history, because a query reports when its list
+    # is complete.
+    for token in active_tokens(session):
         if token not in tokens.lost_tokens:
             tokens.record(token, stands=True)
     try:

@@ -17,9 +17,11 @@ from importlib.abc import MetaPathFinder
 from typing import Any, Final, Literal, NoReturn, TextIO
 
 Form = Literal["text", "json"]
-_MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
-_SET_PARENT_DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG of prctl
-_LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
+_MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD in glibc's malloc.h
+_SET_PARENT_DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG of prctl(2)
+# [bytes] larger arrays get memory of their own; the arrays of one pass of the service's main loop
+# are smaller.
+_LARGE: Final = 4 << 20
 
 
 class LogLine(str):
@@ -51,7 +53,7 @@ def limit_memory(*without: str) -> None:
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-    with suppress(AttributeError, OSError):  # where it is another allocator than glibc's
+    with suppress(AttributeError, OSError):  # the C library is not glibc
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
     sys.meta_path.insert(0, _Without({"pandas", *without}))
 
@@ -79,7 +81,7 @@ def force_exit(code: int) -> NoReturn:
     Printed text is flushed. Other threads are stopped without cleanup.
     """
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):  # a full disk, a reader that left, a closed stream
+        with suppress(OSError, ValueError):  # full disk, closed pipe or closed stream
             stream.flush()
     os._exit(code)
 
@@ -100,7 +102,7 @@ class _Without(MetaPathFinder):
     def __init__(self, names: set[str]) -> None:
         self._names = names
 
-    # the interface of import finders
+    # The signature is prescribed by importlib's finder interface.
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002
         if fullname in self._names:
             raise ModuleNotFoundError(
@@ -113,7 +115,7 @@ def print_line(line: str, stream: TextIO) -> None:
     of the stream (full disk, closed pipe) are ignored.
     """
     with suppress(OSError):
-        stream.write(f"{line}\n")  # in one piece: `print` writes the end of a line by itself
+        stream.write(f"{line}\n")  # one write: `print` writes the line feed separately
         stream.flush()
 
 

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from schemas.runtime.process import print_line
 
-PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
+PATIENCE_S: Final = 0.8  # delay of the spinner: short commands show none
 TICK_S: Final = 1.0
 COMPILING: Final = (
     "compiling kernels for this machine: takes up to a minute, once; the next start reuses them"
@@ -104,7 +104,8 @@ def _show_status() -> None:
     began = time.monotonic()
     loading = threading.Thread(target=_load_drawing, daemon=True)
     loading.start()
-    while loading.is_alive():  # seconds, beside a command that computes or loads its own
+    # The import of the drawing library takes seconds next to a busy command.
+    while loading.is_alive():
         with suppress(OSError):
             waited = PATIENCE_S + time.monotonic() - began
             print(f"{_voice.words} … {waited:.0f} s", end="\r", file=sys.stderr, flush=True)

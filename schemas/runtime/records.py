@@ -39,8 +39,9 @@ from schemas.numeric import FloatArray, IntArray
 
 RecordArray: TypeAlias = NDArray[np.void]
 LaneArray = NewType("LaneArray", FloatArray)
-LANES: Final = 8  # numbers in a vector: 512 bits; other processors take two or four registers
-LINE: Final = 8 * LANES  # bytes of a vector, and of a cache line
+# Numbers in a vector of 512 bits; processors with shorter registers use two or four.
+LANES: Final = 8
+LINE: Final = 8 * LANES  # [bytes] size of a vector and of a cache line
 R_co = TypeVar("R_co", covariant=True)
 
 
@@ -60,7 +61,7 @@ KINDS: dict[Any, Any] = {
     FloatArray: "f8",
     IntArray: "i8",
     **{number: number for number in _NUMBERS},
-    # a value, not an annotation
+    # mypy takes this dictionary key for an annotation.
     **{NDArray[number]: number for number in _NUMBERS},  # type: ignore[valid-type]
 }
 

@@ -25,7 +25,8 @@ SETTINGS: Final = {
     "spark.ui.enabled": "false",
     "spark.sql.session.timeZone": "UTC",
     "spark.sql.execution.arrow.pyspark.enabled": "true",
-    "spark.sql.ansi.enabled": "false",  # Ibis writes 0/0 where there is nothing
+    # Ibis computes 0/0 for empty groups, which ANSI mode treats as an error.
+    "spark.sql.ansi.enabled": "false",
 }
 
 
@@ -41,9 +42,8 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
         from pyspark.sql import SparkSession
     except ImportError as error:
         raise InputError("engine", "Spark is not installed", install_command("spark")) from error
-    os.environ.setdefault(
-        "PYSPARK_PYTHON", sys.executable
-    )  # that of this environment, which has the package
+    # The workers must use the Python of this environment, which contains the package.
+    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     builder = SparkSession.builder.appName("gripmap")
     for key, value in (*SETTINGS.items(), ("spark.ui.showConsoleProgress", str(progress).lower())):
         builder = builder.config(key, value)
@@ -94,9 +94,9 @@ def spread(
 
     packed = [pickle.dumps(numbered) for numbered in enumerate(tasks)]
     frame = session.createDataFrame(pa.table([pa.array(packed, pa.binary())], schema=_TASK))
-    each = frame.coalesce(1).repartition(
-        len(tasks)
-    )  # out of one partition they go around: one in each
+    # `repartition` distributes the rows of a single partition in turn, so that each partition gets
+    # one task.
+    each = frame.coalesce(1).repartition(len(tasks))
     try:
         answers: pa.Table = each.mapInArrow(run_batches, from_arrow_schema(_TASK)).toArrow()
     except (PySparkException, Py4JError) as error:

@@ -11,9 +11,9 @@ from contextlib import suppress
 from typing import Final
 
 _ADDRESS = "NOTIFY_SOCKET"
-_WITHIN: Final = "WATCHDOG_USEC"  # of systemd: a sign is due so often
+_WITHIN: Final = "WATCHDOG_USEC"  # set by systemd: longest time between two notifications
 _USUAL_US: Final = 40e6
-LONG_S: Final = 900.0  # a start may take as long, see TimeoutStartSec of the units
+LONG_S: Final = 900.0  # longest start of a process, as TimeoutStartSec in the systemd units
 _at_work = threading.Event()
 
 

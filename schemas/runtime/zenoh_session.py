@@ -31,11 +31,11 @@ CLIENT: Final[Mapping[str, Any]] = {
     "scouting/delay": 0,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 3000,
-    "transport/unicast/open_timeout": 2000,  # several round trips of a mobile network
+    "transport/unicast/open_timeout": 2000,  # [ms] several round trips of a mobile network
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 1.5},
 }
 RETRY_S: Final = 0.5
-LONGEST_OPEN_MS: Final = 10_000  # Zenoh's own time to open a link
+LONGEST_OPEN_MS: Final = 10_000  # Zenoh's own limit for opening a link
 _TIMEOUT: Final = "connect/timeout_ms"
 _OPEN: Final = "transport/unicast/open_timeout"
 NAME: Final = "{name}"
@@ -114,9 +114,8 @@ def open_session(
         try:
             return zenoh.open(configuration(patient, name))
         except zenoh.ZError as error:
-            reason = (
-                str(error).partition(" at /")[0].strip()
-            )  # where Zenoh was built is nobody's business
+            # Zenoh's message ends with a path of the machine that built it. The path is cut off.
+            reason = str(error).partition(" at /")[0].strip()
             if reason not in logged:
                 logged.add(reason)
                 log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)

@@ -30,7 +30,7 @@ from schemas.wire.codec import (
     parse,
 )
 
-ABSENT: Final = dict.fromkeys(FLAGS, -1)  # what an absent integer reads as, where it is not 0
+ABSENT: Final = dict.fromkeys(FLAGS, -1)  # value of an absent integer column where it is not 0
 LIKELIHOOD: Final = "log_likelihood"
 
 
@@ -126,7 +126,7 @@ class PresentColumns(NamedTuple):
         return np.repeat(self.columns[name], self.sizes)
 
 
-# protobuf messages are untyped
+# protobuf messages have no types.
 def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401
     """Parse the bytes of a batch with the protobuf library and check that its columns have equal
     lengths.

@@ -24,20 +24,20 @@ from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
 JSON: Final = "application/json"
+# Encodings that mean protobuf; the key then says which message type it is.
 PLAIN: Final = (
     "application/protobuf",
     "zenoh/bytes",
     "",
-)  # protobuf of which the key says what it is
+)
 ARROW: Final = "application/vnd.apache.arrow.stream"
 GEOJSON: Final = "application/geo+json"
 MAX_ROWS: Final = 50
-MAX_STANDING_BYTES: Final = (
-    8 << 20
-)  # every cell and sector of a z14 tile under an alert: 65 536 of them
-# of one kind from one session over QUIC; a router drops what follows sooner
+# Enough for an alert on each of the 65 536 cells and sectors of a z14 tile.
+MAX_STANDING_BYTES: Final = 8 << 20
+# Largest rate per kind and session over QUIC. A router drops messages that exceed it.
 MESSAGES_PER_S: Final = 100.0
-MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JSON
+MAX_BYTES: Final = 64 * 1024  # 50 records take 8 kB as protobuf and 40 kB as JSON
 
 
 class Kind(StrEnum):
@@ -48,9 +48,9 @@ class Kind(StrEnum):
     OBSERVATION = "obs"
     STATE = "state"
 
-    __hash__ = (
-        str.__hash__
-    )  # the enumeration's own is Python, and a kind is part of every stream's name
+    # The hash of an Enum is Python code and slow. A `Kind` is hashed often, as a part of each
+    # stream's name.
+    __hash__ = str.__hash__
 
 
 Columns = dict[str, NDArray[Any]]
@@ -59,7 +59,7 @@ MESSAGES: Final[dict[Kind, type[Any]]] = {
     Kind.OBSERVATION: pb.ObservationBatch,
     Kind.STATE: pb.StateBatch,
 }
-# columns without which a batch is none; the first one's length is the number of records
+# Columns that every batch must have. The length of the first one is the number of records.
 NEEDED: Final = {
     Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
     Kind.STATE: ("time", "latitude", "longitude"),
@@ -156,7 +156,7 @@ def encode(batch: Batch) -> bytes:
     return data
 
 
-# protobuf messages are untyped
+# protobuf messages have no types.
 def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401
     """Parse a message of type `message` from its bytes. They are protobuf if `encoding` is
     `expected` or names no message type, and JSON if it is the JSON encoding.
@@ -213,7 +213,8 @@ def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
     """
     message = pb.Ack(vehicle=vehicle, time=time)
     for stream in streams:
-        part = message.streams.add()  # field by field: half of what keyword arguments take
+        # Setting fields one by one takes half the time of keyword arguments.
+        part = message.streams.add()
         part.boot = stream.boot
         part.kind = _PB_KIND[stream.kind]
         part.region = stream.region

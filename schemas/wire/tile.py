@@ -15,10 +15,10 @@ import pyarrow as pa
 from schemas.errors import WireError
 from schemas.tables import MAP_SCHEMA
 
-MAX_BYTES: Final = 64 * 1024 * 1024  # the largest message that a router passes
-MAX_ROWS: Final = 1 << 17  # a tile has 2^14 cells of four sectors; twice that
-_BATCH: Final = 3  # type of a record batch's head in the format's schema
-# places of fields in the tables Message and RecordBatch
+MAX_BYTES: Final = 64 * 1024 * 1024  # largest message that a router forwards
+MAX_ROWS: Final = 1 << 17  # twice the rows of a full tile: 2^14 cells of four sectors
+_BATCH: Final = 3  # MessageHeader type of a record batch in Arrow's IPC format
+# Field numbers in the flatbuffers tables Message and RecordBatch of Arrow.
 _TYPE = 1
 _HEAD = 2
 _COMPRESSION = 3
