@@ -2,6 +2,5 @@
 
 import os
 
-os.environ.setdefault(
-    "OPENBLAS_NUM_THREADS", "1"
-)  # as service and agent have it: `schemas.runtime.process.limit_memory`
+# The service and the agent set the same limit, see `schemas.runtime.process.limit_memory`.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -207,7 +207,7 @@ def _find_refusals(path: Path) -> list[str]:
 def _can_read(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: int) -> bool:
     try:
         return reader(root)[0] == expected
-    except Exception as error:  # noqa: BLE001 whatever a tool of others raises is what is counted
+    except Exception as error:  # noqa: BLE001 a foreign tool may raise anything
         print_progress(f"{reader.__name__}: {error}")
         return False
 
@@ -220,7 +220,7 @@ def _count_differences(root: Path, readings: Path) -> int:
         roads,
     )
     for question in QUESTIONS.values():
-        if question.name == "replay":  # asks no engine
+        if question.name == "replay":  # this question uses no query engine
             continue
         options = Options(
             at=HALF,

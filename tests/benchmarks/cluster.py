@@ -22,7 +22,7 @@ from schemas.runtime.zenoh_session import open_session
 from tests.benchmarks.service import ACKS, ack_delays_s, poll_until, run_process
 from tests.buckets import bucket_server
 
-TURNS = 3  # alternate runs of each, so that other work on the machine affects both
+TURNS = 3  # alternating runs of each variant, so that other load on the machine affects both
 BAR = 2.0
 
 

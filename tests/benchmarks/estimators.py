@@ -28,9 +28,8 @@ def estimators() -> list[Figure]:
     def run_estimator(n: int, samples: int) -> float:
         block = np.repeat(signals[:samples], n, axis=1)
         times = np.repeat(t[:samples], n, axis=1)
-        banks = [
-            bank_of("aco-fckf", [vehicle] * n) for _ in range(ROUNDS + 1)
-        ]  # to make one is not to step it
+        # The estimators are created in advance, so that only their steps are timed.
+        banks = [bank_of("aco-fckf", [vehicle] * n) for _ in range(ROUNDS + 1)]
         seconds = median_s(lambda: banks.pop().advance(times, block))
         return seconds / (n * samples) * 1e6
 

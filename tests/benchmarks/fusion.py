@@ -24,7 +24,7 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.process import trim_memory
 from tests.benchmarks.measure import ROUNDS, SEED, time_in_turn
 
-BATCH = 5_000  # rows per pass of the main loop of a service under load
+BATCH = 5_000  # rows that a loaded service processes per pass of its main loop
 VEHICLES = 5_000
 EXCITED = 1 / 9  # share of visits that measure the friction
 SECOND = 10**9
@@ -107,7 +107,7 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
     """
     fusion, rng = fill_fusion(cells, 1, 600.0)
     spent = []
-    for minute in range(ROUNDS + 3):  # until the window is full
+    for minute in range(ROUNDS + 3):  # the first three passes fill the window
         parts = list(
             split_batches(make_visits(rng, 60 * per_s, cells, 660.0 + 60.0 * minute, 60.0))
         )
@@ -159,12 +159,12 @@ def resident() -> None:
     """Print the resident memory [MB] of a service's process with 10⁶ cells each of which vehicles
     visited three times in a day.
     """
-    import fleet_service.app.service  # noqa: F401 what a service has loaded
+    import fleet_service.app.service  # noqa: F401 a service has loaded it
     from fleet_service.serve.map_state import MapState
 
     fusion, _ = fill_fusion(CELLS, 3, 86_400.0)
     MapState(fusion).tiles()
-    trim_memory()  # as upkeep does
+    trim_memory()  # the service's background jobs also do this
     with open("/proc/self/status") as status:  # noqa: PTH123
         kilobytes = next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
     print(kilobytes * 1024 / 1e6, fusion.size)

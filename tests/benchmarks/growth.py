@@ -26,14 +26,15 @@ from schemas.wire import Kind
 from tests.benchmarks.ingest import make_messages
 from tests.changed_tiles import changed_tiles
 
+# Observations per second, and the measured time [s] for each rate.
 RATES: Final = {
     1_000: 24,
     10_000: 12,
     100_000: 6,
-}  # observations/s, and seconds of each that are measured
+}
 ROWS: Final = 10
-TURN: Final = 512  # messages, as the service's worker takes them
-# short, so that the window is full and settling has its full cost from the beginning
+TURN: Final = 512  # messages per pass; the service's worker takes the same number
+# Short, so that the window is full and settling has its full cost from the beginning.
 LATENESS_S: Final = 4.0
 WARM_S: Final = 4
 SECOND: Final = 10**9
@@ -64,7 +65,7 @@ def second_s(rate: int, seconds: int) -> float:
     config = ServiceConfig(lateness_s=LATENESS_S)
     with tempfile.TemporaryDirectory() as folder, closing(Engine(config, Path(folder))) as engine:
         gc.collect()
-        gc.freeze()  # as the service does when it starts
+        gc.freeze()  # the service does this when it starts
         for second in range(WARM_S + seconds):
             now = begin + second * SECOND
             sent = make_messages(vehicles, ROWS, now, vehicles, second * vehicles)

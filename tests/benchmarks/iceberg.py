@@ -18,7 +18,7 @@ from fleet_service.archive.maintenance.compaction import compact
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill
 
-Table: TypeAlias = Any  # of pyiceberg
+Table: TypeAlias = Any  # pyiceberg's table type, which is an optional import
 SEEDS: Final = (0, 10, 20, 30)
 
 

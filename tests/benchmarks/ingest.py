@@ -35,9 +35,9 @@ from tests.faults.load import make_visits
 
 VEHICLES: Final = 1000
 CELLS_ACROSS: Final = 200
-STEP_NS: Final = 200_000_000  # between two cells of 10 m
+STEP_NS: Final = 200_000_000  # time from one cell of 10 m to the next
 REGION_BITS: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM)
-FLUSH: Final = 20_000  # messages between two segments
+FLUSH: Final = 20_000  # messages between two written segments
 COUNTS: Final = {10: 16_384, 1: 65_536}  # messages per round, by the number of records in a message
 MESSAGE: Final = wire.MESSAGES[Kind.OBSERVATION]
 ROUNDS: Final = 3
@@ -180,7 +180,8 @@ def _time_ingest(sent: list[Message], records: int) -> tuple[float, float]:
     ):
         turn = turn_of(sent)
         gc.collect()
-        # as the service does at its start: the collector must not search the benchmark's messages
+        # The service also does this at its start. Otherwise the garbage collector would search the
+        # benchmark's messages.
         gc.freeze()
         wall = time.perf_counter()
         cpu = time.process_time()

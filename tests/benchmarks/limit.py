@@ -29,8 +29,8 @@ FOLDER = Path(__file__).parent
 STATES = 6
 ROWS = 3
 WHEELS = 4
-FACTOR = STATES + STATES * STATES + ROWS * 2  # place of `factor` in the struct's doubles
-# what lets gcc take roots and select in vectors; none of them changes a result
+FACTOR = STATES + STATES * STATES + ROWS * 2  # index of `factor` among the struct's doubles
+# Options that let gcc vectorise square roots and selections. None of them changes a result.
 VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 

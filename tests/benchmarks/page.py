@@ -51,19 +51,20 @@ from tests.waiting import until
 T = TypeVar("T")
 OUT: Final = Path(".page")
 SEED: Final = 20_319
-CHANGED_HZ: Final = 1000  # cells a second
-PUT_S: Final = 0.25  # each of four tiles is published once a second, as by a service
+CHANGED_HZ: Final = 1000  # cells that change per second
+# Time between two publications; a service publishes each of the four tiles once a second.
+PUT_S: Final = 0.25
 PUSHES: Final = 120
 DRAWN_S: Final = 10.0
-FIRST: Final = 100  # number of the first push; earlier content has smaller numbers
+FIRST: Final = 100  # number of the first push; content of the page before it has smaller numbers
 WATCHERS: Final = (400, 300, 200, 100, 50)
 WATCHED_PUSHES: Final = 20
 VIEWPORT: Final = {"width": 1600, "height": 1100}
 ROUNDS: Final = 3
 ALL: Final = (*FOUR, *TWO, LITTLE, GROUND)
 
-# A picture counts from the moment at which all cells were painted; performance.now() begins with
-# the navigation.
+# A picture counts when all cells have been painted. performance.now() is 0 at the start of the
+# navigation.
 _WATCH: Final = """
   globalThis.shown = null; globalThis.numbers = [];
   document.addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
@@ -74,8 +75,8 @@ _WATCH: Final = """
     }
   }).observe(document.body, { attributeFilter: ["data-drawn"] }));
 """.replace("CELLS", str(CELLS))
-# Moved at each frame of the browser, as a hand does; what was painted counts. To wait for each
-# picture before the next move would leave every second frame without one.
+# Move the map at each frame of the browser, as a user does, and count the painted pictures. If the
+# script waited for each picture before the next move, every second frame would show none.
 _MOVES: Final = """async () => {
   const began = performance.now(), before = painted();
   for (let k = 0; performance.now() - began < 3000; k++) {
@@ -231,15 +232,15 @@ def pushed_ms(on: Stage) -> float:
             on.session.put(keys.map_key(tile), payload)
             due += PUT_S
             time.sleep(max(due - time.monotonic(), 0.0))
-        with contextlib.suppress(
-            TimeoutError
-        ):  # a publication may be dropped; then it counts as infinitely late
+        # Zenoh may drop a publication. It then counts as infinitely late.
+        with contextlib.suppress(TimeoutError):
             until(
                 lambda: seen.page.evaluate(f"numbers.some(one => one[0] === {FIRST + PUSHES - 1})"),
                 DRAWN_S,
             )
         drawn_at = {int(number): float(at) for number, at in seen.page.evaluate("numbers")}
-    # a publication overtaken by the next one of its tile counts as drawn with that one
+    # If the next publication of the same tile overtakes a publication, both count as drawn with the
+    # later one.
     late = [
         min(
             (

@@ -47,9 +47,9 @@ STEPS = 40
 SEED = 20_319
 LEAST_ENDED = 20
 PATIENCE_S: Final = 120.0
-ICE_NS: Final = (
-    1800 * NS
-)  # age of the ice when it has melted: in seconds no road changes, and no alert would end
+# Age of the reported ice at the time when it has melted. Within seconds no road changes, so no
+# alert would end.
+ICE_NS: Final = 1800 * NS
 _SPACES: Final = {
     "sit": "http://datex2.eu/schema/3/situation",
     "loc": "http://datex2.eu/schema/3/locationReferencing",
@@ -195,7 +195,7 @@ def measure_publication() -> dict[str, float]:
                     time.sleep(1.0)
                     seq = street.put(session, ("melted",), time.time_ns(), seq)
                 until(lambda: not standing_alerts(session), PATIENCE_S)
-                time.sleep(1.0)  # a pull
+                time.sleep(1.0)  # time for the feed's next update
                 unended = sum(not is_over(one) for one in list_records(fetch_publication(address)))
         finally:
             stop.set()

@@ -27,7 +27,7 @@ from schemas.thresholds import GRAVITY
 from tests.waiting import until
 
 CELLS: Final = 20_000
-SIDE: Final = 2  # tiles: at the least zoom that shows cells they fit a screen
+SIDE: Final = 2  # tiles along a side; at the smallest zoom that shows cells they fill one screen
 ZOOM: Final = 14.75
 MIDDLE: Final = (57.7, 11.97)
 BOUND_SHARE: Final = 0.3

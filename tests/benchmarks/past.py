@@ -29,7 +29,7 @@ from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
 WORLD = SyntheticFleet(1_000_000, days=3)
-# side of a box in cells; a thousand of its cells were visited
+# [cells] side of the queried box. Vehicles visited about a thousand of its cells.
 SIDE = 320
 QUERIES = 15
 
@@ -41,9 +41,8 @@ def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     """
     synthetic.write_archive(root, WORLD)
     compact(root)
-    synthetic.write_archive(
-        root, SyntheticFleet(20_000, 1, seed=1)
-    )  # rows that are not compacted yet
+    # These rows are not compacted yet.
+    synthetic.write_archive(root, SyntheticFleet(20_000, 1, seed=1))
     with closing(Engine(ServiceConfig(), root)) as engine:
         before = _read_beliefs(engine)
     with closing(Engine(ServiceConfig(), root)) as engine:

@@ -20,15 +20,15 @@ from schemas.runtime.lanes import lanes_at, sum_lanes
 from schemas.runtime.records import LANES
 from tests.benchmarks.measure import ROUNDS
 
-CHAINS = 10  # independent sums: more than a core has multiply-adds under way
+CHAINS = 10  # independent sums; a core has fewer multiply-adds in flight
 TURNS = 1_000_000
-FUSED = 2  # operations of a multiply-add
+FUSED = 2  # a multiply-add counts as two operations
 WHEELS = 4
 AXLES = 2
 EXPONENTIAL = 33  # operations of `exp_lanes`: range reduction, polynomial, power of two
-CURVE = 6  # of an interpolation in a table
-DISTANCE = 10  # of the distance of a measurement row from the tyre curve
-INVERSE = 8 + CURVE  # of the slip at a force
+CURVE = 6  # operations of an interpolation in a table
+DISTANCE = 10  # operations of a measurement row's distance from the tyre curve
+INVERSE = 8 + CURVE  # operations of computing the slip that gives a force
 
 
 def measure_peak() -> float:

@@ -14,7 +14,7 @@ from edge_agent.estimators.paper_aco_fckf import STEP_S, Setting
 from schemas.numeric import FloatArray
 from tests.benchmarks.reference import move, predict_measurement
 
-PYTHON_STEPS = 300  # enough for a median: these are slow
+PYTHON_STEPS = 300  # these filters are slow; this number is enough for a median
 
 
 class Problem(NamedTuple):
@@ -22,10 +22,10 @@ class Problem(NamedTuple):
     the first reading [m/s], and time between readings [s].
     """
 
-    row: FloatArray  # (12,) of the vehicle
-    readings: FloatArray  # (T, 11)
-    gone: float  # [s] between samples
-    speed: float  # [m/s] at the first
+    row: FloatArray  # (12,) vehicle parameters
+    readings: FloatArray  # (T, 11) sensor readings
+    gone: float  # [s] time between readings
+    speed: float  # [m/s] speed at the first reading
 
     def start(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return mean (6,) and covariance (6, 6) of the initial state, covariance Q (6, 6) of the

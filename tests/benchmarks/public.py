@@ -21,7 +21,7 @@ from tests.fleet_service.examples import CELL, SECOND, START, observations, valu
 
 CELLS = 10_000
 LEAST = 3
-BATCH = 500  # visits of a turn
+BATCH = 500  # visits per pass
 _NOW = START + 10 * PERIOD_NS
 
 
@@ -32,7 +32,7 @@ def public() -> list[Figure]:
     """
     private, public = _Map(1), _Map(LEAST)
     seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))
-    # a turn each of warm-up and ROUNDS
+    # Each measurement has one warm-up pass and ROUNDS timed passes.
     followed, fused = (1e6 * s / CELLS for s in time_in_turn(public.drive, private.drive, ROUNDS))
     return [
         Figure("bench.public.read_us", seen, "us per cell of a tile that one vehicle visited"),

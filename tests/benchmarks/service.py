@@ -28,16 +28,16 @@ from schemas.wire import Batch, Kind
 from schemas.wire.tile import decode_tile
 
 RATE = 20_000  # observations/s of the load
-ROWS = 10  # of a message
+ROWS = 10  # observations in a message
 VEHICLES = 500
-# columns and lines of cells in the tile that the load visits; a query's box contains half of them
+# Columns and lines of cells that the load visits in the tile. A query's box contains half of them.
 COLUMNS = 40
 LINES = 50
 QUERIES = 200
 ALERTS = 60
 ACKS = 60
 IDLE_ACKS = 25
-APART = 4  # cells between two icy cells: more than the position error
+APART = 4  # distance of neighbouring icy cells, in cells; it is larger than the position error
 BARE = "gripmap-bare/tile"
 BARE_BOX = "gripmap-bare/box"
 LATITUDE = 57.7
@@ -249,8 +249,8 @@ def service() -> list[Figure]:
     answers queries). Return the figures.
     """
     tile = keys.map_key(_TILE)
-    # The first cell. The box goes from it over all columns and half of the lines. It is a little
-    # smaller, because a box contains its borders.
+    # Bounds of the first cell. The queried box begins there and covers all columns and half of the
+    # lines. It is slightly smaller than these cells, because a box includes its borders.
     west, south, east, north = (
         float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
     )
@@ -288,7 +288,7 @@ def service() -> list[Figure]:
             run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
         )
         poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
-        time.sleep(10.0)  # the window fills
+        time.sleep(10.0)  # wait until the window is full
         asked = (tile, f"{tile}?bbox={box}")
         for key, selector in zip((BARE, BARE_BOX), asked, strict=True):
             (folder / Path(key).name).write_bytes(fetch_reply(client, selector))

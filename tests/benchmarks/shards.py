@@ -36,9 +36,9 @@ from tests.faults.processes import Part
 from tests.waiting import matched
 
 ROWS: Final = 10
-BURST: Final = 4_000  # messages in each region
-TURN: Final = 512  # messages that an engine takes at once
-VEHICLES: Final = 100  # of each region
+BURST: Final = 4_000  # messages sent to each region
+TURN: Final = 512  # messages that an engine processes per pass
+VEHICLES: Final = 100  # vehicles in each region
 ROUNDS: Final = 3
 PATIENCE_S: Final = 120.0
 

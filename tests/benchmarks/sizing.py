@@ -28,10 +28,10 @@ from schemas.wire import Batch, Kind
 from tests.benchmarks.ingest import corner_of_region
 from tests.benchmarks.measure import read_resident_bytes
 
-VEHICLES: Final = {10_000: 8, 100_000: 3}  # and messages of each
-ROWS: Final = 10  # observations of a message
+VEHICLES: Final = {10_000: 8, 100_000: 3}  # messages per vehicle, by the number of vehicles
+ROWS: Final = 10  # observations in a message
 AREAS: Final = 10  # regions in which the vehicles drive
-LANES: Final = 1500  # roads of a region
+LANES: Final = 1500  # roads in a region
 TURN: Final = 512
 BAR: Final = 0.2
 

@@ -29,7 +29,8 @@ SEEDS: Final = (101, 102, 103, 104)
 WORLD: Final = SyntheticFleet(rows=40_000, days=1, vehicles=60, roads=8, length=60, icy=4, seed=101)
 ESTIMATOR: Final = "aco-fckf"
 DRIVE_S: Final = 120.0
-# of each drive: some ten seconds of work on one core, beside which Spark's own tenths are little
+# Copies of each drive. They give ten seconds of work on one core, so that Spark's overhead of some
+# tenths of a second matters little.
 COPIES: Final = 6
 ROUNDS: Final = 3
 
@@ -115,7 +116,8 @@ def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
 
 def _time_backfill(tasks: Sequence[Task], cores: int) -> float:
     with spark_sessions.spark_session(cores):
-        for _ in range(2):  # each worker starts and loads the kernels in the first
+        # In the first run each worker starts and loads the kernels; only the second counts.
+        for _ in range(2):
             began = time.perf_counter()
             outcomes = list(backfill_on_spark(tasks, ESTIMATOR))
             spent = time.perf_counter() - began

@@ -32,9 +32,9 @@ from tests.benchmarks.fusion import CELLS, START, fill_fusion
 from tests.benchmarks.ingest import make_messages
 from tests.faults.processes import Part
 
-SPAN_S: Final = 86_400.0  # in which every cell was visited three times
-TURN: Final = 100  # messages of ten
-SINCE: Final = 10_000  # messages after the last checkpoint: 100 000 observations
+SPAN_S: Final = 86_400.0  # time span in which every cell is visited three times
+TURN: Final = 100  # messages per pass; each has ten observations
+SINCE: Final = 10_000  # messages after the last checkpoint; they contain 100 000 observations
 RESTARTS: Final = 3
 SECOND: Final = 10**9
 
@@ -91,7 +91,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
                 saved.wait()
 
     worker = threading.Thread(target=ingest_parts)
-    for part in parts[:2]:  # warm
+    for part in parts[:2]:  # warm up
         engine.intake.ingest(part, now)
     worker.start()
     began = time.perf_counter()

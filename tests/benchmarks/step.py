@@ -26,9 +26,10 @@ from tests.benchmarks.peers import PEERS, PYTHON_STEPS, Problem
 
 NAME = "paper-aco-fckf"
 SAMPLES = 100_000
-CALLS = 1_000  # single ones, in a round
+CALLS = 1_000  # single calls in a round
 THREADS = 2
-AGREE = 1e-6  # largest accepted difference of C and Python in v_x, v_y and yaw rate over a drive
+# Largest accepted difference between C and Python in v_x, v_y and yaw rate over a drive.
+AGREE = 1e-6
 
 
 class Drive:
@@ -163,7 +164,7 @@ def bank() -> list[Figure]:
         t, signals, readings = drive.repeat_samples(samples, vehicles)
         fleet = [drive.vehicle] * vehicles
         ours, threaded = time_in_turn(
-            # called before the loop goes on
+            # The loop variables are safe: the function runs before the next iteration (B023).
             lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023
             lambda: make_limit(
                 Limit,

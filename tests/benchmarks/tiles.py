@@ -38,10 +38,12 @@ from tests.benchmarks.service import (
 )
 from tests.fleet_service.examples import batch
 
-RATE = 1500  # visits/s of all vehicles
+RATE = 1500  # visits per second of all vehicles
 VEHICLES = 1600
 ROW = 5
 TILES = VEHICLES * ROW
+# Tile that a vehicle visits at each step. Consecutive tiles are neighbours, because a car cannot
+# jump to another town.
 TURNS = (
     0,
     1,
@@ -51,13 +53,13 @@ TURNS = (
     3,
     2,
     1,
-)  # tiles of a vehicle: neighbours, because no car is in two towns at once
+)
 WARM_S = 8.0
 MEASURED_S = 20.0
 PATIENCE_S = 60.0
 READERS = 2
 QUESTIONS = 200
-_ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles of a region's side
+_ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles along a region's side
 _ROWS = _ACROSS // ROW
 
 
@@ -170,7 +172,7 @@ def read(endpoint: str) -> None:
     assert session is not None
     while True:
         replies = [reply for reply in session.get(f"{keys.ROOT}/map/**", timeout=60.0) if reply.ok]
-        if replies:  # a session that has just been opened may not know yet who answers
+        if replies:  # a new session may not know yet which services answer
             print(len(replies), flush=True)
 
 

@@ -15,10 +15,12 @@ from schemas.runtime.figures import Figure, markdown, write
 from tests.benchmarks.ahead import approaches, cost, entry, latency
 
 TITLE: Final = "ahead"
-SEEDS: Final = 20  # towns of a campaign whose targets count
-# 24 cars drive 0.2 km/s: 20 towns are 1 200 km, enough for a target of one in 1 000 km
+SEEDS: Final = 20  # towns that the compared targets are measured on
+# [s] length of a campaign. Its 24 cars together drive 0.2 km/s, so 20 towns give 1 200 km. This is
+# enough for a target of one false warning in 1 000 km.
 APPROACHES_S: Final = 300.0
-ENTRY_TOWNS: Final = 4  # towns for the map as a prior; there the estimator itself runs
+# Towns for the test of the map as a prior; it runs the estimator itself, which takes longer.
+ENTRY_TOWNS: Final = 4
 
 
 def measure_ahead(seeds: range, quick: bool) -> list[Figure]:

@@ -38,11 +38,14 @@ RATE_HZ: Final = 50.0
 AFTER_S: Final = 80.0  # time of the scenario by which all its events have happened
 SETTLE_S: Final = 10.0  # after this time all cars are moving
 NEW_M: Final = 60.0  # length of road without slippery places that must precede an approach
-ALERTED: Final = 0.3  # below this friction P(slippery) > 0.9 on such a map, and the service alerts
-NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
+# Below this friction the map states P(slippery) > 0.9, and the service raises an alert.
+ALERTED: Final = 0.3
+# Above SLIPPERY_MU, because a slippery stretch may begin in a cell that is only half ice.
+NEAR_SLIPPERY: Final = 0.45
 BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
-# with fewer, targets of 0.99 or of 1 in 1000 km could be met by chance
+# Least numbers of approaches and kilometres. With fewer, targets of 0.99 and of 1 in 1 000 km could
+# be met by chance.
 LEAST_CAME = 100
 LEAST_KM = 1000.0
 START_NS: Final = 1_800_000_000 * NS
@@ -59,7 +62,8 @@ class Approaches:
     raised: int = 0
     false: int = 0
     metres: float = 0.0
-    short: list[float] = field(default_factory=list)  # [m] too late
+    # [m] distance by which each warning came too late.
+    short: list[float] = field(default_factory=list)
 
 
 @dataclass
@@ -211,9 +215,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
         if look < SETTLE_S or not before.any() or (mu[before] < NEAR_SLIPPERY).any():
             continue
         counts.came += 1
-        start = float(
-            metre[look - 1]
-        )  # the ice begins after the look before, at the latest by this one
+        # The ice begins after the previous sample and at the latest at this one.
+        start = float(metre[look - 1])
         standing = (one.at for one in track.raised.values() if one.at < look < one.ended)
         late = min(
             (_stopping_shortfall(metre, speed, mu, at, start) for at in standing),
@@ -226,7 +229,7 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
     for one in track.raised.values():
         end = metre[one.at] + one.distance + one.length + 30.0
         ahead = (metre >= metre[one.at] - 10.0) & (metre <= end)
-        whole = metre[-1] >= end  # the drive lasted until here
+        whole = metre[-1] >= end  # the drive reached the end of the stretch
         counts.false += bool(whole and not (beside[ahead] < NEAR_SLIPPERY).any())
 
 

@@ -28,12 +28,12 @@ from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
 from tests.benchmarks.ahead.made_up_service import tile_payload
 
-DAY_KM: Final = 40.0  # of a car in Europe: 13 000 km a year on 325 days
-SPEED: Final = 9.0  # [m/s]
+DAY_KM: Final = 40.0  # daily distance of a car in Europe: 13 000 km a year on 325 days
+SPEED: Final = 9.0  # [m/s] speed of the simulated car
 BLOCK_M: Final = 100.0
-BLOCKS: Final = 40  # a side of the city
-STANDING: Final = 3  # alerts in each tile of 1.3 km, put again every two seconds
-ALERT_BYTES: Final = 190  # of one, with its key
+BLOCKS: Final = 40  # blocks along a side of the city
+STANDING: Final = 3  # alerts in each tile of 1.3 km; the service repeats them every two seconds
+ALERT_BYTES: Final = 190  # size of an alert with its key
 FRAME: Final = 40
 CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
 

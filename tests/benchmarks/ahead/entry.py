@@ -34,11 +34,12 @@ from tests.benchmarks.ahead.known_town import KnownPlaces, map_of_places, places
 RATE_HZ: Final = 100.0
 BLOCK: Final = 10
 FIRST_S: Final = 1.0
-ARRIVED: Final = 0.1  # as `arrival` in the evaluation
+# [mu] error at which an estimate has arrived, as in `edge_agent.lab.evaluation`.
+ARRIVED: Final = 0.1
 START_NS: Final = 1_800_000_000 * NS
 BEFORE_S: Final = 0.0  # time of the scenario before any event
 FAKE_ICE: Final = 0.15
-FAKE_M: Final = 22.0  # half of a fake stretch
+FAKE_M: Final = 22.0  # half the length of a fake stretch
 
 
 @dataclass
@@ -73,8 +74,8 @@ def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> l
         old_map = map_of_places(places_of(scenario, BEFORE_S), now, rng)
         fake_map = map_of_places(_with_fake_ice(scenario, seconds, rng), now, rng)
         errors.append(entry_errors(trace, true_map, now))
-        # where the old map says grip and there is ice; where the fake one says ice and there is
-        # grip
+        # "ice": places that are icy although the old map says grip. "dry": places with grip
+        # although the fake map says ice.
         for name, wrong in (("ice", old_map), ("dry", fake_map)):
             delays[name] += arrival_times(trace, wrong, true_map, now)
         nats = max(nats, published_change(fleet, trace, seconds))
@@ -137,7 +138,8 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
     alone = _median_friction(np.exp(trace.own))
     since = _since_entry(trace.place)
     first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
-    first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the drive's start is not an entry
+    # Leave out the start of the drive, which is not an entry.
+    first[: int(RATE_HZ / BLOCK * 5.0)] = False
     return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 
@@ -159,7 +161,7 @@ def arrival_times(
             np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8))
         )
         for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            if last - first < RATE_HZ / BLOCK:  # less than a second there
+            if last - first < RATE_HZ / BLOCK:  # the stretch lasts less than 1 s
                 continue
             pair = []
             for one in (with_prior, alone):

@@ -31,7 +31,7 @@ from schemas.wire.ahead import GripWarning
 from tests.benchmarks.ahead.made_up_service import MadeUpService
 
 VEHICLES: Final = 200
-APART_M: Final = 60.0  # roads, each further north than the previous one
+APART_M: Final = 60.0  # distance of neighbouring roads; each lies north of the previous one
 AHEAD_M: Final = 45.0
 SPEED: Final = 14.0
 PATIENCE_S: Final = 10.0
@@ -121,7 +121,7 @@ def measure_alerts(
         lookout.see(current_poses())
         lookout.start()
         stack.callback(lookout.close)
-        while lookout.counts.looks < 2 * vehicles:  # all have subscribed
+        while lookout.counts.looks < 2 * vehicles:  # wait until all have subscribed
             time.sleep(0.05)
             lookout.see(current_poses())
         time.sleep(SETTLE_S)

@@ -16,7 +16,7 @@ from tests.benchmarks.sumo import Sumo
 
 VEHICLES: Final = 300
 SECONDS: Final = 240
-ROUGH: Final = 0.5  # half of the vehicles are as real cars are
+ROUGH: Final = 0.5  # share of the vehicles whose sensors have the errors of real cars
 PREFIX: Final = "country.city"
 
 

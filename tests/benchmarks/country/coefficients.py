@@ -28,9 +28,9 @@ from tests.benchmarks.fusion import SECOND, START, make_visits
 from tests.benchmarks.ingest import make_messages
 from tests.benchmarks.measure import SEED, read_resident_bytes
 
-MANY: Final = 40_000  # messages of each part
+MANY: Final = 40_000  # messages in each measured part
 ROWS: Final = 10
-FEW: Final = 400  # vehicles
+FEW: Final = 400  # vehicles in the parts in which the number of vehicles must not matter
 REGIONS: Final = 10  # regions over which many cells are spread
 TURN: Final = 512
 
@@ -42,9 +42,9 @@ class Coefficients(NamedTuple):
 
     vehicle_bytes: float
     cell_bytes: float
-    pair_bytes: (
-        float  # of a vehicle and a cell's sector that it visited in the last three to four hours
-    )
+    # Memory of a pair: a vehicle and a cell's sector that it visited in the last three to four
+    # hours.
+    pair_bytes: float
 
 
 def measure_coefficients() -> Coefficients:

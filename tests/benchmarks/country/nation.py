@@ -31,12 +31,14 @@ from tests.benchmarks.country.sender import EVERY_S as SAYS_S
 from tests.faults.processes import Part
 from tests.faults.soak import fit_slope, memory_mb
 
-# by then all cells were visited, the window is full, and two checkpoints released their memory
+# The measurement begins after this time. By then all cells were visited, the window is full, and
+# two checkpoints have released their memory.
 WARM_S: Final = 660.0
 MEASURED_S: Final = 600.0
 EVERY_S: Final = 5.0
 MEMORY_S: Final = 0.25
-COMPACT_S: Final = 240.0  # happens twice in the ten minutes and once before
+# Compaction then runs once before the measured ten minutes and twice during them.
+COMPACT_S: Final = 240.0
 SERVICES: Final = ("west", "middle", "east")
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 
@@ -289,9 +291,8 @@ def _make_growth_figures(looks: Sequence[Look], coefficients: Coefficients) -> l
     the part due to new cells.
     """
     time_s = np.array([look.time for look in looks])
-    late = (time_s >= WARM_S) & (
-        time_s < WARM_S + MEASURED_S
-    )  # whole minutes: a line goes through the least of each
+    # Whole minutes: the fitted line goes through the minimum of each minute.
+    late = (time_s >= WARM_S) & (time_s < WARM_S + MEASURED_S)
     memory, cells = (
         np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells")
     )

@@ -13,7 +13,8 @@ from schemas.runtime.figures import Figure
 from tests.benchmarks.country.replayed import ROWS
 
 VEHICLES: Final = 1_000_000
-FACTOR: Final = 10  # vehicles, messages and cells, divided by those of the measured country
+# Ratio of this country's vehicles, messages and cells to those of the measured country.
+FACTOR: Final = 10
 USED: Final = 0.6  # largest share of a core, so that a service catches up after an outage
 DAY_S: Final = 86_400.0
 

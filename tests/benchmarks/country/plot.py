@@ -10,7 +10,7 @@ from matplotlib.figure import Figure as Canvas
 
 from tests.benchmarks.country.nation import SERVICES, WARM_S
 
-SPAN_S: Final = 10.0  # of a point
+SPAN_S: Final = 10.0  # time that a plotted point covers
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73")
 
 

@@ -28,16 +28,18 @@ from schemas.wire import Kind
 
 VEHICLES: Final = 100_000
 RATE: Final = 20_000.0  # observations/s
-ROWS: Final = 10  # of a batch
+ROWS: Final = 10  # observations in a batch
 PERIOD_S: Final = VEHICLES * ROWS / RATE
-ZONES: Final = (17, 17, 16)  # regions in each
-TOWNS: Final = ((2, 2), (9, 2), (2, 9), (9, 9))  # tiles from a region's corner
-ALIKE: Final = 8  # vehicles that share a drive in one town
-# batches per vehicle before it repeats them, so that later growth is not due to new places
+ZONES: Final = (17, 17, 16)  # regions in each zone
+# Position of the towns in a region, in tiles from its corner.
+TOWNS: Final = ((2, 2), (9, 2), (2, 9), (9, 9))
+ALIKE: Final = 8  # vehicles of a town that share one recorded drive
+# Batches that a vehicle sends before it repeats them. After the first round, growth of memory is
+# not due to new places.
 LOOP: Final = 3
-_TILES: Final = 1 << (grid.TILE_ZOOM - grid.REGION_ZOOM)  # of a region's side
-_REGIONS: Final = 1 << (grid.REGION_ZOOM - grid.ZONE_ZOOM)  # of a zone's side
-_CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # of a tile's side
+_TILES: Final = 1 << (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles along a region's side
+_REGIONS: Final = 1 << (grid.REGION_ZOOM - grid.ZONE_ZOOM)  # regions along a zone's side
+_CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # cells along a tile's side
 
 
 class Chunk(NamedTuple):

@@ -20,7 +20,7 @@ from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
 from tests.benchmarks.country.replayed import PERIOD_S, ROWS, Country
 
-EVERY_S: Final = 10.0  # between two lines
+EVERY_S: Final = 10.0  # time between two printed lines
 PATIENCE_S: Final = 30.0  # wait for the remaining acknowledgements
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
 
@@ -46,7 +46,7 @@ class Waits:
         """Return the number of batches sent, the number that still wait for their acknowledgement,
         and the 99 % quantile [s] of the waits that ended after `since`.
         """
-        # a copy: it is written meanwhile
+        # Zenoh's callback changes `acked` meanwhile, so a copy is used.
         put = self.put
         acked = self.acked.copy()
         now = time.monotonic()
@@ -84,7 +84,8 @@ def main() -> int:
     late = 0.0
     for number in range(int(asked.seconds * rate)):
         due = began + number / rate
-        if (ahead := due - time.monotonic()) > 0.002:  # a few at a time
+        # Shorter waits are skipped; then several batches are sent at once.
+        if (ahead := due - time.monotonic()) > 0.002:
             time.sleep(ahead)
         late = max(late, -ahead)
         turn, vehicle = divmod(number, asked.vehicles)

@@ -25,12 +25,12 @@ from schemas.runtime.figures import Figure
 from schemas.signals import WHEELS, S
 from tests.benchmarks.inputs.planted import RATE_HZ, drives
 
-# drives of each car; each drive continues on the road of the previous one
+# Drives of each car. Each drive continues on the road of the previous one.
 DRIVES = 10
 DRIVE_S = 60
 CARS_AT_ONCE: Final = 5
 JUDGED_S: Final = 120  # length of the following drive, which is evaluated
-SETTLED_S: Final = 10.0  # its first seconds, which are left out
+SETTLED_S: Final = 10.0  # first part of that drive, which is not evaluated
 ESTIMATOR: Final = "aco-fckf"
 
 
@@ -54,7 +54,7 @@ def true_errors(seed: int, car: int) -> dict[str, float]:
             f"{name}_lag": float(mounted[Misaligned.LAG + device] - mounted[Misaligned.LAG])
             for name, device in (("steer", 1), ("wheel", 2))
         },
-        # front and rear tyres of the simulated cars have one stiffness over load
+        # The simulated cars have the same cornering stiffness per load at both axles.
         "understeer": 0.0,
         "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _mass_radius_ratio(seed, car),
     }

@@ -27,9 +27,9 @@ from tests.benchmarks.inputs.formats import as_bag, as_csv, as_log, as_mf4
 from tests.benchmarks.inputs.peers import CHANNELS, DBC, STEP, profile_of
 from tests.benchmarks.inputs.planted import Recorded, drives
 
-MADE: Final = 200  # frames of each message
+MADE: Final = 200  # generated frames of each message
 MINUTE_FRAMES: Final = 99_000
-OTHERS: Final = 40  # identifiers on the bus that no profile reads
+OTHERS: Final = 40  # CAN identifiers on the bus that no profile reads
 TRIES: Final = 3
 DRIVE_S: Final = 30
 START_S: Final = 1_700_000_000
@@ -109,7 +109,7 @@ def on_a_bus(drive: Recorded) -> list[Any]:
     return frames
 
 
-# python-can has no types
+# python-can has no types.
 def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401
     stamp = round(START_S + t, 6)
     return import_optional("can").Message(

@@ -159,7 +159,8 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
                 break
     table = np.concatenate(parts)[:, [ALL.index(channel) for channel in CHANNELS]]
     if np.isfinite(table).all(axis=1).sum() < samples // 2:
-        return samples, samples  # received, but no row was built
+        # Messages were received, but no signal row was built: count all samples as missing.
+        return samples, samples
     missing = -(-(sent - heard) * samples // max(sent, 1))
     return max(missing, 0) + feeds[0].lost + rows.late, samples
 
@@ -201,7 +202,7 @@ def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
             "car-one",
         ]
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
-        if kind == "gpsd":  # positions beside a bus
+        if kind == "gpsd":  # gpsd sends only positions, so a CAN source is added
             words += ["--source", peer_addresses("can")[1]]
         command = [sys.executable, "-m", "edge_agent.cli"]
         agent = subprocess.Popen(
@@ -252,7 +253,7 @@ def _shows_silence(
             and troubles
             and silent == any(source in line for line in troubles)
         ):
-            return True  # its router is absent, so that it always reports a problem
+            return True  # the router is absent, so the agent always reports a problem
         time.sleep(0.1)
     return False
 

@@ -28,11 +28,11 @@ from schemas.signals import per_wheel
 from schemas.thresholds import NS
 from tests.benchmarks.inputs.databroker import Databroker
 
-# [m/s], [m]
+# Speed of the car [m/s] and radius of its wheels [m].
 SPEED = 15.0
 RADIUS = 0.3
 CHANNELS: Final = ("ax", "ay", "yaw_rate", "delta_fl", *per_wheel("omega"))
-STEP: Final = 1e-6  # of a number on the bus
+STEP: Final = 1e-6  # scale of a number on the bus: value per bit
 DBC: Final = "".join(
     f"BO_ {256 + k} M{k}: 8 X\n"
     + "".join(
@@ -135,7 +135,7 @@ def send_ros2(address: str, samples: int, rate: float) -> int:
             for topic, kind in (("car/imu", "Imu"), ("car/joints", "JointState"))
         ]
         report_ready()
-        # the stubs call a matching status a bool
+        # The stubs declare `matching` as a bool.
         while not all(
             publisher.matching_status.matching  # type: ignore[attr-defined]
             for publisher in put

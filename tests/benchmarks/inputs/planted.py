@@ -25,9 +25,10 @@ from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
 DRIVE_S: Final = 150
-LATE: Final = 40  # samples
-RATIO: Final = 16.0  # of the steering
-STATUS: Final = 512.0 / 3.6  # [m/s] that a status bit adds
+LATE: Final = 40  # [samples] delay of the delayed channels
+RATIO: Final = 16.0  # steering ratio: steering wheel angle over road wheel angle
+# [m/s] error of the wheel speed when a status bit is read as part of the value.
+STATUS: Final = 512.0 / 3.6
 OMEGA = list(range(S.OMEGA, S.OMEGA + 4))
 DELTA = list(range(S.DELTA, S.DELTA + 4))
 IMU = [S.AX, S.AY, S.YAW_RATE]
@@ -182,9 +183,9 @@ PLANTED: Final = {
     "compass for yaw": Planted(turn_yaw_clockwise, "yaw", "compass"),
     "yaw in deg": Planted(scale_columns([S.YAW], 1.0 / DEG), "yaw", "deg"),
 }
-RADII_ALIKE: Final = (
-    {"km/h", "radius", "mph", "kn"},
-)  # factors near one: no drive can distinguish a unit from another tyre
+# Errors with a factor close to one. A drive cannot distinguish such a wrong unit from another tyre
+# radius.
+RADII_ALIKE: Final = ({"km/h", "radius", "mph", "kn"},)
 
 
 def drives(

@@ -25,7 +25,7 @@ from tests.benchmarks.iov.denm import measure_denm
 from tests.benchmarks.iov.planner import measure_planner
 
 SEED: Final = 4201
-SLOWER: Final = 1.2  # share of the time of the quickest route
+SLOWER: Final = 1.2  # longest time of an accepted detour, relative to the quickest route
 
 
 def measure_routes(folder: Path, quick: bool) -> list[Figure]:
@@ -60,7 +60,8 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
     error_s = 0.0
     longer = list[float]()
     for _ in range(20 if quick else 60):
-        # A trip that ends at a crossing would have a last turn of no length in its shape.
+        # The ends lie in the middle of streets. A trip that ends at a crossing would have a last
+        # turn without length.
         ends = draw.choice(len(town.streets), 2, replace=False).tolist()
         trip = np.array([town.crossings[list(town.streets[k])].mean(axis=0) for k in ends])
         request = {"locations": [{"lat": a, "lon": b} for a, b in trip.tolist()], "costing": "auto"}

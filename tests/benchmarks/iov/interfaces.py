@@ -35,14 +35,13 @@ from tests.benchmarks.iov.routes import unpack_wheel
 from tests.waiting import until
 
 START: Final = 1_700_000_000 * NS
-# friction as own vehicles report it: one that slid on ice, one that braked on a dry road, and one
-# that used little grip
+# Friction reports of three vehicles: one slid on ice, one braked on a dry road, and one used little
+# grip.
 SLID: Final = {"mu": 0.2, "mu_lower": 0.12, "mu_upper": 0.28, "mu_utilised": 0.19}
 DRY: Final = {"mu": 0.8, "mu_lower": 0.7, "mu_upper": 0.9, "mu_utilised": 0.7}
 PASSED: Final = {"mu": 0.5, "mu_lower": 0.1, "mu_upper": 1.1, "mu_utilised": 0.1}
-KUKSA: Final = (
-    "0.6.0"  # version of kuksa-client, whose generated modules are the published protocol
-)
+# Version of kuksa-client whose generated modules define the published protocol.
+KUKSA: Final = "0.6.0"
 
 
 def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
@@ -168,7 +167,7 @@ def measure_kuksa(folder: Path, quick: bool) -> list[Figure]:
     return [Figure("kuksa.written", right / (4 * count), "of the values", 1.0, "more")]
 
 
-def _number(point: Any) -> float | None:  # noqa: ANN401 modules of the wheel have no types
+def _number(point: Any) -> float | None:  # noqa: ANN401 the wheel's modules have no types
     return float(point.value.float) if point.HasField("value") else None
 
 

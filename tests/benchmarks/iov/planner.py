@@ -19,9 +19,9 @@ from schemas.thresholds import GRAVITY, NS, REACTION_S
 
 SEED: Final = 4203
 STEP_S: Final = 0.1
-DELAY_S: Final = 0.3  # of the planner
-SPREAD: Final = 0.03  # standard deviation of the map's error of mu on ice
-STRAIGHT: Final = 1000  # [m] of road
+DELAY_S: Final = 0.3  # reaction delay of the planner
+SPREAD: Final = 0.03  # standard deviation of the error of the map's friction on ice
+STRAIGHT: Final = 1000  # [m] length of the straight road
 
 
 def measure_planner(_folder: Path, quick: bool) -> list[Figure]:

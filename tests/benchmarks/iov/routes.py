@@ -25,12 +25,12 @@ from schemas.numeric import FloatArray
 from schemas.thresholds import METRES_PER_DEGREE
 
 VERSION: Final = "3.9.1"
-STREETS: Final = 14  # in each direction
+STREETS: Final = 14  # streets in each direction
 APART_M: Final = 150.0
 ORIGIN: Final = (57.70, 11.95)
-ICY_SHARE: Final = 0.08  # share of the links between two crossings
+ICY_SHARE: Final = 0.08  # share of icy links; a link joins two crossings
 EDGE: Final = "edge_walk"
-NO_PATH: Final = 442  # error code of an answer without a route
+NO_PATH: Final = 442  # Valhalla's error code when there is no route
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def icy_map(town: StreetTown, icy: Sequence[tuple[int, int]]) -> pa.Table:
         line = town.line(street)
         for road in (line, routing.RoadLine(line.latitude[::-1], line.longitude[::-1])):
             latitude, longitude, yaw = routing._sample_road(road)
-            inner = slice(4, -4)  # crossings belong to several streets
+            inner = slice(4, -4)  # leave out the ends: crossings belong to several streets
             for cell, sector in zip(
                 grid.cell_of(latitude[inner], longitude[inner]).tolist(),
                 grid.sector_of(yaw[inner]).tolist(),
