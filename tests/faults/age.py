@@ -37,10 +37,10 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 
 DAYS: Final = 6
-SINCE: Final = 20_000  # observations after the checkpoint
+SINCE: Final = 20_000  # observations after the last checkpoint
 SEGMENT: Final = 20_000
-OWN: Final = ("processor_s", "mb")  # what a start costs by itself
-# a quarter of a road
+OWN: Final = ("processor_s", "mb")  # cost of a start itself: processor time and memory
+# Box around a quarter of a road.
 NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"
 
 
@@ -66,7 +66,7 @@ def run(site: Site) -> list[Figure]:
         _last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2))
     )
     tries = [(_measure_process("ready", young), _measure_process("ready", old)) for _ in range(2)]
-    # the minimum of two runs, because other work on the machine only adds time
+    # The minimum of two runs counts, because other load on the machine only adds time.
     alone, aged = (
         {name: min(one[name] for one in side) for name in OWN} for side in zip(*tries, strict=True)
     )

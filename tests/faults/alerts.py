@@ -32,9 +32,9 @@ from tests.waiting import until
 
 SOON_S: Final = 5.0
 WITNESSES: Final = 3
-APART: Final = 4e-4  # degrees, over two cells
+APART: Final = 4e-4  # [deg] distance of two places: more than two cells
 NS: Final = 10**9
-Place = tuple[int, int]  # cell and sector
+Place = tuple[int, int]  # cell and heading sector
 
 
 def run(site: Site) -> list[Figure]:

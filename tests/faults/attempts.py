@@ -234,7 +234,7 @@ def declared_publisher_on_another_key(ground: Ground) -> bool:
 @register_attempt
 def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     session = ground.open_session(ROGUE, ROUTERS[1])
-    ground.await_judgement()  # otherwise refusals of earlier attacks would count for this one
+    ground.await_judgement()  # otherwise refusals of an earlier attack would count for this one
     before = ground.admitted_count
     refused = ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
@@ -344,7 +344,7 @@ def foreign_liveliness_token(ground: Ground) -> bool:
         replies = ground.monitor.session.liveliness().get(f"{keys.ROOT}/**")
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
 
-    until(lambda: keys.alive_key(ROGUE) in list_tokens())  # its own comes last
+    until(lambda: keys.alive_key(ROGUE) in list_tokens())  # the rogue's own token arrives last
     through = list_tokens()
     for token in tokens:
         token.undeclare()
@@ -387,7 +387,7 @@ def as_router(ground: Ground, mode: str) -> bool:
         print("look", file=process.stdin, flush=True)
         heard = json.loads(process.stdout.readline())
     ground.await_effects(ground.honest.session)
-    own = set(told["put"])  # what it puts itself, it hears
+    own = set(told["put"])  # a client also receives its own messages
     overheard = [
         name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own
     ]

@@ -28,7 +28,7 @@ from tests.faults.frame import Site
 from tests.faults.processes import Part, open_stage
 from tests.faults.queries import _await_tile, _fill_map, _find_tile
 
-PATIENCE_S: Final = 10.0  # of a person
+PATIENCE_S: Final = 10.0  # longest wait of a human user
 ATTACKER: Final = "127.0.0.66"
 CONNECTIONS: Final = 1024
 HALF: Final = b"GET / HTTP/1.1\r\nHost: 127"

@@ -34,8 +34,8 @@ STEP_S: Final = 0.5
 NS: Final = 10**9
 PLACE: Final = (57.0, 12.0)
 CELL_DEG: Final = 360.0 / 2**grid.CELL_ZOOM
-TAKEN_PER_S: Final = 20.0  # batches per car that a service of a thousand cars accepts
-QUEUED: Final = 20.0  # places per car in its queue
+TAKEN_PER_S: Final = 20.0  # [1/s] batches per car that a service of 1 000 cars processes
+QUEUED: Final = 20.0  # places per car in the service's input queue
 
 
 @dataclass
@@ -161,7 +161,8 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
     left = sum(len(outbox.held) for outbox in outboxes)
     for outbox in outboxes:
         outbox.close()
-    begun = next((at for at, n in enumerate(taken) if n > cars), 0)  # the first cars have noticed
+    # From now on vehicles have noticed that the service is back.
+    begun = next((at for at, n in enumerate(taken) if n > cars), 0)
     drain = sum(taken[begun:]) / max(len(taken) - begun, 1) / (TAKEN_PER_S * STEP_S * cars)
     site.say(
         f"{backlog} batches waited; {while_away} messages while away; drained in "

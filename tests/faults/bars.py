@@ -102,9 +102,7 @@ BARS: Final = {
     "faults.history.acknowledged": Bar("batches", 2000, "more"),
     "faults.fuzz_parsers.crashes": Bar("inputs that raise what is not documented", 0),
     "faults.fuzz_parsers.hangs": Bar("inputs that take more than five seconds", 0),
-    "faults.fuzz_parsers.executions": Bar(
-        "executions", 5000, "more"
-    ),  # ten million in the full form
+    "faults.fuzz_parsers.executions": Bar("executions", 5000, "more"),  # ten million in a full run
     "faults.fuzz_parsers.lines": Bar("pairs of lines that ran one after the other", 200, "more"),
     "faults.path.implausible_accepted": Bar(
         "reports of places that their car cannot have reached", 0
@@ -160,7 +158,7 @@ BARS: Final = {
     "cluster.takeover_s.freeze": Bar("s to the next acknowledgement, the longest", 12),
     "cluster.failovers": Bar(
         "failovers", 95, "more"
-    ),  # of a hundred; a frozen one may wake in time
+    ),  # of a hundred attempts; a frozen service may resume in time
     "cluster.failovers.kill": Bar("killed", 5, "more"),
     "cluster.failovers.freeze": Bar("frozen for good", 5, "more"),
     "cluster.failovers.bucket": Bar("cut from the bucket", 5, "more"),

@@ -42,14 +42,15 @@ KINDS: Final = {
     "roll-up": "rollup/*/*/*/*.parquet",
     "map": "map/*/*.parquet",
 }
-BATCHES: Final = 40  # of a spool
+BATCHES: Final = 40  # batches in the agent's stored backlog
 
 
 def run(site: Site) -> list[Figure]:
     """Change random bits in each kind of file, count errors that were not detected, and return the
     figures.
     """
-    logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
+    # Each damaged file causes a log line.
+    logging.getLogger("fleet_service").setLevel(logging.ERROR)
     logging.getLogger("edge_agent").setLevel(logging.ERROR)
     random_ = random.Random(site.seed)
     each = site.choose_amount(40, 1)
@@ -70,11 +71,11 @@ def run(site: Site) -> list[Figure]:
             try:
                 found = _reload_service(copy, whole)
             except InputError:
-                if (
-                    kind != "key"
-                ):  # without its key an archive is another one: only a person can decide
+                # Without its key an archive looks like another archive, and only an operator can
+                # decide.
+                if kind != "key":
                     loops.append(f"{kind}: {path.name} bit {bit}")
-            # whatever ends a service at its start ends it at each
+            # Any exception at a start repeats at each start, so it counts as a restart loop.
             except Exception as error:  # noqa: BLE001
                 loops.append(f"{kind}: {path.name} bit {bit}: {error!r}")
             else:

@@ -267,10 +267,10 @@ CAMPAIGNS: Final = (
             *("faults.handover.lost", "faults.handover.doubled", "faults.handover.pause_s"),
             *("faults.handover.handovers", "faults.handover.acknowledged"),
         ),
-        in_quick=False,  # a hand-over takes seconds
+        in_quick=False,  # each hand-over takes several seconds
     ),
-    Campaign(
-        "link", link.measure, link.OWES, in_quick=False
-    ),  # needs root, and a minute for each transport
-    Campaign("soak", soak.run, soak.OWES, in_quick=False),  # what grows shows only in half an hour
+    # This campaign needs root, and a minute for each transport.
+    Campaign("link", link.measure, link.OWES, in_quick=False),
+    # Memory growth shows only after half an hour.
+    Campaign("soak", soak.run, soak.OWES, in_quick=False),
 )

@@ -79,7 +79,7 @@ def read_journals(journals: Iterable[Path]) -> Told:
     for journal in journals:
         for line in journal.read_text().splitlines():
             if line[:2] not in ("+ ", "- "):
-                continue  # something else that the generator said
+                continue  # other output of the load generator
             sign, vehicle, boot, _, region, seq, records, at = line.split()
             name = (vehicle, int(boot), int(region), int(seq))
             if sign == "+":

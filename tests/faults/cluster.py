@@ -47,16 +47,16 @@ from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
 from tests.standbys import open_hosts, restore_archive
 from tests.waiting import until
 
-FULL: Final = 100  # failovers
+FULL: Final = 100  # failovers in a full run
 LEASE_S: Final = ServiceConfig().lease_s
-# 300 observations/s
+# Load: 300 observations/s in all.
 PROCESSES = 2
 VEHICLES = 6
 RATE = 25.0
 EVERY: Final = 8  # failovers per group; a hand-over follows in the middle and at the end of a group
 HOLD_S: Final = (1.0, 5.0)  # undisturbed time between two failovers
-# Often, so that the few seconds in which a service lives have some of each; a snapshot costs a
-# second.
+# These jobs run often, so that each happens in the few seconds for which a service lives. A
+# snapshot costs a second.
 PERIODS: Final[dict[str, object]] = {
     "compact_s": 5.0,
     "checkpoint_s": 4.0,

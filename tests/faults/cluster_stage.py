@@ -39,11 +39,14 @@ from tests.faults.processes import Part
 from tests.standbys import Host
 from tests.waiting import until
 
-WORLD: Final = SyntheticFleet(300_000, days=1, roads=300)  # 107 000 cells, visited in the last day
+# 107 000 cells that were visited in the last day.
+WORLD: Final = SyntheticFleet(300_000, days=1, roads=300)
 SIDE: Final = 0.01  # [deg] side of the queried box
-FROZEN: Final = (0.5, 1.3)  # freeze, in lease times; a successor takes over after 0.6 to 1
-AMID_S: Final = 0.3  # latest kill after the begin of a compaction or an upload
-WOKE: Final = 3.0  # in lease times; without a takeover by then, it resumed in time
+# Length of a freeze in lease times; another service takes over after 0.6 to 1.
+FROZEN: Final = (0.5, 1.3)
+AMID_S: Final = 0.3  # latest time of a kill after a compaction or an upload has begun
+# In lease times: if no takeover happened by then, the frozen service resumed in time.
+WOKE: Final = 3.0
 SETTLED_S: Final = 2.0  # after this time all sent rows are in a segment
 PATIENCE_S: Final = 600.0  # long, so that a slow takeover is measured and not an error
 

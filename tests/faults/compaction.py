@@ -30,10 +30,11 @@ from tests.faults.crash_model import ROWS, Batch, rows_of
 from tests.faults.frame import Site
 from tests.faults.processes import Part
 
-BATCHES: Final = 50  # to a segment
-PAUSE_S: Final = 0.05  # between two segments
+BATCHES: Final = 50  # batches in a segment
+PAUSE_S: Final = 0.05  # pause between two segments
 ROUND_ROWS: Final = 1000
-UNTIL_KILL_S: Final = (0.0, 0.6)  # time from its start; a round takes a tenth of a second
+# Range of the time until the kill; one round of compaction takes 0.1 s.
+UNTIL_KILL_S: Final = (0.0, 0.6)
 
 
 class Writing:

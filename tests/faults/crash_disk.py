@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
-FOLDER = -1  # instead of the number of a file
+FOLDER = -1  # marks a folder, in place of the number of a file
 
 
 class PowerLoss(BaseException):
@@ -48,12 +48,12 @@ class CrashDisk:
         self._power = power
         self._full = full
         self.operations = 0
-        self._number: dict[
-            int, int
-        ] = {}  # number of each present file by inode; inodes are reused, numbers are not
+        # Number of each existing file by its inode. Inode numbers are reused, these numbers are
+        # not.
+        self._number: dict[int, int] = {}
         self._numbers = 0
         self._synced: dict[int, bytes] = {}
-        self._written: dict[int, bytes] = {}  # content of files without a name
+        self._written: dict[int, bytes] = {}  # content of files that no folder entry names
         self._names: dict[str, dict[str, int]] = {}
         self._later: dict[str, list[tuple[str, int | None]]] = defaultdict(list)
         for folder, folders, files in os.walk(live):
@@ -173,7 +173,7 @@ class CrashDisk:
             if self._is_ours(path):
                 self._count_operation(needs_room=True)
                 real(path, *more, **named)
-                self._names.pop(str(path), None)  # of one that had this name before
+                self._names.pop(str(path), None)  # entries of a removed folder of the same name
                 self._later.pop(str(path), None)
                 self._record_change(path, FOLDER)
             else:
@@ -197,7 +197,7 @@ class CrashDisk:
         disk = self
 
         class Raw(io.FileIO):
-            # only bytes are written
+            # The code under test writes only bytes.
             def write(self, data: bytes) -> int:  # type: ignore[override]
                 disk._count_operation(needs_room=True)
                 return super().write(data)
@@ -236,7 +236,8 @@ class CrashDisk:
             if name not in dropped and self._random.random() < 0.5:
                 _apply_change(names, name, number)
             else:
-                dropped.add(name)  # a later change of the same name cannot overtake this one
+                # Later changes of the same name must not be applied before this one.
+                dropped.add(name)
         for name, number in names.items():
             if number == FOLDER:
                 self._write_folder_image(f"{folder}/{name}", target / name, written)

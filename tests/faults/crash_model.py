@@ -46,7 +46,7 @@ from tests.faults.frame import Site
 
 VEHICLE: Final = 7
 STEPS: Final = 7
-ROWS: Final = 2  # of a batch: in two zones, so that compaction has partitions to get wrong
+ROWS: Final = 2  # rows of a batch. They lie in two zones, so that compaction writes two partitions.
 START: Final = 1_728_000_000_000_000_000
 CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
 
@@ -251,8 +251,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _silence_logs() -> None:
+    # These modules log damaged files and unusable checkpoints, which occur in every history.
     for module in (
         load,
         restart,
-    ):  # torn files are set aside, and checkpoints not begun from, all the time
+    ):
         logging.getLogger(module.__name__).setLevel(logging.ERROR)

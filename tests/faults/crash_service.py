@@ -53,10 +53,11 @@ START: Final = 1_698_500_000 * SECOND  # 2023-10-28: months end within the histo
 AWAY_DAYS: Final = 14  # longest time between two lives
 VEHICLES: Final = ("car-a", "car-b", "car-c")
 PLACES: Final = 4  # cells that the vehicles visit
-NORTH: Final = 0.0003  # [deg] from one cell to the next
+NORTH: Final = 0.0003  # [deg] distance in latitude between two places
 CONFIG: Final = ServiceConfig(name="shard")
-SAME: Final = 1e-6  # largest difference in the probability of a bin
-NEARLY: Final = 0.01  # the same, for a cell that was dropped after an idle week and visited again
+SAME: Final = 1e-6  # largest accepted difference in the probability of a bin of the map's friction
+# The same, for a cell that was dropped after an idle week and then visited again.
+NEARLY: Final = 0.01
 
 
 class Sent(NamedTuple):
@@ -94,12 +95,11 @@ class ServiceHistory(Lives[Sent]):
     def __init__(self, number_: int, folder: Path) -> None:
         super().__init__(number_, folder)
         self.sent: list[Sent] = []
-        self.weather: set[int] = set()  # times of reports that acted
-        self.forgetting: set[tuple[str, str]] = (
-            set()
-        )  # month, and vehicle or "", whose erasure began
+        self.weather: set[int] = set()  # times of the weather reports that had an effect
+        # (month, vehicle) of each erasure that has begun; vehicle is "" for a whole month.
+        self.forgetting: set[tuple[str, str]] = set()
         self.gone: set[Sent] = set()  # batches whose rows were erased
-        self.destroyed: set[bytes] = set()  # keys
+        self.destroyed: set[bytes] = set()  # destroyed keys of months
         self._nobodys: set[Sent] = set()  # batches whose rows can no longer be identified
         self.retired = -1  # last day whose rows may have been removed
         self.done: Counter[str] = Counter()
@@ -160,7 +160,7 @@ class ServiceHistory(Lives[Sent]):
             "retention": 1,
         }
         job = self.random.choices([*jobs], [*jobs.values()])[0]
-        with suppress(OSError):  # upkeep counts it and goes on
+        with suppress(OSError):  # the background jobs count this error and continue
             if job == "batches":
                 new = [self._make_batch() for _ in range(self.random.randint(1, 3))]
                 self._ingest_batches(
@@ -174,7 +174,8 @@ class ServiceHistory(Lives[Sent]):
             elif job == "retention":
                 self._apply_retention(root)
             else:
-                self._flush_acks(engine)  # what upkeep wants is done right after a segment
+                # The background jobs run right after a segment was written.
+                self._flush_acks(engine)
                 if job == "checkpoint":
                     self._write_checkpoint(engine, root)
             self.done[job] += 1
@@ -324,7 +325,8 @@ class ServiceHistory(Lives[Sent]):
         pseudonyms = Pseudonyms(root / "keys")
         for one in self.sent:
             if (one.month, "") in self.forgetting or not self._may_come(one):
-                continue  # nobody can tell, and it is not let in; or it is too old
+                # Rows of an erased month cannot be identified; too old batches are refused.
+                continue
             if not (root / "keys" / f"{one.month}.key").exists():
                 if rows[one.time]:
                     found.append(f"{one.vehicle} {one.seq} is there, its key is lost")
@@ -362,8 +364,7 @@ def _find_differences(begun: ServiceState, whole: ServiceState, now: int) -> lis
     if (there < 0).any():
         return [f"{int((there < 0).sum())} cells are not in the checkpoint's map"]
     apart = np.abs(begun.fusion.beliefs(there, now) - whole.fusion.beliefs(slots, now)).max(axis=1)
-    anew = (
-        begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
-    )  # dropped meanwhile, when it was at rest
+    # The cell was at rest and dropped, and has been visited again since.
+    anew = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
     wrong = apart > np.where(anew, NEARLY, SAME)
     return [f"the maps differ by {apart[wrong].max():.2g}"] if wrong.any() else []

@@ -46,7 +46,7 @@ from tests.outboxes import read_batches
 SIZE_MB: Final = 24
 VEHICLES: Final = 5
 CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
-RESERVE_MB: Final = 2  # the same share of this small disk as 64 MB of a real one
+RESERVE_MB: Final = 2  # [MB] the same share of this small disk as 64 MB of a real one
 RUNS: Final = ("compaction_runs", "checkpoint_runs")
 STUCK_S: Final = 60.0
 
@@ -132,7 +132,8 @@ def run(site: Site) -> list[Figure]:
                     with fill_disk(site.folder / "disk", mounted):
                         acknowledged += _drive(engine, seq, 6)
                         seq += 6
-                        # A job that removes files meanwhile makes room for a later segment.
+                        # A job may remove files meanwhile, so that a later segment finds room and
+                        # is written.
                         refused += engine.counts["segment_failures"] > failures
                         false += acknowledged > _count_rows(root)
                     acknowledged += _until_settled(engine)
@@ -174,7 +175,7 @@ def _drive(engine: Engine, since: int, steps: int) -> int:
                 [Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now
             )
         got += _count_acked(engine.settlement.flush())
-        threading.Event().wait(0.2)  # for the jobs
+        threading.Event().wait(0.2)  # time for the background jobs
     return got
 
 
@@ -241,7 +242,7 @@ def _outbox_recovers(folder: Path, mounted: bool) -> bool:
         with fill_disk(folder, mounted):
             try:
                 took += len(outbox.store([draft] * 50, 0.0))
-            except Exception:  # noqa: BLE001 sqlite's own
+            except Exception:  # noqa: BLE001 sqlite raises errors of its own
                 refused = True
     took += len(outbox.store([draft], 0.0))
     whole = len(read_batches(outbox)) == took and (refused or not mounted)

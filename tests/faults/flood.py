@@ -40,9 +40,9 @@ HONEST: Final = tuple(f"car-{number:03}" for number in range(10))
 FLOODER: Final = "flood-001"
 CELLS: Final = 20
 FLOODED_MU: Final = 0.8
-EVERY_S: Final = 0.5  # of each honest vehicle
-RESEND_S: Final = 2.0  # as an outbox does
-START_S: Final = 300.0  # the first start compiles the kernels
+EVERY_S: Final = 0.5  # time between two messages of an honest vehicle
+RESEND_S: Final = 2.0  # time after which an unacknowledged message is sent again, as in an outbox
+START_S: Final = 300.0  # patience for the first start, which compiles the kernels
 _ASKED: Final = "gripmap/v1/map/**"
 
 
@@ -79,7 +79,8 @@ class Honest:
     resent: int = 0
 
     def __post_init__(self) -> None:
-        self._last: dict[int, float] = {}  # when each unsettled one was put last [s]
+        # [s] time of the last transmission of each unacknowledged batch.
+        self._last: dict[int, float] = {}
         self._acks = self.session.declare_subscriber(keys.ack_key(self.name), self._record_ack)
 
     def _record_ack(self, sample: zenoh.Sample) -> None:

@@ -21,7 +21,8 @@ from schemas.runtime.zenoh_session import configuration
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch, key
 
-ROWS = (1, 1, 1, 50)  # small messages cost most per byte, large ones most in total
+# Records per message: small messages cost most per byte, large ones most in total.
+ROWS = (1, 1, 1, 50)
 
 
 def main() -> None:
@@ -62,7 +63,7 @@ def main() -> None:
         message.enter_time[:] = [now - SECOND] * len(message.leave_time)
         session.put(place, message.SerializeToString(), encoding=encoding, congestion_control=block)
     print(sent, flush=True)
-    os._exit(0)  # a session that is still being read out would hold the process
+    os._exit(0)  # a session whose messages are still being read would delay the end of the process
 
 
 if __name__ == "__main__":

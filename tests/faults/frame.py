@@ -29,7 +29,7 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.process import force_exit
 from tests.faults.bars import make_figure
 
-RAISED: Final = 2  # exit code; 1: a bar does not hold
+RAISED: Final = 2  # exit code after an exception; 1 means that a target was missed
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def run_and_exit(run: Callable[[], int]) -> NoReturn:
     """
     try:
         code = run()
-    except Exception:  # noqa: BLE001 whatever it is, it is told and ends the run
+    except Exception:  # noqa: BLE001 any exception is printed and ends the run
         traceback.print_exc()
         for children in Path("/proc/self/task").glob("*/children"):
             for child in children.read_text().split():

@@ -34,7 +34,7 @@ from tests.fleet_service.examples import SECOND, batch, key
 
 TURN: Final = 500  # malformed messages per pass of the service's main loop
 HONEST: Final = ("honest-0", "honest-1", "honest-2")
-ASKED_EVERY: Final = 10  # a query for so many messages
+ASKED_EVERY: Final = 10  # one query for each so many messages
 # Possible values by column of the archive: limits that hold for every car on every road.
 POSSIBLE: Final = {
     "latitude": (-85.06, 85.06),
@@ -87,7 +87,7 @@ def run(site: Site) -> list[Figure]:
     answers = 0
     mutants = Mutants(site.seed, began)
     engine = Engine(ServiceConfig(), site.folder / "archive")
-    # that are rebuilt: each takes a process and a second
+    # Number of historical maps to compute. Each takes a process and a second.
     honest = 0
     pasts = site.choose_amount(50, 3)
     for turn in range(count // TURN):
@@ -149,7 +149,7 @@ def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> 
             wire.decode_ack(ack)
         changed_tiles(engine.queries, now)
         engine.alerts.expire(now)
-    except Exception:  # noqa: BLE001 whatever it is, it is a crash
+    except Exception:  # noqa: BLE001 any exception counts as a crash
         site.say(traceback.format_exc())
         return 1
     return 0

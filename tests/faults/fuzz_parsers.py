@@ -16,7 +16,7 @@ from tests.faults.frame import Site
 from tests.fuzz import PARSERS, Fuzzer, Result, make_keeper, seeds_of
 
 EXECUTIONS: Final = 10_000_000
-QUICK: Final = 400  # for each parser
+QUICK: Final = 400  # executions per parser in a quick run
 ROUND_S: Final = 15.0
 LONGEST_S: Final = 7200.0
 

@@ -31,9 +31,9 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION
 
 TURN: Final = 200  # malformed messages between two queries
 HONEST: Final = tuple(f"sim-{number:03}" for number in range(10))
-RATE: Final = 5.0  # observations/s of each
-# Malformed messages are sent until this many batches of honest vehicles are acknowledged meanwhile;
-# a fast machine sends a quick run's messages before that.
+RATE: Final = 5.0  # observations/s of each honest vehicle
+# Malformed messages are sent until at least this many batches of honest vehicles have been
+# acknowledged. A fast machine would otherwise end a quick run earlier.
 HONEST_LEAST: Final = 10
 HONEST_S: Final = 60.0
 DRAIN_S: Final = 60.0

@@ -28,7 +28,7 @@ from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, settings
 from tests.waiting import matched, until
 
 HONEST, ROGUE = VEHICLES
-RESEND_S = 0.5  # after a restart of the routers
+RESEND_S = 0.5  # [s] time until a message is sent again after a restart of the routers
 MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 
@@ -161,7 +161,8 @@ def open_ground(network: Network) -> Iterator[Ground]:
         until(lambda: any(line.startswith("ready") for line in lines))
         with ExitStack() as stack:
             found = Ground(network, service, stack)
-            # only a service learns who answers queries; the path over the second router is longer
+            # Wait until the second router knows that the service answers queries. Its path is the
+            # longer one, and only a session with the service's rights learns this.
             querier = found.open_session(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
             matched(querier)
             querier.undeclare()

@@ -28,7 +28,7 @@ from tests.faults.frame import Site
 from tests.standbys import open_hosts, restore_archive
 from tests.waiting import until
 
-# 1 000 observations/s
+# Load: 1 000 observations/s in all.
 PROCESSES: Final = 2
 VEHICLES: Final = 10
 RATE: Final = 50.0

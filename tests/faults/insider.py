@@ -34,7 +34,7 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch
 
 CAR: Final = "car-666"
 HONEST: Final = tuple(f"car-{k:03}" for k in range(10))
-ICE: Final = (LATITUDE + 0.01, LONGITUDE + 0.01)  # a road that nobody else drives
+ICE: Final = (LATITUDE + 0.01, LONGITUDE + 0.01)  # a road that no other vehicle drives on
 MONTH_NS: Final = 29 * 86_400 * NS
 WARM_S: Final = 60  # after this time the sizes of pools and windows are constant
 
@@ -67,7 +67,7 @@ def run(site: Site) -> list[Figure]:
     )
     with closing(Engine(config, site.folder / "archive")) as engine:
         warm = 0.0
-        for first in range(6):  # what is compiled at first use is no harm that it does
+        for first in range(6):  # warm up: compilation at first use is not damage by the attacker
             engine.intake.ingest([_make_attack(first, 0, start - NS, random_)], start - NS)
         for second in range(seconds):
             at = float(second)
@@ -119,23 +119,23 @@ def _make_attack(number: int, second: int, now: int, random_: np.random.Generato
     what = number % 6
     if what == 0:  # places all over the region
         return _make_message(_make_scattered(seq, now, random_, 0.05))
-    if what == 1:  # ... and over the world
+    if what == 1:  # places all over the world
         return _make_message(_make_scattered(seq, now, random_, 60.0))
-    if what == 2:  # a stream for each batch
+    if what == 2:  # a new stream for each batch
         return _make_message(
             replace(_make_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62)))
         )
-    if what == 3:  # text, which is dear to read
+    if what == 3:  # JSON text, which is expensive to parse
         one = _make_scattered(seq, now, random_, 0.001)
         return _make_text_message(one)
-    if what == 4:  # a foot in another month, on its own ice
+    if what == 4:  # one row in an earlier month and one now, on the ice that it reports alone
         old = now - MONTH_NS
         one = _make_ice(seq, now, 2)
         leave = np.array([old, now])
         return _make_message(
             replace(one, columns=one.columns | {"leave_time": leave, "enter_time": leave - NS})
         )
-    return _make_message(_make_ice(seq, now, 1))  # and its own report, again and again
+    return _make_message(_make_ice(seq, now, 1))  # the same report of ice again and again
 
 
 def _make_ice(seq: int, now: int, rows: int) -> Batch:

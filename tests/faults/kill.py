@@ -36,29 +36,31 @@ from tests.faults.frame import Site
 from tests.faults.processes import Part, Stage, open_stage
 
 AGENTS: Final = 12
-# Observations/s of each: one that is restarting offers none, and 5 000/s are to remain. A start
-# takes .6 s of a core, a thousand observations .054 at 300/s and .025 at 700/s: so few agents that
-# offer much, as two cores have the starts of all that was killed to do as well.
+# [observations/s] offered by each agent, so that 5 000/s remain although restarting agents offer
+# none.
+# Few agents with a high rate are used, because starts are expensive for two cores. A start takes
+# 0.6 s of a core. A thousand observations take 0.054 s at 300/s and 0.025 s at 700/s.
 RATE: Final = 700.0
 KILLS_PER_ROUND: Final = 20
+# Time between two kills. It ends before, during or after the restart of the processes that were
+# killed last.
 PAUSE_S: Final = (
     0.5,
     3.0,
-)  # between kills: before, during and after the restart of the ones killed before
-DOWN_S: Final = (0.0, 1.0)  # how long the killed ones stay away
+)
+DOWN_S: Final = (0.0, 1.0)  # range of the time for which killed processes stay away
 DRAIN_S: Final = 90.0
-# So short that compaction, checkpoints and snapshots happen many times within the seconds that a
-# service lives.
+# Short periods, so that compaction, checkpoints and snapshots happen often in the seconds for which
+# a service lives.
 PERIODS: Final[dict[str, object]] = {
     "compact_s": 2.0,
     "checkpoint_s": 1.5,
     "snapshot_s": 3.0,
     "vehicle_kb_s": 250.0,
 }
-OLD: Final = synthetic.SyntheticFleet(
-    4000, 4, vehicles=50
-)  # rows of January 2026, beyond what retention keeps
-RETIRED_EVERY: Final = 4  # kills
+# Rows of January 2026, which are older than the retention time.
+OLD: Final = synthetic.SyntheticFleet(4000, 4, vehicles=50)
+RETIRED_EVERY: Final = 4  # kills between two retention runs
 RETIRING_KILLED: Final = 0.5
 
 
@@ -218,7 +220,7 @@ def _run_round(
     there.drain(DRAIN_S)
     there.service.stop()
     retention.kill()
-    retention.start()  # what the kills left of it
+    retention.start()  # delete what the killed retention runs have left
     retention.wait(DRAIN_S)
     assert not old_days(there.archive), f"retention did not go on after a kill; see {retention.log}"
     amid = sum(

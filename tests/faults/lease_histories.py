@@ -27,11 +27,12 @@ from fleet_service.replication.lease import Lease, Standby
 from schemas.errors import InputError
 
 NAMES: Final = ("one", "two", "three")
-LENGTH_S: Final = 90.0  # of a history
+LENGTH_S: Final = 90.0  # simulated length of a history
 LEASES: Final = (2.0, 3.0, 20.0)
-# The takeover after HINT of a lease allows a ratio of 5/6 between two clocks.
-RATES: Final = (0.93, 1.07)  # of the processes' clocks
-REQUEST_S: Final = 0.6  # after this time a client gives up a request
+# Speeds of the processes' clocks. A takeover after HINT = 0.6 of a lease allows a ratio of 5/6
+# between two clocks.
+RATES: Final = (0.93, 1.07)
+REQUEST_S: Final = 0.6  # time after which a client gives up a request
 BATCHES_PER_S = 4
 WALL: Final = 1_700_000_000.0
 DAY_S = 86_400.0
@@ -101,7 +102,7 @@ class _Process:
         self.is_dead = False
         self.frozen_until = 0.0
         self.cut_until = 0.0
-        self.token_until = 0.0  # when its token is active again
+        self.token_until = 0.0  # time at which its token is active again
 
 
 class _Actor:
@@ -180,7 +181,7 @@ class VirtualTime:
             actor.is_done = True
             self._main.release()
 
-    # what the module of the lease uses of `time`
+    # The methods below replace those functions of `time` that the lease module uses.
 
     def monotonic(self) -> float:
         """Return the reading [s] of the elapsed-time clock of the running simulated process."""
@@ -247,7 +248,7 @@ class VirtualBucket:
         """
         return bool(self._request(lambda: self.objects.setdefault(name, content) == content))
 
-    def _request(self, effect: Callable[[], Any]) -> Any:  # noqa: ANN401 of many kinds
+    def _request(self, effect: Callable[[], Any]) -> Any:  # noqa: ANN401 any operation's result
         world = self._world
         if world.now < world.process.cut_until or self._random.random() < 0.01:
             if self._random.random() < 0.5:

@@ -190,7 +190,7 @@ def stop_process(process: subprocess.Popen[str]) -> None:
     process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
-            with suppress(OSError):  # what was not yet written is of no use
+            with suppress(OSError):  # unwritten data is not needed
                 pipe.close()
 
 

@@ -27,7 +27,7 @@ from schemas.runtime.zenoh_session import open_session, quality_of
 from tests.secured import settings
 from tests.waiting import matched
 
-HEAD: Final = struct.Struct("<Id")  # number of the message, time at which it was put [s]
+HEAD: Final = struct.Struct("<Id")  # number of the message, and time [s] at which it was sent
 
 
 def open_end(given: dict[str, Any]) -> zenoh.Session:
@@ -84,7 +84,8 @@ def send(given: dict[str, Any]) -> None:
             number += 1
             counts[stream["key"]] = number
             if stream["rate"]:
-                # after a delay no burst, which the contract forbids and the router cuts
+                # No burst after a delay: the contract forbids it, and the router would drop
+                # messages.
                 due = max(due, time.monotonic()) + 1.0 / stream["rate"]
                 over.wait(due - time.monotonic())
 
@@ -98,7 +99,7 @@ def send(given: dict[str, Any]) -> None:
         for one in given["streams"]
     ]
     for publisher in publishers:
-        matched(publisher)  # before the subscription is known a message is dropped at once
+        matched(publisher)  # Zenoh drops messages until it knows the subscription
     print(json.dumps({"protocols": links}), flush=True)
     sys.stdin.readline()
     threads = [

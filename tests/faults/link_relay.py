@@ -23,9 +23,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-TUNSETIFF: Final = 0x400454CA  # linux/if_tun.h
+TUNSETIFF: Final = 0x400454CA  # from linux/if_tun.h
 IFF_TUN: Final = 0x0001
-IFF_NO_PI: Final = 0x1000  # packets without a header of the driver
+IFF_NO_PI: Final = 0x1000  # packets have no header of the driver
 CLONE_NEWNET: Final = 0x40000000
 PACKET: Final = 65536
 UDP: Final = 17  # protocol number in an IPv4 header
@@ -90,7 +90,7 @@ class Direction:
             packet = heapq.heappop(self.flying)[2]
             try:
                 os.write(self.out, packet)
-            except OSError:  # the other end is full, or its device is down
+            except OSError:  # the other end is full, or its device is down: drop the packet
                 continue
 
 

@@ -49,7 +49,7 @@ class Plan:
     seed: int = 0
     flush_s: float = 0.5
     capacity_mb: float = 256.0
-    cells_across: int = 64  # of the square that the vehicles drive in
+    cells_across: int = 64  # side of the square that the vehicles drive in, in cells
 
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:

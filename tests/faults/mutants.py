@@ -129,7 +129,7 @@ class Mutants:
             return message.SerializeToString(), wire.ENCODING[kind]
         return changed_bytes(r, message.SerializeToString()), wire.ENCODING[kind]
 
-    # protobuf messages are untyped
+    # protobuf messages have no types.
     def _make_valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401
         self._seq += 1
         message = _MESSAGE[kind]()

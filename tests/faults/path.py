@@ -32,12 +32,14 @@ from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
 
 Numbers = NDArray[np.floating[Any]]
 KINDS: Final = ("row", "batch", "boot", "region", "before", "between", "walk")
-FAR_M: Final = 6_000.0  # least distance from the car's path; LEAP_M and 20 s at FASTEST are 3.4 km
-# distance of two places, and speed [m/s] of two cars with a plausible path
+# Least distance of a false place from the car's path. A car at speed FASTEST moves 3.4 km in 20 s,
+# LEAP_M included.
+FAR_M: Final = 6_000.0
+# Distance between two places [m] and speed [m/s] of two cars with plausible paths.
 STEP_M = 1_900.0
 SPEED = 65.0
 PLACES: Final = 210
-ICY_PLACES: Final = 20  # of three honest cars
+ICY_PLACES: Final = 20  # icy places that three honest cars report
 METRES_PER_DEGREE: Final = 111_195.0
 
 
@@ -120,7 +122,8 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
                 engine.intake.ingest(
                     _make_messages([replace(one, columns=columns)]), start + 100 * SECOND
                 )
-            elif kind == "between":  # the first half of the way, the far place, the second half
+            elif kind == "between":
+                # Order of arrival: first half of the path, false place, second half.
                 half = _make_visits(
                     name, 1, when[:15], _offset_position(north[:15], np.zeros(15)), 0.8
                 )
@@ -148,15 +151,15 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
     """
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
-    if (
-        kind == "walk"
-    ):  # in leaps that the row before would allow; the first two may be what the budget allows
+    # The car approaches the false place in steps that are each possible after the previous row. The
+    # first two steps may be possible within the leap budget.
+    if kind == "walk":
         steps = np.arange(2, 50)
         when = start + 31 * SECOND + steps * (SECOND // 1000)
         return _make_visits(
             name, 2, when, _offset_position(450.0 + np.zeros(len(steps)), steps * 2 * STEP_M), 0.2
         )
-    if kind == "row":  # the batch is of one region, and so is the place
+    if kind == "row":  # a batch covers one region, so the false place must lie in it
         home = grid.region_of(grid.cell_of(LATITUDE, LONGITUDE))
         sides = [FAR_M * 1j**turn for turn in range(4)]
         far = next(

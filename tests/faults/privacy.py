@@ -40,10 +40,10 @@ from tests.faults.frame import Site
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, batch
 
 PUBLIC: Final = 3  # vehicles needed for a public cell in the secure configuration
-CUT: Final = 16  # cells at the beginning of a trip that the agent does not publish: 200 m
-STREETS: Final = (4, 3, 3, 2, 1)  # households
-LENGTH: Final = 30  # cells of a street
-PART: Final = 40  # visits of a batch
+CUT: Final = 16  # cells (200 m) at the beginning of a trip that the agent does not publish
+STREETS: Final = (4, 3, 3, 2, 1)  # households in each side street
+LENGTH: Final = 30  # cells of a side street
+PART: Final = 40  # visits in a batch
 MAIN: Final = 60  # cells of the main road
 NEAR_M: Final = 25.0
 EAST: Final = 0
@@ -124,7 +124,7 @@ class Town:
     def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:
         self._random = np.random.default_rng(seed)
         self.engine = Engine(ServiceConfig(public_vehicles=public), folder)
-        # so that the night lies in one part of the window with the evening
+        # The day begins so that the evening and the night are in the same part of the window.
         self.day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS
         self.held: dict[int, pa.Table] = {}
         self._sent = 0

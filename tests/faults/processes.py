@@ -21,7 +21,7 @@ from pathlib import Path
 from tests.waiting import until
 
 START_S = 120.0  # the first start compiles the kernels
-STOP_S = 30.0  # a stopped part is gone after 3 s, on a machine that has time for it
+STOP_S = 30.0  # a stopped process needs 3 s on an idle machine
 
 
 class Part:
@@ -181,7 +181,7 @@ class Stage:
         then missing in the archive; the comparison with the archive counts them.
         """
         for part in self.loads:
-            part.line_with("ready: ")  # before, the signal would end it
+            part.line_with("ready: ")  # before this line the signal would end the process
             part.send_signal(signal.SIGUSR1)
         with suppress(TimeoutError):
             while any(part.is_alive for part in self.loads):

@@ -32,7 +32,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 NAMES: Final = (0, 1)
-BATCHES: Final = (0,)  # batches do not depend on each other
+BATCHES: Final = (0,)  # one batch is enough, because batches do not depend on each other
 NOT_YET: Final = -1
 
 
@@ -45,12 +45,14 @@ class Rules(NamedTuple):
     compares_lease: bool = True
     acknowledges_within_half: bool = True
     lists_after_waiting: bool = True
-    wait_share: int = 2  # wait before a service lists the objects, in half lease times
+    # In half lease times: wait before a new holder lists the objects in the bucket.
+    wait_share: int = 2
     has_fence: bool = True
     remembers_erasure: bool = True
     writes_turn_once: bool = True
 
 
+# Faulty protocols: each lacks one rule.
 BROKEN: Final = {
     "unlike lease times": Rules(lease=(6, 2), compares_lease=False),
     "acknowledges for ever": Rules(acknowledges_within_half=False),
@@ -58,7 +60,7 @@ BROKEN: Final = {
     "no fence": Rules(has_fence=False),
     "erasure forgotten": Rules(remembers_erasure=False),
     "turn written again after a failure": Rules(writes_turn_once=False),
-}  # each lacks one rule
+}
 
 
 class Service(NamedTuple):
@@ -200,7 +202,8 @@ def list_steps(
             yield f"tick, slow {slow}", _advance_clocks(world, slow, rules)
     for me in NAMES:
         one = world.services[me]
-        for batch in one.sending:  # the network delivers whatever the service does
+        # The network may deliver at any time, whatever state the service is in.
+        for batch in one.sending:
             landed = world._replace(objects=world.objects | {(batch, one.number)})
             known = one._replace(sending=one.sending - {batch}, uploaded=one.uploaded | {batch})
             yield f"upload of {batch} by {me} lands", _replace_service(landed, me, known)
@@ -221,7 +224,8 @@ def _list_serving_steps(
     if one.role != "serving":
         return
     lease = rules.lease[me]
-    turn = one.turn if rules.writes_turn_once else one.turn + 1  # of a renewal under way
+    # Turn of the renewal that is under way.
+    turn = one.turn if rules.writes_turn_once else one.turn + 1
     if one.begun == NOT_YET:
         if one.turn < most_turn:
             begun = one._replace(begun=0, turn=one.turn + rules.writes_turn_once)

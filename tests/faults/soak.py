@@ -20,16 +20,15 @@ from tests.faults.census import compare_with_archive
 from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
 from tests.faults.processes import Part, open_stage
 
-# 2 000 observations/s
+# Load: 2 000 observations/s in all.
 PROCESSES = 2
 VEHICLES = 20
 RATE = 50.0
-# small, so that soon every cell is on the map: growth by new cells is not a leak
+# A small area, so that soon every cell is on the map. Growth by new cells would look like a leak.
 CELLS_ACROSS: Final = 12
 EVERY_S: Final = 5.0
-SETTLED: Final = (
-    1 / 3
-)  # of the time, until buffers, windows and the cells of the map have been filled
+# Share of the time in which buffers, windows and the map's cells are filled.
+SETTLED: Final = 1 / 3
 MINUTES: Final = 30.0
 OWES: Final = (
     *("faults.soak.growth_mb", "faults.soak.handles"),

@@ -32,8 +32,8 @@ from tests.faults.frame import Site
 from tests.fleet_service.examples import SECOND, batch, key
 
 SEGMENTS: Final = 2
-BATCHES: Final = 2  # to a segment
-# after this number of damages a service starts on the archive and everything is sent again
+BATCHES: Final = 2  # batches in a segment
+# After each WHOLE_WAY damages a service starts on the archive, and all batches are sent again.
 WHOLE_WAY: Final = 200
 
 
@@ -42,7 +42,8 @@ def run(site: Site) -> list[Figure]:
     quick run, some hundred bytes); return as figures how many rows were lost or wrongly counted as
     received.
     """
-    logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
+    # Thousands of files are set aside, each with a log line.
+    logging.getLogger(load.__name__).setLevel(logging.ERROR)
     batches, newest = _write_archive(site.folder)
     whole = newest.read_bytes()
     rng = np.random.default_rng(site.seed)

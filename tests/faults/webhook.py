@@ -26,10 +26,10 @@ from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 
 ALERTS: Final = 5
-BROKEN: Final = 2  # connections that fail before the receiver works
+BROKEN: Final = 2  # connections that fail before the receiver works again
 TIMEOUT_S: Final = 0.5
-PATIENCE_S: Final = 30.0  # for all alerts to settle
-FEW: Final = 3  # queue places for the receiver that is absent for too long
+PATIENCE_S: Final = 30.0  # time for all alerts to be delivered or dropped
+FEW: Final = 3  # queue places for the receiver that stays absent too long
 OK: Final = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 FOREVER: Final = frozenset({"absent", "overflow", "refuses"})
 
@@ -114,7 +114,7 @@ class Receiver:
                 client.sendall(OK)
                 self.heard.add(json.loads(text)["alerts"][0]["fingerprint"])
             else:
-                client.sendall(OK)  # a login page answers every GET
+                client.sendall(OK)  # like a login page, which answers every GET
 
 
 def _read_request(client: socket.socket) -> tuple[bytes, bytes]:
