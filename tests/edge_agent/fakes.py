@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LATITUDE = 57.70
 LONGITUDE = 11.97
 Lengths: TypeAlias = NDArray[np.floating[Any]]
-METRE = 1.0 / 111_320.0  # degrees of latitude
+METRE = 1.0 / 111_320.0  # [deg] latitude per metre
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 
@@ -181,7 +181,7 @@ def make_log_writer(**changes: object) -> Callable[[Path], object]:
 
 
 _LOST = np.full(5, np.nan)
-# what is wrong with a log -> how to write such a one, and the error that it gives
+# Fault of a log: a function that writes such a log, and the expected error message.
 BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such file": (lambda path: None, "^log: .* does not exist; give"),
     "empty file": (

@@ -17,7 +17,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import ACK_ENCODING, Batch, Kind, StreamAck, decode, encode_ack
 
-DEADLINE_S = 120.0  # the first start after a change compiles the kernels
+DEADLINE_S = 120.0  # time for the first start after a change, which compiles the kernels
 
 
 class Router:

@@ -204,7 +204,8 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
     finally:
         router.send_signal(signal.SIGCONT)
         router.kill()
-    late = ("a session did not close", "no session at tcp/127.0.0.1")  # when Zenoh gave up
+    # Messages after Zenoh has given up.
+    late = ("a session did not close", "no session at tcp/127.0.0.1")
     assert any(words in done.stderr for words in late)
     assert json.loads(done.stdout)["unsettled"] > 20
     assert done.returncode == 1
@@ -274,9 +275,8 @@ def test_run_drives_with_the_source_of_another_distribution(
         "blocks = lambda address: read_log(pathlib.Path(address)).blocks(time.time_ns(), 10)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(
-        plugins, "entry_points_of", plugins.entry_points_of.__wrapped__
-    )  # the cache was filled before
+    # Bypass the cache, which an earlier test has filled.
+    monkeypatch.setattr(plugins, "entry_points_of", plugins.entry_points_of.__wrapped__)
     source = [
         "--source",
         f"theirs:{drive / 'log.parquet'}",

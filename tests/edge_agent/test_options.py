@@ -32,7 +32,7 @@ from schemas.vehicle import Vehicle
 from schemas.wire import Kind
 from tests.edge_agent.estimators.drives import drive
 
-# simulate: option -> another value than that of SIMULATED
+# Options of `simulate`: a command line with another value than in SIMULATED.
 SIMULATED = [
     "slalom",
     "--mu",
@@ -63,8 +63,8 @@ SIMULATE = {
     },
     "--no-torque": [*SIMULATED, "--no-torque"],
 }
-# run, fleet, tune: option -> the words that are added to those of USUAL; `{0}` and `{1}` are two
-# drives
+# Options of `run`, `fleet` and `tune`: the words that are added to those of USUAL. `{0}` and `{1}`
+# are two recorded drives.
 USUAL = {
     "run": ["run"],
     "fleet": ["fleet", "--vehicles", "3"],
@@ -105,8 +105,7 @@ CHANGED: dict[tuple[str, str], list[str]] = {
 }
 REPLAYED = "test_replay_depends_on_log_vehicle_estimator_and_configuration"
 SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
-# what the other options of the commands do is told by the tests named here, in whose modules they
-# are given
+# Tests in other modules that show the effect of the remaining options.
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
@@ -190,7 +189,8 @@ ELSEWHERE = {
         "--paper": "test_paper_is_reproduced_and_written",
     },
 }
-# agent configuration: setting -> another value; those of sending are shown where things are sent
+# Settings of the agent that influence observations, with another value. SENT lists the settings of
+# the connection.
 OBSERVED = {
     "state_rate_hz": 5.0,
     "slippery_mu": 1.15,
@@ -200,8 +200,8 @@ OBSERVED = {
     "trip_end_s": 3.0,
     "tyre_season": 2,
 }
-# none by default; tested with the corrections (inputs/test_adopt.py) and with the prior
-# (schemas/test_vehicle_axles.py)
+# Vehicle fields without a default value. Other tests cover them: inputs/test_adopt.py for
+# corrections, schemas/test_vehicle_axles.py for the prior.
 OPTIONAL = {
     "wheel_radius_front",
     "wheel_radius_rear",
@@ -215,16 +215,18 @@ NUMBERS = [
     for name in Vehicle.model_fields
     for estimator in ("aco-fckf", "compensated-wckf")
     if name
+    # `import` and the log readers use these fields; test_learn covers them.
     not in (
         "name",
         "steering_ratio",
         "calibration",
-    )  # read by `import`, and by what reads logs: test_learn
+    )
     and name not in OPTIONAL
     and (estimator, name) != ("compensated-wckf", "drive_split_front")
 ]
 SENT = {"zenoh", "spool", "spool_mb", "resend_s", "flush_s", "batch_rows", "estimator"}
-WATCHED = {"metrics_port", "metrics_host", "log"}  # shown by tests/schemas/test_monitor.py
+# Settings that tests/schemas/test_monitor.py covers.
+WATCHED = {"metrics_port", "metrics_host", "log"}
 
 
 def options(command: str) -> set[str]:
@@ -262,7 +264,8 @@ def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
         (Path(__file__).parents[1] / f"test_{name}.py").read_text()
         for name in ("commands", "faces")
     ]
-    texts.append(Path(__file__).read_text().partition("def options(")[2])  # behind the tables
+    # Only the code below the tables counts.
+    texts.append(Path(__file__).read_text().partition("def options(")[2])
     for command, shown in ELSEWHERE.items():
         for option, test in shown.items():
             text = "".join(text for text in texts if f"def {test}" in text)
@@ -466,7 +469,7 @@ def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()
-    broken[150:, 11:15] = np.nan  # without torque, the drive's split matters
+    broken[150:, 11:15] = np.nan  # without torque readings the drive split matters
     given = getattr(vehicle, name)
     changed = vehicle.model_copy(update={name: 1.2 * given})
     assert given is not None

@@ -43,7 +43,7 @@ def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:
     latitude, longitude = line()
     assert len(path.distance) == 200
     assert path.places[99, 0] // grid.SECTORS == grid.cell_of(latitude[100], longitude[100])
-    assert path.places[99, 0] % grid.SECTORS == 0  # it heads east
+    assert path.places[99, 0] % grid.SECTORS == 0  # heading sector 0 is east
     assert np.abs(path.curvature).max() < 1e-6
 
 

@@ -281,9 +281,9 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
         assert outlook.here[0] == pytest.approx(0.625, abs=0.02)
 
         def is_informed(seen: Outlook) -> bool:
-            car.lookout.believe(
-                here, flat
-            )  # block after block: while the car looks ahead, it does not wait for that
+            # The estimator calls this for each block; `believe` does not wait for the thread that
+            # looks ahead.
+            car.lookout.believe(here, flat)
             return bool(seen.here[0] < 0.3)
 
         seen = car.drive_until(is_informed)
@@ -375,16 +375,16 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
         driving(router) as car,
     ):
         later_s = 0.0
-        while liar.said < every:  # an old part of the map is requested again
+        while liar.said < every:  # after REFRESH_S the car requests the map part again
             said = liar.said
             later_s = later_s + REFRESH_S + 1.0
             car.report_pose(later_s=later_s)
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
         assert not car.lookout.counts.total_of("cells")
-        car.drive_until(
-            lambda seen: seen.time < time.time_ns() + NS
-        )  # at a pose dated an hour ahead, an alert of now would be expired
+        # The last pose was dated an hour ahead. Until a pose of now arrives, an alert of now would
+        # count as expired.
+        car.drive_until(lambda seen: seen.time < time.time_ns() + NS)
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
         assert car.next_warning().state == "raised"
         assert not car.lookout.counts.failures

@@ -83,14 +83,14 @@ def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs
         if pipe not in writers:
             try:
                 writers[pipe] = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
-            except OSError:  # nobody reads
+            except OSError:  # no process reads the pipe yet
                 return False
         return True
 
     def watch() -> None:
         until(lambda: all(is_waiting(task.vehicle) for task in tasks[:jobs]))
         under_way.append(sum(is_waiting(task.vehicle) for task in tasks))
-        for task in tasks:  # an empty pipe is no vehicle file, which ends the drive
+        for task in tasks:  # an empty pipe is not a valid vehicle file, so the drive ends
             until(lambda task=task: is_waiting(task.vehicle))  # type: ignore[misc]
             os.close(writers[task.vehicle])
 
@@ -108,7 +108,7 @@ def test_a_process_that_the_system_ends_is_an_error_and_no_hang(
     tasks = piped_tasks(drives, tmp_path)
 
     def end_one() -> None:
-        with tasks[0].vehicle.open("wb"):  # waits until a process reads
+        with tasks[0].vehicle.open("wb"):  # `open` waits until a process reads the pipe
             multiprocessing.active_children()[0].kill()
 
     watcher = threading.Thread(target=end_one)
@@ -130,9 +130,9 @@ def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
         [sys.executable, "-m", "edge_agent.cli", *words, "--out", str(tmp_path), "--jobs", jobs],
         stderr=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # a process group of its own, as of a command in a shell
+        start_new_session=True,  # a process group of its own, like a command in a shell
     )
-    with pipe.open("wb"):  # waits until a drive has begun
+    with pipe.open("wb"):  # `open` waits until a drive has begun
         os.killpg(process.pid, signal.SIGINT)
         _, reported = process.communicate()
     assert process.returncode == 130

@@ -27,9 +27,9 @@ def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> Non
     )
     untuned = create(name, [vehicle], memberships=Memberships()).advance(t, signals)
     assert np.array_equal(reported.vx, tuned.vx)
-    if (
-        shipped_memberships(TUNED[name]) != Memberships()
-    ):  # the default's vertices, set by hand, scored best
+    # The default estimator's vertices are the defaults of `Memberships`: values set by hand scored
+    # best.
+    if shipped_memberships(TUNED[name]) != Memberships():
         assert not np.array_equal(reported.vx, untuned.vx)
 
 

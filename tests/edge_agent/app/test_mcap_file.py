@@ -22,7 +22,8 @@ def samples(count: int) -> pa.Table:
         values = 0.01 * np.arange(count) + 1.0 if field.name == "t" else draw.normal(size=count)
         columns.append(pa.array(values).cast(field.type, safe=False))
     place = ESTIMATES_SCHEMA.get_field_index("mu_fl")
-    columns[place] = pa.nulls(count, pa.float64())  # as from a bank with one value for all wheels
+    # Like a bank that gives one value for all wheels.
+    columns[place] = pa.nulls(count, pa.float64())
     return pa.Table.from_arrays(columns, schema=ESTIMATES_SCHEMA)
 
 

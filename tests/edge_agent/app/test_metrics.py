@@ -54,10 +54,10 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
 ) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     observations, states = drive()
-    publisher.offer(
-        observations._replace(vehicle=observations.vehicle + 1000)
-    )  # nobody has this number
-    strange = states.columns | {"health": np.full(len(states.vehicle), 1 << 40)}  # no 32 bits
+    # No enrolled vehicle has this number.
+    publisher.offer(observations._replace(vehicle=observations.vehicle + 1000))
+    # Does not fit into 32 bits.
+    strange = states.columns | {"health": np.full(len(states.vehicle), 1 << 40)}
     publisher.offer(states._replace(columns=strange), observations)
     until(lambda: publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle))
     assert publisher.counts.dropped == {

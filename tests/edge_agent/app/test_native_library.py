@@ -16,7 +16,7 @@ from edge_agent.app import native_library, shipped_library
 from edge_agent.lab.simulation import SimulatedFleet
 from schemas.runtime import jit
 
-# a running agent must load none of these
+# Modules that an agent with native kernels must not load.
 HEAVY = ("grpc", "llvmlite", "numba", "pandas", "pyarrow", "rich", "scipy", "yaml")
 LEVEL = next(iter(shipped_library.FEATURES))
 VEHICLES = 2
@@ -53,7 +53,8 @@ for column in last.columns.values():
     digest.update(column.tobytes())
 print(digest.hexdigest(), records + len(last.vehicle))
 """
-# the folder of the wheel's libraries contains one for other sources, which would crash
+# Use only the folder of the wheel's libraries. Another folder has a library of other sources, which
+# would crash.
 NATIVE = """
 from pathlib import Path
 from edge_agent.app import native_library
@@ -83,7 +84,7 @@ def run_python(code: str, *words: str) -> list[str]:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # Numba compiles if nothing is cached
+@pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
     bit by bit. The agent that uses the library must not load the heavy modules. It must refuse a

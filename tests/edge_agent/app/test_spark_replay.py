@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
 pytest.importorskip("pyspark", reason="pip install 'gripmap[spark]'")
 
 DRIVES = 3
-ESTIMATOR = "aco-fckf"  # compiled by `make setup`; others take minutes at first
+ESTIMATOR = "aco-fckf"  # `make setup` compiles it; the first run of another estimator takes minutes
 
 
 @pytest.fixture(scope="module")

@@ -150,7 +150,7 @@ def replace_rows(drive: Recorded, rows: int) -> Recorded:
 def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
     for block in trip.corrected_blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
-        replace(block)  # the loop does not wait
+        replace(block)  # stands for the main loop, which does not wait for the doctor
     until(lambda: trip._looking is not None and trip._looking.done())
     assert trip.is_admitted()
     trip.close()

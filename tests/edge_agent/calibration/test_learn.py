@@ -108,7 +108,7 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
     axle, the radius errors must be smaller than without this entry. Without it, the stated
     uncertainty must be larger.
     """
-    drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
+    drive = drives(3, 32, rough=False, seconds=300)[2]  # a van with rear-wheel drive
     assert drive.vehicle.drive_split_front == 0.0
     unsaid = drive.vehicle.model_copy(update={"drive_split_front": None})
     known, blind = (
@@ -160,7 +160,7 @@ WHEELS_AND_STEERING = {
     "wheel_lag": range(S.OMEGA, S.OMEGA + 4),
     "steer_lag": range(S.DELTA, S.DELTA + 4),
 }
-LATE = 8  # samples
+LATE = 8  # [samples] delay
 
 
 def late(drive: Recorded, channels: range) -> Recorded:
@@ -234,7 +234,7 @@ def write(path: Path, drive: Recorded) -> str:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # kernels may have to be compiled
+@pytest.mark.timeout(600)  # time to compile the kernels
 def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output
 ) -> None:

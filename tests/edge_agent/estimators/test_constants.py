@@ -30,7 +30,7 @@ from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, drive_over_
 
 SAMPLES = 400  # samples of the short drives
 FIRST = 100  # first sample that counts in the figures
-CUT = 20  # samples between two readings of the filters' internal states
+CUT = 20  # samples between two readings of the filter's internal states
 SHORT: dict[str, float | None] = {
     "j-turn": 0.4,
     "braking": 0.3,
@@ -49,81 +49,76 @@ class Move(NamedTuple):
 
     figure: str
     drive: str
-    ratio: float  # changed / usual value: at least this if above 1, otherwise at most
-    times: float = 3.0  # factor of the constant
+    # Changed value / usual value: at least `ratio` if it is above 1, otherwise at most.
+    ratio: float
+    times: float = 3.0  # factor by which the constant is multiplied
 
 
 LESS = 1.0 / 3.0
 MOVES = {
-    # fewer and more independent measurements
+    # Number and independence of the measurements.
     "block_time": Move("updates", "acceleration", 0.4),
     "correlation_time": Move("vy_std", "constant-radius", 1.4),
-    "window": Move("adaptation", "acceleration", 2.0, LESS),  # R follows the spin sooner
-    # the road
+    # R adapts faster to the spinning wheels.
+    "window": Move("adaptation", "acceleration", 2.0, LESS),
+    # The road.
     "hazard": Move("least probabilities", "j-turn", 1.5),
-    "patch_length": Move("lower", "slalom", 1.015),  # ice comes later
+    # Ice is expected after a longer distance without grip demand.
+    "patch_length": Move("lower", "slalom", 1.015),
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
-    "split_asymmetry": Move("split probability", "split-braking", 0.997),  # they wake later
-    # how much a block counts
-    "demand_half": Move(
-        "least probabilities", "braking", 0.3
-    ),  # what is not taken as evidence is charged to more nodes
-    "demand_power": Move(
-        "penalty", "acceleration", 0.5
-    ),  # above the threshold all is evidence, nothing is charged
+    # The split nodes wake later.
+    "split_asymmetry": Move("split probability", "split-braking", 0.997),
+    # Evidence that a block gives.
+    # Evidence below the demand threshold becomes a penalty of more nodes.
+    "demand_half": Move("least probabilities", "braking", 0.3),
+    # With a steep threshold, all above it is evidence and nothing becomes a penalty.
+    "demand_power": Move("penalty", "acceleration", 0.5),
     "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
-    "steady_time": Move("width", "constant-radius", 0.92),  # force and slip are new for longer
-    "abrupt_share": Move("upper", "joints", 0.95, LESS),  # a bump reads as slip
-    "abrupt_time": Move("upper", "joints", 0.992, LESS),  # ... sooner
+    "steady_time": Move("width", "constant-radius", 0.92),  # force and slip count as new for longer
+    "abrupt_share": Move("upper", "joints", 0.95, LESS),  # more of a bump is read as slip
+    "abrupt_time": Move("upper", "joints", 0.992, LESS),  # a bump is read as slip sooner
     "steady_half": Move("width", "constant-radius", 1.05),
     "steady_share": Move("least probabilities", "constant-radius", 0.95),
-    "sliding_slope": Move(
-        "upper", "constant-radius", 1.08
-    ),  # more nodes pay for sliding: those of little friction
+    # More nodes of low friction pay the penalty for sliding.
+    "sliding_slope": Move("upper", "constant-radius", 1.08),
     "sliding_penalty": Move("lower", "constant-radius", 1.025),
-    "axle_penalty": Move(
-        "upper", "constant-radius", 0.85
-    ),  # saturated nodes, of little friction, gain
-    # limits
-    "farthest": Move(
-        "penalty", "braking", 0.5, LESS
-    ),  # nodes may not go to where they would be charged
-    "huber": Move(
-        "nis", "stopping", 3.0, LESS
-    ),  # R is inflated by what is refused, and follows it less
+    # Saturated nodes, which have low friction, gain.
+    "axle_penalty": Move("upper", "constant-radius", 0.85),
+    # Limits.
+    # Tighter limits keep the nodes away from states that cost a penalty.
+    "farthest": Move("penalty", "braking", 0.5, LESS),
+    # R adapts less to innovations beyond a smaller limit.
+    "huber": Move("nis", "stopping", 3.0, LESS),
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
-    # the tyre and the vehicle: what a sharper curve explains is not explained by a sharper tyre
+    # Tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the state
+    # SHAPE.
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
     "curve_e": Move("sharpness", "j-turn", 0.95),
     "shape_std": Move("std SHAPE", "gaining-slalom", 2.0),
     "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
     "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
-    "stiffness_power_x": Move(
-        "nis", "acceleration", 0.6
-    ),  # the residual of a stiff tyre is divided by more
+    # The residual of a stiff tyre is divided by a larger number.
+    "stiffness_power_x": Move("nis", "acceleration", 0.6),
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
     "informing": Move("std LN_KX", "j-turn", 1.03),
     "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
-    "compliance_mean": Move(
-        "strain", "constant-radius", 1.1
-    ),  # a car whose axle does not yield is not as expected
+    # The axle of this car does not yield as much as the larger mean expects.
+    "compliance_mean": Move("strain", "constant-radius", 1.1),
     "compliance_std": Move("std COMPLIANCE", "stopping", 2.5),
-    "steer_time": Move(
-        "std COMPLIANCE", "constant-radius", 1.02, LESS
-    ),  # they are forgotten sooner
+    # Learned values are forgotten sooner.
+    "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),
     "spin_share": Move("nis", "braking", 0.9),
-    # wheels that slide
-    "slip_change": Move(
-        "least probabilities", "acceleration", 1.1
-    ),  # the road may be any other sooner
+    # Sliding wheels.
+    # After the start of a slide, other friction values become possible sooner.
+    "slip_change": Move("least probabilities", "acceleration", 1.1),
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     "rear_unlike": Move("adaptation", "acceleration", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
-    # sensors
+    # Sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
     "leak_x": Move("vx_std", "braking without torque", 1.02),
@@ -131,14 +126,15 @@ MOVES = {
     "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
     "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
     "slope_std": Move("std SLOPE", "braking", 1.6),
-    "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),  # it is another one sooner
+    # The slope is forgotten after a shorter distance.
+    "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.0),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.15),
-    # noise: what is expected to be larger is found to be smaller than expected
+    # Noise. Larger assumed noise makes the normalised innovations (nis) smaller.
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.985),
@@ -151,7 +147,7 @@ MOVES = {
     "lag": Move("nis", "pulses", 0.85),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.91),
-    # wheels that tell the motion without a tyre
+    # Wheels that show the velocity without a tyre model.
     "standing_time": Move("stands", "stopping", 0.5),
     "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
     "agreeing_width": Move("v_x told by wheels", "pulses", 0.8, LESS),
@@ -161,24 +157,25 @@ MOVES = {
     "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
     "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),
-    # no friction below the grip in use
+    # Guard against a friction below the grip in use.
     "guard_margin": Move("least probabilities", "braking", 1.4),
     "guard_std": Move("least probabilities", "acceleration", 1.25),
-    # contradiction
-    "strain_prior": Move("strain", "turn and straight", 1.1),  # it takes more to tell how a car is
-    "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are surer
-    "strain_power": Move("vy_std", "braking", 1.1, LESS),  # a level car's axles are less sure
+    # Contradiction between the car and the vehicle model.
+    # More data are needed to learn the strain of a car.
+    "strain_prior": Move("strain", "turn and straight", 1.1),
+    "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are trusted more
+    # Axles of a car with little strain are trusted less.
+    "strain_power": Move("vy_std", "braking", 1.1, LESS),
     "strain_least": Move("vy_std", "gaining-slalom", 1.12),
     "strain_most": Move("vy_std", "rough acceleration", 0.92, LESS),
-    "odd_least": Move("distrust", "side force without turning", 0.98),  # it is believed later
-    "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
-    "distrust_noise": Move(
-        "nis", "side force without turning", 0.97, LESS
-    ),  # it no longer follows what it distrusts
+    # The contradiction is accepted later.
+    "odd_least": Move("distrust", "side force without turning", 0.98),
+    # The model is tried again sooner.
+    "patience": Move("distrust", "side force in one bend", 0.8, 0.02),
+    "distrust_noise": Move("nis", "side force without turning", 0.97, LESS),
     "distrust_drift": Move("vy_std", "side force without turning", 1.5),
-    "distrust_forget": Move(
-        "std RADIUS", "side force without turning", 0.9
-    ),  # what was learned is kept for longer
+    # Learned states are kept for longer.
+    "distrust_forget": Move("std RADIUS", "side force without turning", 0.9),
 }
 
 

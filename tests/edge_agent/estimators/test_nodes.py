@@ -62,9 +62,8 @@ def test_evidence_is_the_likelihood_that_was_put_in() -> None:
 
 
 def test_every_constant_has_its_unit_and_its_reason_above_it() -> None:
-    source = re.sub(
-        r"\n +# (?!\[)", " ", inspect.getsource(Constants)
-    )  # a comment of several lines
+    # Join comments of several lines.
+    source = re.sub(r"\n +# (?!\[)", " ", inspect.getsource(Constants))
     lines = [line.strip() for line in source.splitlines()]
     found = {line.split(":")[0]: above for above, line in pairwise(lines) if ": float = " in line}
     assert tuple(found) == Constants._fields

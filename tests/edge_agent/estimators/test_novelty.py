@@ -20,7 +20,7 @@ from tests.edge_agent.estimators.drives import drive
 
 SPEED_M_S = 10.0
 BLOCK_S = 0.05
-BEND = 0.15  # side force over load
+BEND = 0.15  # side force over load in the bend
 ICE = 0.18
 
 

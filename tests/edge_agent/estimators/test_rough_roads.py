@@ -52,7 +52,7 @@ def test_a_car_that_starts_after_it_stood_is_not_held_back() -> None:
     rest, still = at_rest(5.0, 0.3, 0.0)
     go = signals.copy()
     go[:, S.AX] += 0.3
-    go[:, OMEGA] -= go[:1, OMEGA]  # like after a standstill
+    go[:, OMEGA] -= go[:1, OMEGA]  # the wheel speeds start at 0, as after a standstill
     said = run(
         np.concatenate([rest, t - t[0] + 5.0]), np.concatenate([still, without_torque(go)]), vehicle
     )
@@ -92,7 +92,8 @@ def test_driven_axle_is_found_without_torque_and_friction_is_right() -> None:
     t, signals, vehicle = drive("firm-acceleration", 0.85)
     said = run(t, without_torque(signals), vehicle)
     assert said.mu_lower[-1, 0] < 0.85 < said.mu_upper[-1, 0]
-    assert said.mu_lower[-1, 0] > 0.3  # and not only the prior
+    # The measurement raised the lower bound above that of the prior.
+    assert said.mu_lower[-1, 0] > 0.3
 
 
 def test_late_steering_contradicts_the_model_and_restores_the_prior() -> None:

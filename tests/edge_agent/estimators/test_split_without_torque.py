@@ -14,10 +14,10 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from tests.edge_agent.estimators.drives import TORQUE
 
-# shares of the stop between which the estimates are judged
+# The estimates between these shares of the stopping time are evaluated.
 FIRST_SIDES = 0.5
 LAST_SIDES = 0.9
-# true frictions of the manoeuvre "split-braking", left and right
+# True friction of the manoeuvre "split-braking" on the dry (left) and the snowy side.
 DRY = 0.8
 SNOW = 0.3
 
@@ -50,9 +50,8 @@ def test_split_stop_without_torque_tells_the_sides_and_the_speed(
     wheels = estimates.mu_wheel
     assert wheels is not None
     dry, snow = (wheels[judged, 0, side].mean(axis=0) for side in ((1, 0) if mirrored else (0, 1)))
-    assert snow[2] < 0.45 < dry[0]  # the upper end of the snow, the median of the dry side
+    assert snow[2] < 0.45 < dry[0]  # upper bound of the snow side, median of the dry side
     assert snow[1] < SNOW < snow[2]
     assert dry[1] < DRY < dry[2]
-    assert (
-        np.sqrt(np.mean((estimates.vx[judged, 0] - vx[judged]) ** 2)) < 0.08
-    )  # [m/s]; .3 without the yaw balance
+    # [m/s] without the yaw balance the error is .3.
+    assert np.sqrt(np.mean((estimates.vx[judged, 0] - vx[judged]) ** 2)) < 0.08

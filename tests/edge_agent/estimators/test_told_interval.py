@@ -131,9 +131,10 @@ def _lower_while_sliding(slides: float, used: float, lower: float) -> float:
 @pytest.mark.parametrize(
     ("slides", "used", "lower", "reported"),
     [
-        (1.0, 0.10, 0.15, 0.95 * 0.10),  # the tyre may be at its peak: friction is the grip in use
-        (1.0, 0.30, 0.15, 0.15),  # the belief is lower already
-        (0.0, 0.10, 0.15, 0.15),  # no wheel slides: the grip in use does not show the limit
+        # The tyre may be at its peak: friction equals the grip in use.
+        (1.0, 0.10, 0.15, 0.95 * 0.10),
+        (1.0, 0.30, 0.15, 0.15),  # the belief's lower bound is lower already
+        (0.0, 0.10, 0.15, 0.15),  # no wheel slides: the grip in use says nothing about the limit
         (0.5, 0.10, 0.15, 0.5 * (0.15 + 0.95 * 0.10)),
     ],
 )

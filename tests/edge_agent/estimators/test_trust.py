@@ -34,7 +34,7 @@ CONSTANTS = Constants()
 def believing(*, strained: float = 1.0, odd: float = 0.0) -> Trust:
     trust = records(Trust, 1)
     trust["strain"], trust["odd"] = strained, odd
-    return cast(Trust, trust[0])  # as a kernel sees it
+    return cast(Trust, trust[0])  # a kernel gets one element of the record array
 
 
 def after(

@@ -21,7 +21,7 @@ from tests.edge_agent.estimators.drives import TORQUE, drive
 
 FRONT = slice(S.TORQUE, S.TORQUE + 2)
 REAR = slice(S.TORQUE + 2, S.TORQUE + 4)
-WORSE = 1.1  # ratio of two errors of speed, and
+WORSE = 1.1  # largest ratio of the two speed errors, in addition to SLACK_M_S
 SLACK_M_S = 0.02
 
 

@@ -28,9 +28,8 @@ def test_a_stop_from_dry_road_onto_snow_tells_of_the_dry_road_first(seed: int) -
     t, estimates = one_visit("jump-braking", None, seed)
     assert estimates.jumps is not None
     assert estimates.evidence is not None
-    jump = int(
-        np.flatnonzero(estimates.jumps[:, 0])[0]
-    )  # the end of the stop may look like another road
+    # Only the first jump counts, because the end of the stop may look like another road change.
+    jump = int(np.flatnonzero(estimates.jumps[:, 0])[0])
     assert 2.0 < t[jump] < 3.0
     likely = mugrid.CENTRES[estimates.evidence[jump, 0] > -3.0]
     assert likely.min() > 0.6

@@ -39,15 +39,15 @@ from tests.ports import free_ports
 from tests.waiting import until
 
 CAR = PRESETS["sedan"].vehicle
-# of the drives here
+# Properties of the drives in this module.
 SECONDS = 20
 RATE = 50
 START_S = 1_700_000_000.0
 AIR = -3.5
 WIPES = 1.0
-ENOUGH = 0.9  # share of rows that a profile with these signals must fill
+ENOUGH = 0.9  # share of rows that must be filled for a profile with these signals
 FLAGS_AT = {"abs_active": (5.0, 7.0), "esc_active": (9.0, 10.0), "tcs_active": (12.0, 15.0)}
-OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> its channel
+OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # channels by CAN message and signal
     "hyundai-can": {
         "TCS11": {"ABS_ACT": "abs_active", "ESP_CTL": "esc_active", "TCS_CTL": "tcs_active"},
         "FATC11": {"CR_Fatc_OutTemp": "air_temperature"},
@@ -63,7 +63,7 @@ OF_PROFILE: dict[str, dict[str, dict[str, str]]] = {  # message -> signal -> its
         "Gateway_72": {"Wischer_vorne_aktiv": "wiper"},
     },
 }
-SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # once a second
+SLOW = {"FATC11", "CGW1", "Kombi_02", "Gateway_72"}  # CAN messages that are sent once a second
 
 
 def told_at(t: float) -> dict[str, float]:
@@ -136,9 +136,8 @@ def assert_filled(log: SignalLog) -> None:
     assert np.nanmin(log.context[:, C.WIPER]) == pytest.approx(WIPES)
     for index, name in enumerate(FLAGS):
         first, last = FLAGS_AT[name]
-        clear = (
-            np.min(np.abs(log.t[:, None] - [first, last]), axis=1) > 0.1
-        )  # rows begin with the second reading
+        # A row begins with the second reading, so the samples near a change are left out.
+        clear = np.min(np.abs(log.t[:, None] - [first, last]), axis=1) > 0.1
         inside = (log.t >= first) & (log.t < last)
         known = np.isfinite(log.context[:, index]) & clear
         assert (log.context[known, index] == inside[known]).all(), name

@@ -27,7 +27,7 @@ from tests.edge_agent.inputs import formats
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 
 Output = pytest.CaptureFixture[str]
-FIRST = 1500  # frames; six seconds
+FIRST = 1500  # [frames] six seconds
 
 
 def bring(out: Path, *sources: Path, more: tuple[str, ...] = ("--profile", "toyota")) -> pa.Table:
@@ -83,9 +83,8 @@ def test_one_drive_is_one_log_in_every_format(
     assert [n for n in other.column_names if n[0] != "t"] == [
         n for n in whole.column_names if n[0] != "t"
     ]
-    close = (
-        1e-3 if kind == "trc" else 1e-9
-    )  # a TRC's times have four digits of a millisecond at the most
+    # A TRC file stores times in ms with at most four digits.
+    close = 1e-3 if kind == "trc" else 1e-9
     for name in whole.column_names[1:]:
         assert np.allclose(
             column(whole, name), column(other, name), rtol=0, atol=close, equal_nan=True
@@ -397,7 +396,7 @@ def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
         if kind in ("csv", "parquet", "nmea")
         else (load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc"))
     )
-    for k in range(3 if kind == "mf4" else 24):  # a process each
+    for k in range(3 if kind == "mf4" else 24):  # each file is read in a process of its own
         bad.write_bytes(broken(data, ("cut", "full", "changed")[k % 3], rng))
         try:
             read_source(bad, profile, database)
@@ -417,8 +416,8 @@ def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None
 
     path = formats.as_mf4(tmp_path / "a.mf4", formats.frames(60))
     data = bytearray(path.read_bytes())
-    group = struct.unpack_from("<Q", data, 64 + 24)[0]  # the first data group
-    struct.pack_into("<Q", data, group + 24, group)  # whose next is itself
+    group = struct.unpack_from("<Q", data, 64 + 24)[0]  # position of the first data group
+    struct.pack_into("<Q", data, group + 24, group)  # its link to the next group points to itself
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match="circle"):
         read_source(path, load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc"))

@@ -71,9 +71,8 @@ def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> No
                 next(patience)
             blocks.close()
         assert got[..., S.OMEGA : S.OMEGA + 4] == pytest.approx(SPEED / RADIUS, rel=1e-6)
-        assert got[..., S.AY] == pytest.approx(
-            SPEED * got[..., S.YAW_RATE], abs=1e-2
-        )  # arrivals are unsteady
+        # The arrival times of the readings vary.
+        assert got[..., S.AY] == pytest.approx(SPEED * got[..., S.YAW_RATE], abs=1e-2)
         assert got[..., S.DELTA] == pytest.approx(2.7 * got[..., S.YAW_RATE] / SPEED, abs=1e-3)
 
 
@@ -92,7 +91,7 @@ def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_
                 running.wait_for("ready")
                 running.send_go()
                 before = feed.heard
-                until(lambda: feed.heard > before + 20)  # noqa: B023 waited for here
+                until(lambda: feed.heard > before + 20)  # noqa: B023 waited for in this iteration
             until(lambda: feed.trouble is not None)
     finally:
         feed.close()
@@ -159,7 +158,7 @@ def test_hostile_lines_of_a_receiver_are_counted() -> None:
             until(lambda: feed.heard)
             assert feed.broken == 5
             assert set(feed.take()) == {"latitude", "longitude", "speed", "course"}
-            connection.sendall(b"x" * 200_000)  # an endless line does not come from a receiver
+            connection.sendall(b"x" * 200_000)  # a real receiver sends no endless line
             until(lambda: feed.losses)
         feed.close()
 
@@ -217,7 +216,7 @@ def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # kernels may have to be compiled
+@pytest.mark.timeout(600)  # time to compile the kernels
 def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
     (bus, can) = peer_addresses("can")
     (receiver, gpsd) = peer_addresses("gpsd")

@@ -149,9 +149,8 @@ def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> N
     for _ in range(8):
         next(blocks)
     now = clock.now()
-    receiver.tell(
-        now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0
-    )  # north, and its row has gone
+    # A north heading at a time whose row was already passed on.
+    receiver.tell(now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0)
     block = next(blocks)
     place = np.isfinite(block.signals[:, 0, S.LATITUDE])
     assert np.flatnonzero(place).tolist() == [0]

@@ -18,7 +18,7 @@ from edge_agent.observe.cell_tracker import (
 from schemas import grid
 from tests.edge_agent.fakes import ground, wanderers
 
-CELL_M = 10.2  # side of a cell at this latitude
+CELL_M = 10.2  # [m] side of a cell at this latitude
 
 
 def straight(samples: int, speed: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -172,9 +172,9 @@ def test_silent_route_keeps_batches_on_disk_and_probes_every_two_minutes(
         put += [(second, batch.seq) for batch in outbox.due_batches(began + second, limit=64)]
     assert 20 <= len(put) <= 50
     assert put[-1][0] - put[-2][0] <= LONGEST_PROBE_S * (1 + JITTER) + 5
-    assert (
-        len({seq for _, seq in put}) > 5
-    )  # not always the same: one may be such that nobody can answer it
+    # The outbox must probe with different batches, because a service may be unable to answer a
+    # particular one.
+    assert len({seq for _, seq in put}) > 5
     outbox.close()
 
 
@@ -354,7 +354,7 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
         fresh = outbox.store([draft(records=2)], now)
         outbox.due_batches(now, 64)
         for batch in fresh:
-            if batch.seq != 3:  # an entry that no service can read
+            if batch.seq != 3:  # stands for a batch that no service can decode
                 outbox.settle_ranges(stream(), [(batch.seq, batch.seq)])
         assert outbox.counts.unanswered == 0 or turn >= 42
     assert len(outbox.held) == 0

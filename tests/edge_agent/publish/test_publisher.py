@@ -237,7 +237,8 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     assert "behind the service's" in caplog.text
     service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
     until(lambda: abs(publisher.status.clock_behind_s) < 10.0)
-    service.put_ack("car-a", encode_ack("car-a", [settled]))  # from a version without a time
+    # An old service sends acknowledgements without a time.
+    service.put_ack("car-a", encode_ack("car-a", [settled]))
     until(lambda: publisher.counts.late[mine.kind] == 3)
     assert health_problems(publisher, Progress()) == []
     publisher.close(within_s=0.1)

@@ -42,7 +42,7 @@ from schemas.mugrid import BINS, CENTRES
 from schemas.signals import CHANNELS, Health
 from schemas.thresholds import SLIPPERY_MU
 
-SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, 6 s dry
+SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, then 6 s dry
 
 
 def drive_saying(lower: float, upper: float) -> DetectionDrive:

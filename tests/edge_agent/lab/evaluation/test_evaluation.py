@@ -27,7 +27,7 @@ from edge_agent.lab.seeds import FIGURES
 from schemas.runtime.figures import Figure
 from schemas.signals import S
 
-# required targets: name -> (target, better)
+# Required targets by name: value, and "less" or "more".
 ASKED = {
     **{
         f"papers.004.{kind}.mae_{name}": (bar, "less")

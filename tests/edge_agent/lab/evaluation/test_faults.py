@@ -14,7 +14,7 @@ from edge_agent.lab.evaluation.campaign import DEFAULT
 from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, apply_fault
 from schemas.signals import Health, S
 
-# required fault -> the row that shows it
+# Required fault: name of the campaign's row that shows it.
 ASKED = {
     "dropout": "inertial-dropout",
     "stuck": "wheel-speed-stuck",
@@ -27,7 +27,7 @@ ASKED = {
     "time gap": "time-gap",
     "out-of-order sample": "sample-out-of-order",
 }
-HONEST = 0.75  # of the samples of six drives; one drive that is wrong to its end is a sixth
+HONEST = 0.75  # share of the samples of six drives; a drive that is wrong until its end is a sixth
 
 
 @pytest.fixture(scope="module")

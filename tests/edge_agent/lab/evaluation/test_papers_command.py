@@ -118,7 +118,7 @@ def test_paper_is_reproduced_and_written(tmp_path: Path) -> None:
 def test_plot_of_numbers_and_a_map_is_drawn() -> None:
     heat = Heat("", "position", "vertex", np.eye(3), ("a", "b", "c"), "pheromone")
     figure = draw_plot(PaperPlot("both", "Both", (*PLOT.panels, heat), 2))
-    assert len(figure.axes) == 3  # and the colour bar
+    assert len(figure.axes) == 3  # two panels and the colour bar
 
 
 def test_dugoff_tyres_in_the_plant_reach_the_printed_friction_error() -> None:

@@ -132,9 +132,8 @@ def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(
     batch, _ = driven
     one = np.ptp(batch.mu_wheel, axis=-1) == 0.0
     steady = one & (np.abs(np.gradient(batch.mu, axis=0)) == 0.0)
-    assert (real_world.in_use(batch) <= batch.mu)[
-        steady
-    ].mean() > 0.999  # it remembers a fifth of a second
+    # `in_use` has a memory of 0.2 s, so a few samples may exceed the friction.
+    assert (real_world.in_use(batch) <= batch.mu)[steady].mean() > 0.999
     assert real_world.in_use(batch).max() > 0.3
 
 

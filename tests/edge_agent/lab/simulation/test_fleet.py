@@ -79,9 +79,8 @@ def test_ideal_signals_are_those_of_the_truth(
     turned = np.diff(truth.yaw, axis=0) * fleet.rate_hz
     np.testing.assert_allclose(turned, signals[:-1, :, S.YAW_RATE], atol=0.1)
     ground = fleet.scenario.friction(t, truth.x, truth.y)
-    assert (
-        np.mean(np.abs(ground - truth.mu_wheel.mean(axis=2)) < 0.01) > 0.85
-    )  # elsewhere the wheels may be on two surfaces
+    # In the other samples the wheels may be on two surfaces.
+    assert np.mean(np.abs(ground - truth.mu_wheel.mean(axis=2)) < 0.01) > 0.85
 
 
 def test_everybody_stays_on_the_road(
@@ -91,7 +90,7 @@ def test_everybody_stays_on_the_road(
     lanes = fleet.scenario.network.points[:, [LanePoint.X, LanePoint.Y]]
     off = np.asarray(cKDTree(lanes).query(np.column_stack([truth.x.ravel(), truth.y.ravel()]))[0])
     assert np.quantile(off, 0.99) < 1.5
-    assert off.max() < 8.0  # black ice
+    assert off.max() < 8.0  # vehicles slide on black ice
     assert (truth.vx > 0.0).all()
 
 

@@ -78,12 +78,13 @@ def test_friction_may_jump_along_the_road_and_differ_from_side_to_side() -> None
     assert (mu[x > 45] == 0.3).all()
     log, _ = simulate_manoeuvre("braking", mu=split(0.8, 0.3), duration_s=2.0)
     assert wheels(log, "true_mu")[0].tolist() == [0.8, 0.3, 0.8, 0.3]
-    assert np.abs(column(log, "true_yaw")).max() > 0.01  # the side with grip pulls
+    # The brake forces of the side with grip turn the car.
+    assert np.abs(column(log, "true_yaw")).max() > 0.01
 
 
 def test_a_driver_keeps_a_split_stop_straight() -> None:
     log, _ = simulate_manoeuvre("split-braking")
-    assert np.abs(column(log, "true_y")).max() < 0.75  # each wheel still on its side
+    assert np.abs(column(log, "true_y")).max() < 0.75  # every wheel is still on its own side
     assert column(log, "true_vx")[-1] < 3.0
     assert np.abs(column(log, "delta_fl")).max() > 0.01
 

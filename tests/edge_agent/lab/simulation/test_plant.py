@@ -89,9 +89,8 @@ def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
 @pytest.mark.parametrize("seed", range(20))
 def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> None:
     x, p, u, w = some_instant(np.random.default_rng(seed))
-    force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(
-        1j * u[Control.STEER]
-    )  # the body's axes as the complex plane
+    # Forces as complex numbers: real part forward, imaginary part to the left.
+    force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(1j * u[Control.STEER])
     half = 0.5 * np.repeat([p[Parameter.TRACK_FRONT], p[Parameter.TRACK_REAR]], 2) * [1, -1, 1, -1]
     place = np.repeat([p[Parameter.TO_FRONT], -p[Parameter.TO_REAR]], 2) + 1j * half
     ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
@@ -146,7 +145,7 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
     assert x[Motion.AY_LAGGED] > 1.0
     assert w[Wheel.FZ, 1] > w[Wheel.FZ, 0]
     assert w[Wheel.FZ, 3] > w[Wheel.FZ, 2]
-    assert u[Control.STEER, 0] > u[Control.STEER, 1]  # the inner wheel turns more
+    assert u[Control.STEER, 0] > u[Control.STEER, 1]  # the inner wheel turns by a larger angle
 
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
@@ -216,9 +215,8 @@ def test_a_steady_circle_has_its_centripetal_acceleration() -> None:
         for name in ("true_vx", "true_vy", "true_ay", "true_yaw_rate")
     }
     speed = np.hypot(truth["true_vx"], truth["true_vy"])
-    assert truth["true_ay"].mean() == pytest.approx(
-        (speed**2).mean() / 40.0, rel=0.05
-    )  # the driven radius is not exactly 40 m
+    # The radius of the driven circle is not exactly 40 m.
+    assert truth["true_ay"].mean() == pytest.approx((speed**2).mean() / 40.0, rel=0.05)
     assert truth["true_ay"].mean() == pytest.approx(
         (truth["true_yaw_rate"] * truth["true_vx"]).mean(), rel=0.01
     )
@@ -269,7 +267,8 @@ OTHER_OPTIONS = {"curve": "dugoff", "stiffness": "proportional-to-friction", "mo
 
 @pytest.mark.parametrize("name", [f.name for f in fields(TrueVehicle) if f.name != "vehicle"])
 def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
-    of_controllers = name in ("tcs", "esc")  # which only vehicles with modulated slip control have
+    # Only vehicles with slip controllers have these parameters.
+    of_controllers = name in ("tcs", "esc")
     usual = replace(PRESETS["van"], abs_hz=8.0) if of_controllers else PRESETS["van"]
     mu = 0.3 if of_controllers else None
     if name in OTHER_OPTIONS:

@@ -73,9 +73,10 @@ def test_one_keeps_to_the_right_four_metres_from_the_other_lane(scenario: Scenar
         for point in there[10:-10]:
             offset = back[:, :2] - point[:2]
             nearest = offset[np.hypot(*offset.T).argmin()]
+            # The opposite lane lies 4 m to the left.
             assert nearest @ (-point[LanePoint.SIN], point[LanePoint.COS]) == pytest.approx(
                 4.0, abs=0.2
-            )  # to the left
+            )
 
 
 @EVERY
@@ -156,7 +157,7 @@ def test_the_demonstration_has_dry_wet_snowy_icy_and_split_roads() -> None:
         :, [LanePoint.SIN, LanePoint.COS]
     ] * [1, -1]
     sides = [scenario.friction(0.0, *side.T) for side in (left, right)]
-    assert (sides[0] > sides[1] + 0.1).sum() > 50  # [m] of lane
+    assert (sides[0] > sides[1] + 0.1).sum() > 50  # [m] length of lane
 
 
 def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:

@@ -80,7 +80,8 @@ def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope:
         vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=1e-9
     )
     used = np.mean([column(log, name)[-1] for name in per_wheel("true_utilisation")])
-    assert used == pytest.approx(abs(slope) / 0.85, rel=1e-9)  # tangent over friction
+    # Tangent of the slope over the friction.
+    assert used == pytest.approx(abs(slope) / 0.85, rel=1e-9)
 
 
 @pytest.mark.parametrize("slope", SLOPES)
@@ -105,7 +106,8 @@ def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
     )
     assert column(log, "ay")[-500:].mean() == pytest.approx(GRAVITY * sine(bank), rel=0.01)
     assert column(log, "true_bank")[-1] == pytest.approx(bank, rel=1e-3)
-    assert abs(column(log, "true_vy")[-1]) > 0.01  # the tyres hold against it with a slip angle
+    # The tyres carry the side force with a slip angle.
+    assert abs(column(log, "true_vy")[-1]) > 0.01
 
 
 @pytest.mark.parametrize("slope", [-0.06, 0.03])
@@ -146,9 +148,9 @@ def test_loads_sum_to_the_normal_weight_and_shift_downhill() -> None:
     wheel_forces(
         level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == Control.MU)[:, None], flat
     )
-    assert (w[Wheel.FZ, 2:] > flat[Wheel.FZ, 2:])[
-        0
-    ]  # uphill the rear carries more, and here the left lies lower
+    # Uphill the rear axle carries more load. The left side of this road lies lower, so the front
+    # left wheel carries more than the front right.
+    assert (w[Wheel.FZ, 2:] > flat[Wheel.FZ, 2:])[0]
     assert w[Wheel.FZ, 0] > w[Wheel.FZ, 1]
 
 
@@ -175,12 +177,11 @@ def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
     assert np.diff(stands.astype(int)).tolist().count(1) == 4
     assert stands.mean() > 0.05
     assert speed.max() > 9.0
-    assert speed.min() > -0.05  # between brake and gas it may roll back a little
+    assert speed.min() > -0.05  # between brake and accelerator the car may roll back slightly
     for name in per_wheel("omega"):
         assert not column(log, name)[stands].any()
-    held_fast = np.flatnonzero(
-        stands[:-1] & stands[1:]
-    )  # the last sample of a stand is that of the foot coming off
+    # The last sample of a stop is left out, because the driver releases the brake in it.
+    held_fast = np.flatnonzero(stands[:-1] & stands[1:])
     np.testing.assert_allclose(
         column(log, "ax")[held_fast], GRAVITY * sine(slope), rtol=1e-12, atol=1e-12
     )
@@ -201,9 +202,8 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
         east, north = slopes[7].tolist()
         there = slope_in_body(east, north, 0.3)
         back = slope_in_body(east, north, 0.3 + np.pi)
-        np.testing.assert_allclose(
-            there, np.negative(back), atol=1e-15
-        )  # uphill in one direction is downhill in the other
+        # A slope that rises in one direction falls in the other.
+        np.testing.assert_allclose(there, np.negative(back), atol=1e-15)
 
 
 def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
@@ -351,7 +351,7 @@ def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> N
     (_, reported) = mixed.step(2000)
     np.testing.assert_array_equal(usual[:, ::2], reported[:, ::2])
     assert not np.array_equal(usual[:, 1], reported[:, 1], equal_nan=True)
-    assert (mixed.truth.vx[:, 1::2] == 0.0).any()  # their drivers stop now and then
+    assert (mixed.truth.vx[:, 1::2] == 0.0).any()  # drivers of rough vehicles stop now and then
     assert (mixed.truth.vx[:, ::2] > 0.0).all()
 
 
@@ -370,9 +370,8 @@ def test_the_road_under_a_car_is_smooth() -> None:
     speed = np.abs(fleet.truth.vx)
     driven = np.maximum(speed[1:], 1.0) / 100.0
     assert np.ptp(slope) > 0.06
-    assert (
-        np.abs(np.diff(slope, axis=0)) / driven
-    ).max() < 0.03  # per metre; at 10 m/s, 3 m/s^2 in a second
+    # Change of slope per metre. At 10 m/s, .03 would change a_x by 3 m/s^2 within a second.
+    assert (np.abs(np.diff(slope, axis=0)) / driven).max() < 0.03
 
 
 def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:

@@ -93,8 +93,8 @@ def test_metres_go_to_degrees_and_back() -> None:
         GOTHENBURG.from_latlon(*GOTHENBURG.to_latlon(x, y)), (x, y), atol=1e-6
     )
     latitude, longitude = GOTHENBURG.to_latlon(x, y)
-    assert latitude[1] < latitude[0]  # y is north
-    assert longitude[1] > longitude[0]  # x is east
+    assert latitude[1] < latitude[0]  # y points north
+    assert longitude[1] > longitude[0]  # x points east
 
 
 def test_a_rolling_body_lets_gravity_into_the_accelerometer() -> None:
