@@ -32,28 +32,32 @@ from schemas.thresholds import SLIPPERY_MU
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
 
-# kinds of vote
+# kinds of report, see `kind_of`
 BOUND = 0
 VALUE = 1
 _BINS: Final = mugrid.BINS
-_DIFFUSION: Final = (
-    0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
-)  # bins² per second, half the variance
-# largest share that leaves a bin to each side in one diffusion step: stable and without ripple
+# [bins²/s] Diffusion coefficient of the slow change of μ: half the variance gained per second.
+_DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
+# Largest share of a bin that moves to each neighbouring bin in one diffusion step. A larger share
+# makes the scheme unstable or adds ripples.
 _STEP: Final = 0.25
-_STEPS: Final = 64  # one day; by then the change hazard has levelled everything
-_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)  # of steps
+# Largest number of diffusion steps. They cover one day; after a day, sudden changes have replaced
+# the belief by the prior.
+_STEPS: Final = 64
+# likelihood for each number of steps below the maximum
+_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
 _EDGE: Final = (SLIPPERY_MU - mugrid.LOWER) / c.BIN_WIDTH
-SLIPPERY_SHARE: Final[FloatArray] = np.clip(
-    _EDGE - np.arange(_BINS), 0.0, 1.0
-)  # of each bin that lies below SLIPPERY
+# share of each bin that lies below SLIPPERY_MU
+SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
 FULL: Final = np.uint16(65535)
-# bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
+# Number of bins on each side at which the bias kernel is cut off: 3.6 of its largest standard
+# deviation.
 REACH: Final = 6
-# single precision has numbers below 1e-38 that cost a hundred times as much to multiply
+# Smaller weights of the kernel become zero. They would lead to single-precision numbers below
+# 1e-38, whose multiplication takes a hundred times as long.
 _LEAST_TAP: Final = 1e-9
 PADDED: Final = _BINS + 2 * REACH
 

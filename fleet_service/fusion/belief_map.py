@@ -23,8 +23,8 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
-# What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape:
-# (kernels, 2, 32).
+# Contribution of each bin of a stored belief to P(slippery) of the road, and to the sum of its
+# probabilities. One array (kernels, 2, 32) per slope in `shared.SHAPES`.
 SLIPPERY_WEIGHTS: Final = tuple(
     np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
 )

@@ -88,9 +88,8 @@ class Fusion(BeliefMap):
     def __init__(self, lateness_s: float, *, enrolled: bool = False) -> None:
         self.enrolled = enrolled
         self._lateness_ns = int(lateness_s * NS)
-        self._kept_epochs = (
-            self._lateness_ns // c.EPOCH_NS + 2
-        )  # whose trust an observation in time may still need
+        # number of epochs whose vote weights an observation in time may still need
+        self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2
         self._epoch: int | None = None
         self.reports: Reports = no_reports()
         super().__init__(
@@ -214,9 +213,8 @@ class Fusion(BeliefMap):
             for f in fields(Reports)
         )
         self.reports = Reports(*columns)
-        if (
-            self.checkpoint is not None
-        ):  # all that a belief may still ask for is younger than its last visit
+        # Beliefs are aged from the times of their last visits. Earlier weather has no effect.
+        if self.checkpoint is not None:
             self.reports = _drop_old_reports(self.reports, self._oldest())
         self._weather = weather_of(self.reports)
 
@@ -261,9 +259,8 @@ class Fusion(BeliefMap):
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
     ) -> tuple[IntArray, BoolArray]:
-        rows = rows[
-            np.argsort(o.time[rows], kind="stable")
-        ]  # in the order of time nothing is computed again
+        # Sort by time, so that no row of the batch makes the belief after another one stale.
+        rows = rows[np.argsort(o.time[rows], kind="stable")]
         at, keys, share = _spread_votes(o, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))

@@ -136,7 +136,8 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
         entries=records["entries"],
         free_entries=_pad_rows(image["free_entries"]["row"], len(records["entries"])),
         pairs=records["pairs"],
-        settled=records["settled"].copy(),  # owns its memory, so that it can be resized
+        # Copies own their memory, so that `settle_pairs` can resize them.
+        settled=records["settled"].copy(),
         settled_keys=image["settled_reports"]["key"].copy(),
         settled_std=image["settled_reports"]["std"].copy(),
         settled_begin=image["settled_reports"]["begin"].reshape(-1, 2).copy(),

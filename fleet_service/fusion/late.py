@@ -30,8 +30,10 @@ from schemas.numeric import ByteArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
-LATE_MOST_NS: Final = int(c.CHANGE_S) * NS  # older news is mostly of another road
-_PLACES_NS: Final = NS  # after the checkpoint, in which late visits stand
+# [ns] Age to which late visits are limited. After this time, the road has probably changed.
+LATE_MOST_NS: Final = int(c.CHANGE_S) * NS
+# [ns] Interval directly after the checkpoint in which late visits get their times.
+_PLACES_NS: Final = NS
 _FLOOR: Final = mugrid.FLOOR_STEPS
 
 

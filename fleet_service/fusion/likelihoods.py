@@ -26,8 +26,9 @@ from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
+# Half a standard deviation of the grip used. A bound is flat from the grip used minus this.
 _LESS: Final = 0.5 * c.UTILISED_STD
-# of the grip used where its bound is looked up, rounded down: a seventh of a bin
+# Step of the grip used in the table of bounds; the grip used is rounded down. A seventh of a bin.
 _USED_STEP: Final = 0.005
 
 

@@ -62,15 +62,17 @@ from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
 _BINS: Final = mugrid.BINS
+# P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
-# A belief at rest that is slippery with less tells nothing, however it is read: time takes it to
-# the prior.
-_ASKED: Final = 0.2  # the prior's .3 and what K adds to it
-_WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
-_X: Final = 0x5555555555555555 & _WHOLE  # those of its column
+# A neighbour whose stored P(slippery) is below this is skipped. Ageing moves it towards the prior's
+# .30 and the kernel K adds little, so its message would have little or no weight.
+_ASKED: Final = 0.2
+_WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell number
+_X: Final = 0x5555555555555555 & _WHOLE  # bits of the column number; `_Y`: of the row number
 _Y: Final = _WHOLE - _X
 _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
-_BEFORE, _BEHIND, _ACROSS = range(3)  # sides; across: the other direction of the road
+# sides of a cell; across: the opposite direction of the road
+_BEFORE, _BEHIND, _ACROSS = range(3)
 
 
 @refcount_free_inlined

@@ -21,12 +21,13 @@ from schemas.signals import FLAGS
 from schemas.thresholds import SLIPPERY_MU
 
 SmallArray = NDArray[np.int8]
-# more than a batch has rows: seq and row become one number that keeps their order
+# Larger than the number of rows of a batch. Batch number and row become one number in this way.
 ROWS_PER_SEQ: Final = 64
-# of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
+# Share of its value that a vehicle is assumed to have used if it does not report the grip used. It
+# is below EXCITED_SHARE, so the assumption is cautious.
 UNTOLD_SHARE: Final = 0.5
-USED_MOST: Final = 2.0  # of the grip, as in the contract
-_US: Final = 1000  # ns: the archive keeps whole microseconds
+USED_MOST: Final = 2.0  # largest grip used that the contract allows
+_US: Final = 1000  # [ns] one microsecond, the resolution of times in the archive
 
 
 @dataclass(frozen=True, kw_only=True)

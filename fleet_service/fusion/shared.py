@@ -48,15 +48,18 @@ from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, Z_95
 
 DRIVING, BRAKING, LEFT, RIGHT = range(MANOEUVRES)
-UNKNOWN: Final = -1  # of a sender that does not tell: as most others do
-USED_STEP: Final = 0.08  # of the table's rows
+# kind of manoeuvre if the sender does not report it; counted as the cell's most frequent kind
+UNKNOWN: Final = -1
+# Axes of the table of kernels: mean grip used (USED_ROWS steps of USED_STEP), shared error σ_s (the
+# nearest entry of STATED), n_eff (the next smaller entry of KINDS).
+USED_STEP: Final = 0.08
 USED_ROWS: Final = 16
-STATED: Final = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2)  # σ_s of the table; the nearest one is taken
+STATED: Final = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2)
 _BORDERS: Final = tuple(0.5 * (a + b) for a, b in pairwise(STATED))
-KINDS: Final = (1.0, 1.5, 2.2, 3.0)  # n_eff of the table's columns; the next smaller one is taken
-TENTH_NS: Final = 360 * NS  # weights fade at the borders of so much time
+KINDS: Final = (1.0, 1.5, 2.2, 3.0)
+TENTH_NS: Final = 360 * NS  # [ns] the weights of a cell fade in steps of this length
 _FADES: Final = np.exp(-np.arange(64) * TENTH_NS / NS / c.VOTE_RENEWAL_S).astype(np.float32)
-_MOST: Final = 255.0
+_MOST: Final = 255.0  # largest number that a byte holds
 
 
 def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
@@ -111,7 +114,8 @@ class Shape(NamedTuple):
         return self.reader + Z_95 * self.std
 
 
-SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)  # doubts of the tables; the nearest one is taken
+# Slopes (error of a value per unit of unused grip) with a table of kernels; the nearest is used.
+SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)
 UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
 
 
@@ -170,7 +174,8 @@ def _kernel_table(slope: float) -> Float32Array:
     return np.stack([base_kernel().T, *rows]).astype(np.float32)
 
 
-# By the fleet's shape; handed to kernels, since a global of this size is not kept in their cache.
+# One table of kernels per slope in SHAPES. Compiled functions get a table as an argument, because a
+# global of this size would prevent the cache of compiled code.
 KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
@@ -276,5 +281,5 @@ def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
             cells[row].untrusted[k] = np.uint16(cells[row].untrusted[k] * _FADES[borders])
         for k in range(MANOEUVRES):
             weight = cells[row].manoeuvres[k]
-            if weight > 0:  # never to nothing: that there were values is not forgotten
+            if weight > 0:  # at least 1 remains, which records that the cell has had values
                 cells[row].manoeuvres[k] = np.uint8(max(weight * _FADES[borders], 1.0))

@@ -25,7 +25,7 @@ from schemas import grid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 from schemas.thresholds import EARTH_RADIUS_M
 
-_EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # circumference at the equator
+_EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # [m] circumference at the equator
 _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
 
 

@@ -38,7 +38,7 @@ from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, SLIPPERY_MU
 
-_LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
+_LEAST_VARIANCE: Final = 1e-4  # relative; no vehicle measures μ more exactly than to 1 %
 
 
 @refcount_free
@@ -76,7 +76,8 @@ def compare_reports(
                 variance = _own_variance(mean, std) + _own_variance(
                     float(here.mean[k]), float(here.std[k])
                 )
-                if difference * difference < c.PEERS_DISAGREE**2 * variance:  # both of one road
+                # only if both values belong to the same road
+                if difference * difference < c.PEERS_DISAGREE**2 * variance:
                     _note_shape(peers, vehicle, (used - here.used[k]) / both, difference, variance)
             break
         if reported[k] < reported[place]:

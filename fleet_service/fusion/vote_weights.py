@@ -11,7 +11,8 @@ import numpy as np
 from fleet_service.fusion import constants as c
 from schemas.numeric import BoolArray, Float32Array, IntArray
 
-# Columns of the archive for corrections of a vehicle's values, of which this fusion makes none.
+# Archive columns for corrections of a vehicle's values, with the values of "no correction". This
+# fusion corrects no value.
 UNCORRECTED: Final = {"bias": 0.0, "bias_std": c.BIAS_RELATIVE, "spread": 1.0, "slope": 0.0}
 
 

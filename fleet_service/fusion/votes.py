@@ -48,18 +48,18 @@ from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
-# Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and
-# `convolve_bias`, the likelihood.
+# Rows of the scratch memory (3, SCRATCH), single precision: belief; padded copy for `forget` and
+# `convolve_bias`; likelihood.
 P = 0
 PADDED = 1
 LIKELIHOOD = 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
-# Mean of "at least EXCITED_SHARE" against the uniform prior. A bound of so much grip used is a
-# source of grip: only dry road gives it. On the best roads values lie at the grid's end and are
-# bounds.
+# A bound is a source of grip if its mean under the uniform prior is at least this, the mean of "μ
+# is at least EXCITED_SHARE". Only dry road allows so much grip to be used. On the best roads values
+# are cut off at the end of the grid and become bounds, so bounds must count.
 _GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
-_GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first that is no ice
-_NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
+_GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first bin above SLIPPERY_MU
+_NEITHER: Final = 0.5  # P(slippery) of a report that shows neither ice nor grip
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 
@@ -182,7 +182,8 @@ def _from_parts(parts: int) -> np.float32:
 
 @refcount_free_inlined
 def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
-    if kind == BOUND:  # the mean of "at least u" against the uniform prior moves by half of u
+    # If the bound u rises, the mean of "at least u" under the uniform prior rises by half as much.
+    if kind == BOUND:
         share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
     else:
         deviations = abs(new_mean - mean) / math.hypot(std, new_std)

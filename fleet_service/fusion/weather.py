@@ -22,27 +22,35 @@ from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import refcount_free
 from schemas.thresholds import NS
 
-VALID_NS: Final = 3 * 3600 * NS  # a service's forecasts and stations renew hourly; two may fail
-WET_MM_H: Final = 0.1  # least that a gauge tells from nothing
-# Water on a road takes, and leaves, some tenths of an hour; a shower passes in as much (CHANGE_S /
-# 4 is 45 minutes).
+# [ns] Time for which a report is valid. Weather services and stations report hourly, so two reports
+# may fail.
+VALID_NS: Final = 3 * 3600 * NS
+WET_MM_H: Final = 0.1  # [mm/h] least precipitation that a gauge measures
+
+# Factors on the rates of change and of drift, for weather as reported.
+
+# Precipitation: roads become wet or dry, and showers pass, in less than an hour. With this factor,
+# the mean time between changes is 45 minutes.
 WET_CHANGE: Final = 4.0
 WET_DRIFT: Final = 2.0
-# Around freezing the same water is ice, slush or wet within minutes, and salt comes: CHANGE_S / 8
-# is 22 minutes.
-FREEZING_C: Final = (-4.0, 1.0)  # road; below, snow is dry and the road keeps
-AIR_ABOVE_ROAD_C: Final = 2.0  # a road radiates: so much colder than the air on a clear night
+# [°C] Range of road temperature around freezing. Below it, snow stays dry and roads change less.
+FREEZING_C: Final = (-4.0, 1.0)
+# [K] Assumed difference if only the air temperature is known: on a clear night radiation cools the
+# road by this much.
+AIR_ABOVE_ROAD_C: Final = 2.0
+# Precipitation around freezing: within minutes the road may have ice, slush, water or salt. With
+# this factor, the mean time between changes is 22 minutes.
 FREEZING_CHANGE: Final = 8.0
-# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge tells of
-# them. With less a road that was dry was called safe half an hour after black ice came under
-# drivers who use a fifth of the grip.
+# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge reports
+# them. With a smaller factor, a dry road was still called safe half an hour after black ice formed,
+# if drivers used a fifth of the grip.
 FROST_CHANGE: Final = 8.0
-# Warm and dry nothing comes over a road but dirt: it keeps twice as long. Not more: a gauge is not
-# on this road.
+# Warm and dry: only dirt changes a road, so beliefs last twice as long. A smaller factor would
+# trust the gauge too much, because it is not at this road.
 STEADY_CHANGE: Final = 0.5
-STEADY_C: Final = 5.0
-# A prior from outside is a guess about a region and not about this road: with this share it is
-# uniform all the same, so that a wrong one is outvoted by two vehicles.
+STEADY_C: Final = 5.0  # [°C] least road temperature for this
+# Weight of the uniform prior in the prior that a report gives. Such a prior is a guess about a
+# region, not about one road. With this weight, two vehicles outvote a wrong one.
 UNIFORM_SHARE: Final = 0.5
 
 
@@ -98,7 +106,7 @@ def report_rates(reports: Reports) -> FloatArray:
         reports.air_temperature - AIR_ABOVE_ROAD_C,
         reports.road_temperature,
     )
-    # both False where unknown
+    # Both are False if the precipitation is unknown.
     wet = reports.precipitation >= WET_MM_H
     dry = reports.precipitation < WET_MM_H
     freezing = (road >= FREEZING_C[0]) & (road <= FREEZING_C[1])
@@ -172,7 +180,7 @@ def no_reports() -> Reports:
     return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))
 
 
-_SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key to its region
+_SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # bits from a slot's key to its region
 
 
 @refcount_free

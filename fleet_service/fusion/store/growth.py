@@ -75,7 +75,7 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     `names` (V,) are the records of the vehicles, and `size` is the number of slots (one per cell
     and heading sector) in use.
     """
-    most = int(state.used[PAIRS])  # of which there will be as many again
+    most = int(state.used[PAIRS])  # the table keeps its size, because as many pairs will follow
     reports, values = drop_reports(state, names, now)
     begins = np.empty((size + 1, 2), np.uint32)
     begins[: len(state.settled_begin)] = state.settled_begin

@@ -34,21 +34,24 @@ from schemas.runtime.records import RecordArray, record_type
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
-# sides: what a corroborating source reported
+# side of a report: grip or ice
 GRIP = 0
 ICE = 1
-SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
-# What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16
-# bits: parts of 1/FINE, and below 4 all. In the window as before the checkpoint, so that it does
-# not matter which of the two is asked.
+# Number of vehicles remembered per slot that reported grip, and per slot that reported ice. An
+# alert never needs more.
+SOURCES: Final = 5
+# Units of numbers that records store as integers; a record holds the number times this factor. A
+# vehicle's last mean, standard deviation and used-up votes (FINE) have 16 bits and are below 4.
+# Open windows and final records use the same units, so both give the same result.
 FINE: Final = 16384.0
-AGED: Final = 4096.0  # likewise; never more than FORGET_S
+AGED: Final = 4096.0  # [1/s]; times up to FORGET_S
 USED: Final = 100.0
 SHARED: Final = 400.0
 WEIGHT: Final = 16.0
 UNTRUSTED: Final = 64.0
 MANOEUVRES: Final = 4
-# a slip controller's intervention: none, of a flag with a bad record, of one with a good record
+# Intervention of a slip controller: none; reported by a vehicle whose interventions often disagree
+# with values of others; reported by a vehicle whose interventions usually agree.
 _NO_FLAG, CLAIMED, HEEDED = range(3)
 
 Int32Array = NDArray[np.int32]
@@ -313,9 +316,9 @@ class Rows(NamedTuple):
     reporters: RecordArray
 
 
-# Places of `State.used`: how many windows and entries are free, how many active pairs and rows of
-# reporters are in use; time [s] before which no settled report was made; number of vehicles when
-# pairs were last settled.
+# Indices into `State.used`: numbers of free windows and of free entries; numbers of active pairs
+# and of rows of reporters in use; time [s] before which no settled report was made; number of
+# vehicles when pairs were last settled.
 FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED, SETTLED_SINCE, SETTLED_VEHICLES = range(6)
 
 

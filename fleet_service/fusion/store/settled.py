@@ -20,7 +20,8 @@ from schemas.runtime.records import RecordArray
 
 _VALUES_S: Final = int(c.FORGOTTEN_S)
 _BOUNDS_S: Final = int(c.VOTE_RENEWAL_S)
-_FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+# 2⁶⁴ divided by the golden ratio: the multiples of this number are far apart (Fibonacci hashing).
+_FIBONACCI = np.uint64(0x9E3779B97F4A7C15)
 # flag of a key: the pair is active again, so the report is not valid
 _MOVED: Final = np.uint32(1)
 
@@ -260,7 +261,7 @@ def insert_reports(
                 if kind == VALUE:
                     to_value -= 1
                     state.settled_std[to_value] = this.std
-        if to == end:  # all others are at their places
+        if to == end:  # all reports before this one are already at their places
             break
         while end > begin:
             end -= 1

@@ -50,8 +50,9 @@ from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
 
 _NOTHING = np.zeros(0, np.int32)
-_HOUR = 3600
-# s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
+_HOUR = 3600  # [s]
+# [s] Time by which the checkpoint may be ahead of the clock: with little lateness, the rest of an
+# epoch.
 _AHEAD = 120
 
 
@@ -225,7 +226,8 @@ class Store:
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
         state = self.state
         resting = int(state.used[PAIRS]) - self.waiting
-        # resting pairs take five times the memory of settled ones, and settling reads all
+        # A resting pair takes five times the memory of a settled one, but settling reads all
+        # settled pairs. So settle only if enough pairs rest.
         some = (len(state.settled) + self.size) // 32
         if now != self.forgotten_at or resting > max(LEAST, self.waiting, some):
             self.state = settle_pairs(state, self.names[: self.vehicles], self.size, now)

@@ -27,13 +27,16 @@ from schemas.runtime.jit import compiled, refcount_free_inlined
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
-LEAST: Final = 1024  # places of a new table
-# share of the places that rows take: eight of them are a line, and probes cost little
+LEAST: Final = 1024  # number of places of a new table
+# Largest share of a table's places that may be in use. Eight places of the table of rows fit into
+# one cache line, so a longer search costs little.
 ROWS_MOST: Final = 0.8
-PAIRS_MOST: Final = 0.7  # ... that pairs take, of which two are a line: two or three probes
+# The same for the table of pairs. Two places fit into a line, and a search reads two or three.
+PAIRS_MOST: Final = 0.7
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
-# rows whose memory is prefetched before they are worked on, so that it comes for all at once
+# Number of rows for which memory is prefetched before the work on them, so that the memory accesses
+# overlap.
 AHEAD: Final = 128
 
 
