@@ -9,7 +9,7 @@ The names of `__all__` are the public interface; each is loaded on first access.
 
 from __future__ import annotations
 
-import gripmap  # noqa: F401 says which other package hides one of ours, where one does
+import gripmap  # noqa: F401 reports another installed package that hides one of this project
 from schemas.runtime import lazy_exports
 
 _FACE = {

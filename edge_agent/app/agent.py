@@ -235,7 +235,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    # `signal.signal` passes both arguments
+    # `signal.signal` requires a function with these two arguments.
     def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         stop.set()
         signal.signal(number, signal.SIG_DFL)

@@ -30,7 +30,9 @@ from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 PAGE = ".html"
 IMAGES = (".png", ".svg", ".pdf")
 ENDINGS: Final = (PAGE, *IMAGES)
-MOST_POINTS: Final = 1500  # of a curve on the page; more are thinned, extremes of the band kept
+# Largest number of points of a curve on the page. Longer curves are thinned, but the extremes of
+# the interval remain.
+MOST_POINTS: Final = 1500
 WIDTH = 900
 HEIGHT = 150
 LEFT = 56
@@ -137,9 +139,8 @@ def page_of(drive: RecordedDrive) -> str:
         "slippery": SLIPPERY_MU,
         "estimators": [{"name": name, "colour": line_of(name).colour} for name in drive.estimates],
     }
-    text = json.dumps(data, allow_nan=False).replace(
-        "<", "\\u003c"
-    )  # no value can end or open a tag
+    # Escape "<", so that no value can open or close an HTML tag.
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     found = _TEMPLATE.read_text(encoding="utf-8")
     return found.replace("<!--TITLE-->", html.escape(drive.title)).replace("/*DATA*/null", text)
 

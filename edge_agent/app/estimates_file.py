@@ -49,7 +49,7 @@ def write_table(field: str, path: Path, table: pa.Table) -> None:
         writer.write_table(table)
 
 
-def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a class of Arrow
+def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 an Arrow class
     if path.suffix not in ENDINGS:
         problem = f"{path.name} has no known ending"
         fix = f"use one of {', '.join(name for name in ENDINGS if name)}"

@@ -21,11 +21,11 @@ from schemas.thresholds import NS
 
 FRICTION: Final = tuple(f"{BRANCH}.{name}" for name in ("MostProbable", "LowerBound", "UpperBound"))
 CONDITION: Final = "Vehicle.Exterior.RoadSurfaceCondition"
-# Friction separates ice from all else, and a dry road from all else (Pacejka 2012, ch. 1: packed
-# snow has .2 and more, wet asphalt .8 and less); between them several conditions have the same.
-ICE_BELOW: Final = 20.0  # [%] upper bound
-DRY_ABOVE: Final = 80.0  # [%] lower bound
-WRITE_S: Final = 2.0  # for one value
+# Only ice and a dry road can be recognised by friction: packed snow has at least 20 %, and wet
+# asphalt at most 80 % (Pacejka 2012, ch. 1). Between the limits, several conditions are possible.
+ICE_BELOW: Final = 20.0  # [%] limit for the upper bound of friction
+DRY_ABOVE: Final = 80.0  # [%] limit for the lower bound of friction
+WRITE_S: Final = 2.0  # [s] timeout for writing one value
 LEAVE_S: Final = 5.0
 
 log = logging.getLogger(__name__)
@@ -136,7 +136,8 @@ class KuksaProvider:
                 log.warning("the databroker rejects %s: %s", path, error.details())
             else:
                 self._log_problem(f"{code.name}: {error.details()}")
-            self.refused += 1  # after the log line, so that whoever sees the count finds the line
+            # Count after writing the log line, so that the line exists when the count is visible.
+            self.refused += 1
             return code not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
         self._log_problem("")
         self.written += 1

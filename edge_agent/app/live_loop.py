@@ -23,8 +23,10 @@ from schemas.runtime import watchdog
 from schemas.wire import Kind
 
 STATUS_EVERY_S = 5.0
-STOPPED_DRAIN_S = 1.7  # a signalled agent is gone within 3 s, with a second for sessions that hang
-ENDED_DRAIN_S = 10.0  # at its own end it may wait for a busy service
+# [s] time to send remaining records after a signal. The agent then ends within 3 s, including one
+# second for sessions that hang.
+STOPPED_DRAIN_S = 1.7
+ENDED_DRAIN_S = 10.0  # [s] the same at the end of the signals, when the agent may wait longer
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +90,7 @@ def run_live_loop(
         options.after()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
-            # the first block may have had to load kernels
+            # Start the clock after the first block, which may have loaded compiled kernels.
             started = options.clock()
             first = float(block.t.min())
         length = float(block.t.max()) - first - progress.signals_s

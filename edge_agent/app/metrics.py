@@ -12,9 +12,9 @@ from schemas.runtime.link_watch import link_metrics
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
-BEHIND_S: Final = 1.0  # of real time, from which on the agent is too slow for its vehicles
-UNANSWERED_S: Final = 60.0  # without any answer: longer than a service takes to start again
-FULL: Final = 0.9  # of the outbox
+BEHIND_S: Final = 1.0  # [s] delay from which the agent is too slow for its vehicles
+UNANSWERED_S: Final = 60.0  # [s] time without any answer; a service needs less to restart
+FULL: Final = 0.9  # share of the outbox in use from which it counts as full
 _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 

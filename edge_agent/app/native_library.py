@@ -86,7 +86,7 @@ def build_agent_library(path: Path) -> None:
     pipeline = Pipeline(bank_of(config.estimator, [load_vehicle("class:compact")]), 1, config)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
     context = np.full((1, 1, len(CONTEXT)), np.nan)
-    with np.errstate(all="ignore"):  # the outputs have no values, because nothing runs
+    with np.errstate(all="ignore"):  # outputs are undefined, because kernels are only recorded
         pipeline.step(Block(np.zeros((1, 1)), np.zeros((1, 1), np.int64), signals, context))
         pipeline.beliefs()
     build_library(recorder, path)

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
 IMPLAUSIBLE: Final = 3  # exit code
-FURTHEST_SPEED: Final = 0.15  # median of |v_x − wheels| over the wheels' speed
-LEAST_SPEED: Final = 3.0  # [m/s] below which speeds are not compared
-MOST_VIOLATION: Final = 0.05  # share of samples whose upper bound lies below the grip in use
-SLACK: Final = 0.05  # of that comparison: half a metre per second squared of a tilted mount
-# over which the grip in use is taken, as long as a tyre takes to build its force up
+FURTHEST_SPEED: Final = 0.15  # largest median of |v_x − wheel speed| / wheel speed
+LEAST_SPEED: Final = 3.0  # [m/s] speeds are compared above this value
+MOST_VIOLATION: Final = 0.05  # largest share of samples with an upper bound below the grip in use
+# Tolerance of this comparison: a tilted mount changes the acceleration by 0.5 m/s^2.
+SLACK: Final = 0.05
+# [s] window over which the grip in use is averaged: the time in which a tyre builds up its force.
 SMOOTHED_S: Final = 0.2
 MOST_RESETS_PER_S: Final = 0.2
 

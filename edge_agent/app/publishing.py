@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from edge_agent.app.live_loop import Progress
     from edge_agent.publish.publisher import Publisher
 
-FLEET = "fleet"  # {name} in the path of an outbox, if it serves many vehicles
+FLEET = "fleet"  # value of {name} in the path of an outbox that serves many vehicles
 
-# Set when a session or a source hangs, on a frozen router, say: what its library does at the exit
-# may wait for it. So the command line ends the process itself, once the command has closed its
-# files and its exit code is known.
+# Event that is set if a session or a source hangs, for example because a router is frozen. Its
+# library might then wait at the exit of the process. Therefore the command line ends the process
+# itself, after the command has closed its files and returned its exit code.
 left_behind = threading.Event()
 
 
@@ -44,9 +44,9 @@ def open_publisher(
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
 
-    for (
-        name
-    ) in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
+    # Check the settings here, so that a bad one or a missing certificate raises an error now and
+    # not later in a thread.
+    for name in names:
         configuration(config.zenoh, name)
     spool = prepare_path("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
     outbox = Outbox(

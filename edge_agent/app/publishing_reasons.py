@@ -14,11 +14,13 @@ from edge_agent.publish.ack_settlement import Counts
 from schemas.runtime.process import LogLine
 from schemas.signals import S
 
-FIRST_S: Final = 3.0  # after the first block: a session opens and a receiver fixes meanwhile
+# [s] time from the first block to the first check. Meanwhile a session opens and a receiver finds
+# its position.
+FIRST_S: Final = 3.0
 EVERY_S: Final = 1.0
-MISSING_S: Final = 2.5  # a receiver of 1 Hz may miss a fix
+MISSING_S: Final = 2.5  # [s] a receiver of 1 Hz may omit one fix
 UNANSWERED_S: Final = 4.0
-STANDING: Final = 0.5  # rad/s of every wheel: slower than a walking pace
+STANDING: Final = 0.5  # [rad/s] speed of the wheels below a walking pace
 _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 

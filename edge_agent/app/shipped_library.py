@@ -24,7 +24,7 @@ BUILD: Final = "edge_agent.app.native_library"
 LEVEL_3: Final = (
     "abm avx avx2 bmi1 bmi2 cx16 f16c fma lahf_lm movbe popcnt sse4_1 sse4_2 ssse3 xsave"
 )
-# what a processor of each level has, in the words of /proc/cpuinfo; the fastest level first
+# Processor features of each level by their names in /proc/cpuinfo, the fastest level first.
 FEATURES: Final = {
     "x86-64-v4": f"{LEVEL_3} avx512bw avx512cd avx512dq avx512f avx512vl",
     "x86-64-v3": LEVEL_3,

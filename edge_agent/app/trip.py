@@ -32,10 +32,12 @@ from edge_agent.inputs.profile import Profile
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
 
-PART_S: Final = 600.0  # 9 MB of signals
-LOOK_S: Final = 30.0  # between two examinations until one has passed
-LEAST_S: Final = 60.0  # of a part that teaches
-MOST_DRIVES: Final = 50  # parts that are remembered: tyres wear, and are changed
+PART_S: Final = 600.0  # [s] length of a section, 9 MB of signals
+LOOK_S: Final = 30.0  # [s] time between examinations until one finds no fault
+LEAST_S: Final = 60.0  # [s] least length of a section for learning
+# Largest number of remembered sections. Older ones are forgotten, because tyres wear and are
+# replaced.
+MOST_DRIVES: Final = 50
 LEAVE_S: Final = 1.0
 
 log = logging.getLogger(__name__)
@@ -82,9 +84,8 @@ class Trip:
         self.vehicle = vehicle.model_copy(
             update={"calibration": surer_values(vehicle.calibration, learned)}
         )
-        self._blocks: list[
-            tuple[FloatArray, FloatArray, FloatArray]
-        ] = []  # of this part: t, signals, ground
+        # Blocks of the current section: t, signals, ground.
+        self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self._since = self._looked = 0.0
         self._faults: list[str] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")

@@ -16,7 +16,8 @@ from schemas.config import explain
 from schemas.errors import InputError
 
 FOLDER: Final = Path(__file__).parent / "tuned"
-WAYS: Final = ("default", "random", "colony")  # untuned memberships, the control, the ant colony
+# Untuned memberships, random search as the control, and the ant colony.
+WAYS: Final = ("default", "random", "colony")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]

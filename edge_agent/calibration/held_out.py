@@ -27,9 +27,9 @@ GROUPS: Final = {
     "torque": ("force_gain",),
 }
 MOST_FOLDS: Final = 3
-LEAST_PART_S: Final = 20.0  # of a drive that is cut in two, each part
-WORSE: Final = 0.02  # [nat/s] below which a difference of predictions is rounding
-LONGER: Final = 0.005  # of the time in contradiction, likewise
+LEAST_PART_S: Final = 20.0  # [s] least length of each half of a single drive
+WORSE: Final = 0.02  # [nat/s] a smaller difference between predictions is rounding
+LONGER: Final = 0.005  # a smaller difference between times in contradiction is rounding
 
 Drive: TypeAlias = tuple[FloatArray, FloatArray]
 """A drive: times (T,) [s] and signals (T, 18)."""
@@ -40,8 +40,8 @@ class Prediction(NamedTuple):
     drive's measurements.
     """
 
-    log_likelihood: float  # of the innovations [nat/s]
-    contradicted: float  # share of the time
+    log_likelihood: float  # log-likelihood of the innovations [nat/s]
+    contradicted: float  # share of the time in contradiction
 
 
 class HeldOut(NamedTuple):

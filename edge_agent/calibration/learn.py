@@ -48,11 +48,11 @@ from schemas.signals import WHEELS
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Calibration, Vehicle
 
-CALM: Final = 0.7  # [m/s^2] of acceleration, up to which wheels hardly slip
-PULLED: Final = 0.5  # [m/s^2] from which on torque tells its gain
-STRAIGHT: Final = 1.0  # [m/s^2] of v·r
-LEAST_S: Final = 10.0  # of moments that count
-# spread among drives that is always allowed for; what drives have in common; and spread among cars
+CALM: Final = 0.7  # [m/s^2] longitudinal acceleration up to which wheels hardly slip
+PULLED: Final = 0.5  # [m/s^2] least acceleration at which torque shows its gain
+STRAIGHT: Final = 1.0  # [m/s^2] largest v·r on a straight
+LEAST_S: Final = 10.0  # [s] least duration of the usable moments
+# Least standard deviation between drives, in the unit of each quantity.
 FLOOR: Final = {
     "radius": 0.0004,
     "ax": 0.10,
@@ -65,6 +65,7 @@ FLOOR: Final = {
     "wheel_lag": 0.012,
     "steer_lag": 0.012,
 }
+# Standard deviation of the error that all drives of a car have in common.
 BIAS: Final = {
     "radius": 0.0001,
     "ax": 0.02,
@@ -77,6 +78,7 @@ BIAS: Final = {
     "wheel_lag": 0.009,
     "steer_lag": 0.009,
 }
+# Standard deviation between cars.
 USUAL: Final = {
     "radius": 0.006,
     "ax": 0.4,
@@ -89,20 +91,23 @@ USUAL: Final = {
     "wheel_lag": 0.04,
     "steer_lag": 0.04,
 }
+# Mean over cars; 0 for all other quantities.
 SOUND: Final = {
     "steer_gain": 1.0,
     "force_gain": 1.0,
     "understeer": 0.0005,
-}  # what usual cars have; 0 for the others
-STEERED_M_S: Final = 5.0  # from which on the way taken tells of the steering
-LINEAR: Final = 4.0  # [m/s^2] of v·r up to which understeer goes with it
-LEAST_ANGLE: Final = 0.001  # [rad] by which steering and way differ at least
+}
+STEERED_M_S: Final = 5.0  # [m/s] least speed at which the path shows the steering angle
+LINEAR: Final = 4.0  # [m/s^2] largest v·r at which understeer is proportional to it
+# [rad] least standard deviation of the steering angle from the regression
+LEAST_ANGLE: Final = 0.001
 TRACED: Final = ("steer_offset", "steer_gain", "understeer")
-ROBUST: Final = 1.4826  # standard deviations in the median of absolute deviations
-UNKNOWN_SPLIT: Final = 0.003  # BIAS of radii where the file does not say which axle drives
-DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 x .3 x 2.2 m^2
-ROLLING: Final = 0.008  # [1] rolling resistance over load
-BRAKED_FRONT: Final = 0.7  # [1] share of the front axle in braking
+# Ratio of the standard deviation to the median absolute deviation of a normal distribution.
+ROBUST: Final = 1.4826
+UNKNOWN_SPLIT: Final = 0.003  # BIAS of the radii if the vehicle file does not name the driven axle
+DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 (air) · 0.3 (drag coefficient) · 2.2 m^2 (area)
+ROLLING: Final = 0.008  # [1] rolling resistance divided by load
+BRAKED_FRONT: Final = 0.7  # [1] share of the braking force at the front axle
 
 DriveEstimates: TypeAlias = dict[str, float]
 """Estimates of one drive, by the name of the quantity. The key QUANTITY_std has the standard
@@ -206,9 +211,8 @@ def _estimate_quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     quantities: DriveEstimates = {}
     if axle.is_known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain
-        drive = replace(
-            drive, r=drive.r - quantities["yaw_rate"]
-        )  # else taken for offsets of steering and a_y
+        # Subtract the offset, which would otherwise appear as offsets of steering and a_y.
+        drive = replace(drive, r=drive.r - quantities["yaw_rate"])
     quantities |= _estimate_radii(drive, vehicle) | _force_gain(drive, vehicle)
     calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
     if calm.sum() > LEAST_S * RATE_HZ:

@@ -19,7 +19,7 @@ from schemas.runtime.commandline import Command
 
 FAILED: Final = commandline.FAILED
 BAD_INPUT: Final = commandline.BAD_INPUT
-LIVE: Final = ("run", "fleet")  # commands that drive for hours
+LIVE: Final = ("run", "fleet")  # commands that run for hours
 
 COMMANDS: Final = (
     Command(
@@ -97,9 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
     progress_messages.enable_messages(quiet=commandline.wants_quiet(arguments))
+    # Show a status line, because loading the modules of a command takes a second.
     with (
         nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
-    ):  # what it loads takes a second
+    ):
         code, left = _run_command(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
     if left:
         from schemas.runtime.process import force_exit
@@ -119,7 +120,7 @@ def _run_command(
     logging.basicConfig(
         level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
-    # pandas, which many libraries load, imports it, and it reports its threads at INFO
+    # Many libraries load pandas, which imports numexpr. It reports its threads at the level INFO.
     logging.getLogger("numexpr").setLevel(logging.WARNING)
     from edge_agent.app.publishing import left_behind
     from schemas.runtime.process import limit_memory

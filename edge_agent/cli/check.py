@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edge_agent.inputs.signal_log import SignalLog
 
 NOT_PASSED = 1
-FLAG_ROWS = 1000  # after which a controller's flag is looked at again
+FLAG_ROWS = 1000  # number of samples between two checks of the controller flags
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
 
-MOST_NAMES = 30  # of signals in an error
+MOST_NAMES = 30  # names of signals listed in an error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -48,7 +48,7 @@ class LookoutPart:
         """Start the lookout, the thread that looks ahead in the map."""
         self._lookout.start()
 
-    # `admitted` is unused: warnings need no admission
+    # The argument `admitted` is unused, because warnings are given even if nothing is published.
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002
         """Pass to the lookout (the thread that looks ahead in the map) the vehicles' positions, and
         the beliefs of their filters (probabilities of friction).

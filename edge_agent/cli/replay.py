@@ -29,10 +29,11 @@ NOW = "now"
 REPORTS = (".html", ".png", ".svg", ".pdf")
 LOCAL = "local"
 SPARK = "spark"
-OLD_NS = (
-    29 * 86_400 * NS
-)  # a service takes nothing of more than thirty days ago, unless it is told otherwise
-DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
+# [ns] age from which a record may be rejected: by default, a service rejects records that are more
+# than thirty days old.
+OLD_NS = 29 * 86_400 * NS
+# [s] time to wait for a busy service. Batches without an answer then stay in the outbox.
+DRAIN_S = 30.0
 PROGRESS_S = 1.0
 
 
@@ -115,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
                 f"{len(args.log)} logs into a folder",
                 "publish one log, to one file, at a time",
             )
-        tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
+        tasks = tasks_of(args.log, args.vehicle, args.out)  # raises if a log would be overwritten
         if args.engine == SPARK:
             return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
         return _print_outcomes(
@@ -134,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             "publish", "cannot be combined with a report", "replay twice: once with .parquet"
         )
-    bank_of(estimator, [vehicle], memberships)  # a wrong name is an error before the log is read
+    bank_of(estimator, [vehicle], memberships)  # raises for a wrong name before the log is read
     log = read_log(path)
     start_ns = _start_time(args.start, log)
     log, vehicle, diagnosis, notes = prepare_log(log, vehicle)

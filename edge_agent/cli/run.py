@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from schemas.vehicle import Vehicle
 
 SIMULATED = "simulated"
-LIVE_ROWS = 10  # of a replayed log per block: a tenth of a second at 100 Hz
+# Samples per block of a replayed log: a tenth of a second at 100 Hz.
+LIVE_ROWS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -59,10 +59,9 @@ QUICK_ANTS = 3
 QUICK_ITERATIONS = 2
 QUICK_DURATION_S = 2.0
 STUDY_DURATION_S: Final = 6.0
-# searches each way of the study
-REPEATS = 8
+REPEATS = 8  # number of searches of each kind in the study
 QUICK_REPEATS = 2
-POSITIONS: Final = 7  # per vertex: the default and three to each side
+POSITIONS: Final = 7  # per vertex: the default and three on each side of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,9 +140,8 @@ def run(args: argparse.Namespace) -> int:
         f"{duration:g} s each"
     )
     objective = objective_on(train, ESTIMATOR, chosen)
-    objective(
-        Memberships().to_vector()
-    )  # loads the compiled filter: the first iteration's time tells the others'
+    # Load the compiled filter now, so that the first iteration takes as long as the others.
+    objective(Memberships().to_vector())
     results = [
         _run_searches(objective, ants, iterations, args.seed + k) for k in range(args.repeats)
     ]

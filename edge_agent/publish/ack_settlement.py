@@ -17,7 +17,9 @@ from schemas.errors import WireError
 from schemas.thresholds import NS
 from schemas.wire import Kind, StreamAck, decode_ack
 
-CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
+# [s] largest difference between the clocks of service and vehicle. A service rejects records that
+# are further in the future.
+CLOCK_OFF_S: Final = 30.0
 
 log = logging.getLogger(__name__)
 
@@ -33,12 +35,11 @@ class Counts:
     acknowledged: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     rejected: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
-    late: dict[Kind, int] = field(
-        default_factory=lambda: dict.fromkeys(Kind, 0)
-    )  # batches, not records
+    # Numbers of batches, not of records.
+    late: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     resent_batches: int = 0
     bad_acks: int = 0
-    failures: int = 0  # of the sending thread, which goes on
+    failures: int = 0  # errors in the sending thread, which continues
 
 
 class AckSettlement:

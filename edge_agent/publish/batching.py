@@ -20,9 +20,9 @@ from schemas.numeric import IntArray
 from schemas.thresholds import NS
 from schemas.wire import Batch, Columns, Kind, encode
 
-SPAN_NS: Final = 600 * NS  # of a batch; a service refuses an hour
+SPAN_NS: Final = 600 * NS  # [ns] largest time span of a batch; a service rejects an hour
 _TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
-UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
+UNNUMBERED: Final = 0  # placeholder until the outbox stores and numbers the batch
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from typing import Final, NamedTuple
 
 from schemas.wire import Kind
 
-# A batch that no service can read is answered by none. Once so many later ones of its stream were
-# settled, a service is about to take no more (it remembers 65 536 above one that is missing), so
-# that this one must go.
+# Number of later batches of a stream that were settled while this batch is unanswered, after which
+# the batch is given up. A service does not answer a batch that it cannot read. It remembers 65 536
+# numbers above the first missing one, and would accept no further batches.
 PASSED_OVER: Final = 50_000
-LEAST_OLDEST: Final = 1000  # keys that may be gone before they are looked through
+LEAST_OLDEST: Final = 1000  # number of keys before the list is searched for removed ones
 
 
 class Stream(NamedTuple):
@@ -77,7 +77,7 @@ class HeldBatches:
         self.bytes = 0
         self._boot = boot
         self._entries: dict[int, HeldBatch] = {}
-        # keys in their order, also those of removed batches
+        # keys in order of age; keys of removed batches may remain
         self._oldest: dict[Kind, deque[int]] = {kind: deque() for kind in Kind}
         self._streams: dict[Stream, _Sequence] = {}
 

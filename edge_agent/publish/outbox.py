@@ -26,9 +26,11 @@ from edge_agent.publish.resend_schedule import FIRST_RESEND_S, ResendSchedule
 from edge_agent.publish.spool_file import SpoolFile
 from schemas.wire import Kind
 
-BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
-DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
-EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
+BOOT_LIMIT = 2**63  # `boot` is below this limit, so that it fits into a signed 64-bit column
+# Several days of one vehicle that stores a batch per second and kind.
+DEFAULT_CAPACITY_BYTES = 256 * 2**20
+# Old states are evicted first because they are worth least, observations last.
+EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,10 @@ class OutboxCounts:
     stored: int = 0
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
-    damaged: int = 0  # records that damage took, as far as it is known
-    # records of batches that were given up since nobody answers them, only later ones
+    damaged: int = 0  # records lost by damage of the file, as far as known
+    # records of batches that were given up, because the service answered only later batches
     unanswered: int = 0
-    damages: int = 0  # times that the file was found damaged
+    damages: int = 0  # number of times that the file was found damaged
 
 
 class Outbox:
@@ -236,7 +238,7 @@ class Outbox:
         batch = self.held[key]
         payload = self._file.read_payload(key)
         if payload is None:
-            # the number of records may be what is damaged
+            # The stored number of records may be damaged as well, so count at least one.
             self.counts.damaged += max(self._drop_batch(key), 1)
             return None
         return StoredBatch(key, batch.stream, batch.seq, batch.records, payload)

@@ -17,17 +17,20 @@ import heapq
 from collections.abc import Container
 from typing import Final
 
-# A service writes a segment each second and starts within some; it is not away before that.
+# [s] time without an answer after which a service counts as unavailable. A service writes a segment
+# each second, and restarts within several seconds.
 SILENT_S: Final = 8.0
 FIRST_PROBE_S: Final = 4.0
-# A thousand cars then cost a service that is away eight messages a second. After five minutes, cars
-# came back one after the other for longer than their backlog of an hour takes, and the service was
-# idle in between.
+# [s] longest interval between probes. With it, a thousand cars send eight messages per second to an
+# unavailable service. With five minutes, cars returned so slowly that the service was idle between
+# them, and the return took longer than the transfer of an hour's backlog.
 LONGEST_PROBE_S: Final = 120.0
-FIRST_WINDOW: Final = 16.0  # batches in flight; 3 kB, as much as TCP begins with
-LEAST_WINDOW: Final = 8.0  # a batch a vehicle, kind and second is put in any case
-LARGEST_WINDOW: Final = 512.0  # in a second, which is what a service takes for an answer: 100 kB
-HALVED_S: Final = 2.0  # all that is lost at once is one sign
+FIRST_WINDOW: Final = 16.0  # batches in flight: 3 kB, the same as the initial window of TCP
+# Batches in flight; new batches (one per vehicle, kind and second) are sent regardless.
+LEAST_WINDOW: Final = 8.0
+# Batches in flight: 100 kB in one second, the time that a service needs for an answer.
+LARGEST_WINDOW: Final = 512.0
+HALVED_S: Final = 2.0  # [s] losses within this time count as one sign of overload
 
 
 class Pacer:
@@ -56,14 +59,15 @@ class Pacer:
     def __init__(self) -> None:
         self.flying = 0
         self.silent = False
-        self._waiting: list[int] = []  # heap of keys, and of such as are gone
-        # up to `sure` it grows fast
+        self._waiting: list[int] = []  # heap of keys; keys of removed batches may remain
         self._window = FIRST_WINDOW
+        # Size up to which the window grows by one per answered batch (slow-start threshold).
         self._sure = LARGEST_WINDOW
-        self._unanswered_since: float | None = None  # since when an answer is
+        self._unanswered_since: float | None = None  # [s] start of the wait for an answer
         self._halved = -float("inf")
         self._answered = False
-        # of those that fly, put before the silence: that they are lost says nothing
+        # Batches in flight that were sent before the service became silent. Their loss does not
+        # indicate overload.
         self._stale = 0
         self._probe_at = 0.0
         self._probe_s = FIRST_PROBE_S

@@ -29,12 +29,15 @@ from edge_agent.publish.spool_file import is_damage
 from schemas.config import AgentConfig
 from schemas.wire import Kind
 
-TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing is offered
-QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that does not answer
-WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
-RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
-RESEND_PER_VEHICLE: Final = 4  # of these on average; a link waits between two messages of one kind
-# beyond the deadline, for a put or a close that hangs on a frozen router
+# [s] interval at which the sender checks for due batches if nothing is offered
+TICK_S: Final = 0.05
+QUEUE_LIMIT: Final = 20_000  # blocks of records: many minutes if the disk does not respond
+WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk rejects writes
+RESEND_LIMIT: Final = 64  # batches sent again per round; more would delay new batches
+# Mean number per vehicle of batches sent again per round. A link pauses between two messages of one
+# kind.
+RESEND_PER_VEHICLE: Final = 4
+# [s] time after the deadline for a `put` or `close` that hangs on a frozen router
 CLOSE_GRACE_S: Final = 0.5
 
 log = logging.getLogger(__name__)
@@ -147,7 +150,7 @@ class Publisher:
                 else:
                     log.warning("the outbox cannot be read or written (%s); trying again", error)
                 self._stopped.wait(TICK_S)
-            except Exception:  # whatever it is: estimation goes on, and so must this thread
+            except Exception:  # the thread must survive any error, because estimation continues
                 self.counts.failures += 1
                 log.exception("sending failed; trying again")
                 self._stopped.wait(TICK_S)
@@ -231,7 +234,7 @@ class Publisher:
         for draft in waiting:
             try:
                 draft.encode(1, 1)
-            except Exception:  # noqa: BLE001 whatever it is, the others must go
+            except Exception:  # noqa: BLE001 no error may block the other drafts
                 self.counts.failures += 1
                 self.counts.dropped[draft.kind] += draft.records
             else:

@@ -13,11 +13,13 @@ from typing import Final
 from edge_agent.publish.held_batches import HeldBatch, HeldBatches, Stream
 from edge_agent.publish.pacing import Pacer
 
-# a service writes a segment each second: an answer younger than this is on its way
+# [s] time to the first resend. A service writes a segment each second, so an answer may arrive
+# until then.
 FIRST_RESEND_S: Final = 2.0
-# for an answer of a service that does answer; see `pacing` for one that does not
+# [s] longest time to a resend if the service answers; see `pacing` for a silent service.
 LONGEST_RESEND_S: Final = 6.0
-# share of the delay, either way: agents that lost one router do not return in step
+# Relative random change of each delay, in both directions. Agents that lost the same router
+# therefore do not return at the same moment.
 JITTER: Final = 0.25
 
 
@@ -31,7 +33,8 @@ class ResendSchedule:
         self._held = held
         self._random = random.Random(seed)
         self._pacers: dict[tuple[str, int], Pacer] = {}
-        self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
+        # heap of (time at which a batch in flight counts as lost [s], key)
+        self._later: list[tuple[float, int]] = []
 
     def remove_all(self) -> None:
         """Remove all batches from the schedule."""

@@ -11,15 +11,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-PAGE: Final = 4096  # bytes; SQLite's own default
-_LEAF: Final = 0x0D  # of a table
-_HEADER: Final = 100  # bytes before the first page's cells
+PAGE: Final = 4096  # [byte] default page size of SQLite
+_LEAF: Final = 0x0D  # type byte of a page with rows of a table
+_HEADER: Final = 100  # [byte] file header before the cells of the first page
 _WAL_HEADER: Final = 32
 _FRAME: Final = 24
 _MOST_LOCAL: Final = PAGE - 35
 _LEAST_LOCAL: Final = (PAGE - 12) * 32 // 255 - 23
-_INTEGERS: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # bytes by serial type
-_LARGEST: Final = 1 << 20  # bytes of a row; a batch has less than a tenth
+_INTEGERS: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # serial type -> size of an integer [byte]
+_LARGEST: Final = 1 << 20  # [byte] largest accepted row; a batch has less than a tenth of it
 
 Value = int | str | bytes | None
 
@@ -49,7 +49,7 @@ def _leaf_cells(
         at = int.from_bytes(page[begin + 8 + 2 * place : begin + 10 + 2 * place], "big")
         try:
             yield _read_cell(page, at, pages)
-        except (IndexError, KeyError, ValueError):  # torn; also UnicodeDecodeError
+        except (IndexError, KeyError, ValueError):  # incomplete row; includes UnicodeDecodeError
             continue
 
 

@@ -31,9 +31,12 @@ CREATE TABLE IF NOT EXISTS batch (
 CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);
 """
 NAME: Final = "vehicle, boot, kind, region, seq, records"
-DAMAGED: Final = "damaged"  # ending of a file set aside; with a number
+DAMAGED: Final = "damaged"  # suffix, before a number, of a damaged file that was set aside
 _MAGIC: Final = b"SQLite format 3\0"
-_SIMILAR: Final = 12  # of its bytes: another file that begins so is none of ours, and is left alone
+# Least number of bytes equal to _MAGIC in a damaged outbox. A file with fewer belongs to another
+# program and is not changed.
+_SIMILAR: Final = 12
+# Types of the columns. The id is not checked, because SQLite stores it as the row number.
 TYPES: Final = (
     object,
     str,
@@ -44,7 +47,7 @@ TYPES: Final = (
     int,
     bytes,
     int | None,
-)  # of the columns; the id is the row's own
+)
 _CORRUPT: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 Row = tuple[object, ...]
@@ -178,7 +181,7 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
         for n in range(1, 10_000)
         if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists()
     )
-    # its name last: a crash in between leaves it to be found damaged again
+    # Rename the main file last. After a crash in between, the file is found damaged again.
     for ending in ("-wal", "-shm", ""):
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))

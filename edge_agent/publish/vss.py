@@ -23,7 +23,7 @@ from schemas.thresholds import EXCITED_SHARE, NS
 
 BRANCH: Final = "Vehicle.ADAS.ESC.RoadFriction"
 ENCODING: Final = "application/json"
-FULL: Final = 100.0  # [%]
+FULL: Final = 100.0  # [%] largest value of a friction signal
 DIGITS: Final = 1
 _TOPIC: Final = keys.TOPICS["vss"]
 

@@ -19,9 +19,9 @@ from schemas.runtime.link_watch import LinkWatch
 from schemas.runtime.zenoh_session import open_session, quality_of
 from schemas.wire import ENCODING, MESSAGES_PER_S, Kind
 
-GAP_S: Final = (
-    2.0 / MESSAGES_PER_S
-)  # twice what a router asks for, because networks move messages together
+# [s] pause between two messages: twice the limit of a router, because networks may delay messages
+# and deliver them together.
+GAP_S: Final = 2.0 / MESSAGES_PER_S
 
 log = logging.getLogger(__name__)
 _TOPIC: Final = {Kind.OBSERVATION: keys.TOPICS["obs"], Kind.STATE: keys.TOPICS["state"]}
@@ -48,7 +48,8 @@ class Link:
         self.session = session
         self._clock = clock
         self._pause = pause
-        self._free_at = dict.fromkeys(Kind, 0.0)  # when the next message of a kind may be sent
+        # earliest time of the next message of each kind [s]
+        self._free_at = dict.fromkeys(Kind, 0.0)
 
         def receive_sample(sample: zenoh.Sample) -> None:
             on_ack(vehicle, sample.payload.to_bytes())
