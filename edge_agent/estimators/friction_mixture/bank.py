@@ -81,9 +81,8 @@ def _advance_filters(
             memory.log_likelihood = 0.0
             output = outputs[k, n]
             health = step(memory, design, scratch, t[k, n], signals[k, n])
-            if (
-                closes.shape[0] > 0 and memory.started and memory.block.samples == 0
-            ):  # a block has ended
+            # A block without samples means that the last block has just ended.
+            if closes.shape[0] > 0 and memory.started and memory.block.samples == 0:
                 end_part(memory, design, evidence[k, n])
             write_estimates(memory, design, output)
             output[Column.HEALTH] = health | memory.health
@@ -124,9 +123,8 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
     vx, vy = mean_velocity(memory)
     constants = design.constants
     var_x = memory.overall_covariance[NodeState.VX, NodeState.VX]
-    var_x += (constants.radius_std * vx) ** 2 + (
-        constants.common_lag * last.ax
-    ) ** 2  # what no sensor tells
+    # No sensor measures the common radius error and the common delay.
+    var_x += (constants.radius_std * vx) ** 2 + (constants.common_lag * last.ax) ** 2
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_STD**2
     write_motion(output, (vx, vy, last.yaw_rate), (var_x, var_y, var_rate))

@@ -33,14 +33,14 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# along, over load, below which wheels that roll alike are taken for rolling freely
+# [1] longitudinal force over load below which wheels of equal speed count as rolling freely
 FREE_FORCE = 0.05
-ALIKE = 0.03  # relative difference of their speeds
-FREE_S = 0.1  # [s] for which wheels must agree before they call the motion back
-LOST_SPREAD_M_S = 5.0
-# of the speed that agreeing wheels tell, beyond `diverged_x`: there the motion is lost
-FAR_SHARE = 0.04
-FAR_SPREADS = 2.0
+ALIKE = 0.03  # [1] relative difference up to which wheel speeds count as equal
+FREE_S = 0.1  # [s] time for which the wheels must agree before they reset the motion
+LOST_SPREAD_M_S = 5.0  # [m/s] standard deviation of v_x after a reset without a known speed
+# The motion is reset if it differs from the wheels by more than `diverged_x` plus two terms:
+FAR_SHARE = 0.04  # [1] share of the wheels' speed
+FAR_SPREADS = 2.0  # [1] number of standard deviations of the wheels' speed
 
 
 @compiled
@@ -136,9 +136,8 @@ def reset_to_wheel_speed(
     if memory.last.time - rolling.disagreed_time < FREE_S or math.isnan(speed):
         return 0
     if abs(memory.overall_mean[NodeState.VX] - speed) > near + FAR_SHARE * speed:
-        restart_motion(
-            memory, speed, FIRST_V_STD
-        )  # friction stays: a slide that ended has taught it
+        # Friction is kept, because the slide that has ended was evidence on it.
+        restart_motion(memory, speed, FIRST_V_STD)
     return 0
 
 
@@ -165,7 +164,8 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
     """Restart the motion estimate at `speed` [m/s], or at its current value if `speed` is NaN.
     Reset all other states and the friction to the prior.
     """
-    forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
+    # The states learned while the motion was wrong are wrong too.
+    forget_vehicle(memory)
     restart_motion(memory, speed, LOST_SPREAD_M_S)
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]

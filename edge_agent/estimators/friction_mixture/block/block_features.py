@@ -35,14 +35,15 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# slips of two wheels are compared at this speed at least: speeds differ by noise below
+# [m/s] smallest speed by which wheel-speed differences are divided, because they are mostly noise
+# at lower speeds
 SLOWEST_COMPARED_M_S = 1.0
-NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
-ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
-STEEPEST = 0.3  # least cosine of steering
-# standard deviations of wheel-speed noise that a difference between the sides must exceed,
-CERTAIN = 4.0
-LIKELY = 2.0  # and of what is unknown of the radii
+NO_FORCE_SHARE = 0.3  # [1] standard deviation of force over load without torque and a_x
+ROUNDING = 1 / math.sqrt(12.0)  # [1] standard deviation of rounding, over the step
+STEEPEST = 0.3  # [1] smallest cosine of a steering angle by which a wheel speed is divided
+# A difference of slip between the sides must exceed these numbers of standard deviations:
+CERTAIN = 4.0  # of the wheel-speed noise
+LIKELY = 2.0  # of the estimated difference of the wheel radii
 
 
 @compiled
@@ -169,7 +170,7 @@ def _compute_wheel_forces(
             if math.isnan(ax):
                 unit = 0.0
                 spread = NO_FORCE_SHARE * loads[wheel]
-            elif lone >= 0 and not brakes:  # the other axle gives the rest of what moves the car
+            elif lone >= 0 and not brakes:  # the other axle provides the rest of the force m*a_x
                 unit = 0.5 * row[Parameter.MASS]
                 force = 0.5 * (known - axle_force(memory, features, lone))
                 spread = math.hypot(spread, constants.no_torque_share * unit * features.change)
@@ -265,15 +266,14 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
     """
     health = 0
     counts = memory.block.counts
-    if (
-        counts[S.DELTA] + counts[S.DELTA + 1] == 0
-    ):  # without steering the front axle's slip is unknown
+    # Without the steering angle, the slip of the front axle is unknown.
+    if counts[S.DELTA] + counts[S.DELTA + 1] == 0:
         features.side[0] = math.nan
         health |= flags.NO_STEERING
     if memory.last.rear_steering and counts[S.DELTA + 2] + counts[S.DELTA + 3] == 0:
         features.side[1] = math.nan
         health |= flags.NO_STEERING
-    if counts[S.YAW_RATE] == 0:  # axle forces need it twice
+    if counts[S.YAW_RATE] == 0:  # the axle's force and its slip both need the yaw rate
         features.side[0] = features.side[1] = math.nan
     return health
 

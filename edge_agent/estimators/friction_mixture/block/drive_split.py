@@ -20,28 +20,26 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-DRIVES = (
-    0.0,
-    0.45,
-    1.0,
-)  # share of the front axle of a car that drives its rear axle, all wheels, its front axle
-ALL_WHEELS = 1  # of these kinds
-FIRST_ODDS = (0.35, 0.3, 0.35)
-SHARE_STD = 0.03  # of a car of a known kind
-# share of the front in braking, and how it differs between cars
-BRAKES_FRONT = 0.64
-BRAKES_STD = 0.06
-ENGINE_BRAKE = 1.5  # [m/s^2] to twice this a car may slow by its engine, on the driven axle alone
-PULLS = 0.05  # a_x over g from which the driven axle shows
-TURNS_M_S2 = 3.0  # lateral acceleration below which it shows
-UNLIKE = 0.3  # share of the slip asked for by which stiffness and load differ
-LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
+# [1] share of the front axle in the driving force with rear, all-wheel and front drive
+DRIVES = (0.0, 0.45, 1.0)
+ALL_WHEELS = 1  # index of all-wheel drive
+FIRST_ODDS = (0.35, 0.3, 0.35)  # initial probabilities of these kinds
+SHARE_STD = 0.03  # [1] standard deviation of the share in a car of known kind
+BRAKES_FRONT = 0.64  # [1] share of the front axle in the brake force
+BRAKES_STD = 0.06  # [1] standard deviation of this share between cars
+# [m/s^2] scale of engine braking, which acts on the driven axle only: from twice this deceleration
+# all force counts as brake force
+ENGINE_BRAKE = 1.5
+PULLS = 0.05  # [1] a_x over g from which the slip shows the driven axle
+TURNS_M_S2 = 3.0  # [m/s^2] lateral acceleration below which the slip shows it
+UNLIKE = 0.3  # [1] relative error of the predicted slip, from stiffness and load
+LEAST_ODDS = 1e-4  # smallest probability of a kind, so that an error is corrected within seconds
 
 
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
     """Return the front axle's share of the longitudinal force at acceleration `ax` [m/s^2], and the
-    standard deviation of the share. `odds` are the probabilities of front, rear and all-wheel
+    standard deviation of the share. `odds` are the probabilities of rear, all-wheel and front
     drive.
     """
     front = row[Parameter.DRIVE_FRONT]
@@ -54,7 +52,7 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
         spread = math.sqrt(max(square - front * front, 0.0) + SHARE_STD**2)
     if ax >= 0.0:
         return front, spread
-    brakes = min(-0.5 * ax / ENGINE_BRAKE, 1.0)  # how surely it is the brakes
+    brakes = min(-0.5 * ax / ENGINE_BRAKE, 1.0)  # weight of the brakes, 0 to 1
     apart = brakes * (1.0 - brakes) * (BRAKES_FRONT - front) ** 2
     variance = brakes * BRAKES_STD**2 + (1.0 - brakes) * spread**2 + apart
     return brakes * BRAKES_FRONT + (1.0 - brakes) * front, math.sqrt(variance)

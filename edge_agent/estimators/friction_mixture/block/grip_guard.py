@@ -13,13 +13,15 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
-# smoothing: of the noise of accelerometers and of what a body shakes
-SLOW_S = 0.15
-FAST_S = 0.06
-# [1/s] at which the largest grip fades after UTILISED_WINDOW_S: roads change
+# [s] time constants that smooth the noise of the accelerometers and the shaking of the body
+SLOW_S = 0.15  # for the penalty of nodes
+FAST_S = 0.06  # for the upper end of the interval
+# [1/s] rate at which the recent maximum of grip in use decreases after UTILISED_WINDOW_S, because
+# the road may have changed
 FORGOTTEN = 0.5
-ABOVE = 0.02  # what smoothing takes from the top of a hard stop
-# of the grip that a sliding axle uses: mass, torque and load are known to a few per cent
+ABOVE = 0.02  # [1] part of the grip in use that smoothing removes in a hard stop
+# [1] largest lower end of the interval over the grip that a sliding axle uses. It is below 1,
+# because mass, torque and load are known only within a few per cent.
 AT_PEAK = 0.95
 
 

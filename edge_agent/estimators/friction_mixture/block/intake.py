@@ -35,14 +35,15 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# of an accelerometer from one reading to the next; a real one is believed at the second
+# [m/s^2] largest change between two readings of an accelerometer. A real jump is accepted at its
+# second reading.
 JUMP_M_S2 = 3.0
-HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
-EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
-YAW_WALK = 3.0  # [rad/s/s^.5] yaw acceleration of a lively car as a random walk
-REAR_STD = 0.03  # [rad/s] yaw rate from the rear wheels: noise and slip difference
-LOST_AX = 2.0  # [m/s/s^.5] random walk without a_x
-LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
+HOLD_S = 0.025  # [s] a shorter gap of an accelerometer is filled with its last reading
+EARLY_S = 1e-6  # [s] tolerance of the block length for rounding of the sample times
+YAW_WALK = 3.0  # [rad/s/s^.5] random walk of the yaw rate: yaw acceleration of a lively car
+REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and slip difference
+LOST_AX = 2.0  # [m/s/s^.5] random walk of v_x without a_x
+LOST_AY = 0.7  # [m/s/s^.5] random walk of v_y without a_y or yaw rate
 
 
 @compiled
@@ -57,9 +58,8 @@ def take_sample(
     if not dt > 0.0:
         return flags.TIME_GAP, False
     now = last.now
-    health = (
-        read_plausible(sample, now) & ~flags.NO_STEERING
-    )  # which the block judges: a single angle is bridged
+    # The block decides about NO_STEERING, because a single missing angle is replaced.
+    health = read_plausible(sample, now) & ~flags.NO_STEERING
     health |= refuse_jumps(memory.row, now)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)

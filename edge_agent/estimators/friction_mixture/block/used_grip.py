@@ -18,8 +18,10 @@ from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-SMOOTH_S = 0.1  # [s] two blocks: a tyre's force builds up as fast
-MOST_USED = 1.5  # [1] more is no tyre of a road car: a bump, or a load that the model has wrong
+SMOOTH_S = 0.1  # [s] two blocks, about the time in which a tyre builds up its force
+# [1] largest reported grip. Tyres of road cars cannot use more; a larger value comes from a bump or
+# from a wrong load.
+MOST_USED = 1.5
 
 
 @compiled

@@ -13,14 +13,15 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# faster than the second slowest wheel by more is a decoding error (512 km/h were met), not a spin
+# [m/s] A wheel that exceeds the second slowest one by more does not spin: its reading is a decoding
+# error (512 km/h occurred).
 SPINS_M_S = 20.0
-SAME_RAD_S = 0.02  # a reading that changes by less is the same
-HELD = 3  # readings that were the same before a change is a step, and not noise
-# [rad/s] steps that are met: 1 km/h is .9
+SAME_RAD_S = 0.02  # [rad/s] a reading that changes by less counts as unchanged
+HELD = 3  # number of unchanged readings after which a change counts as a step, not as noise
+# [rad/s] range of steps that occur in wheel speed signals; a step of 1 km/h is .9 rad/s
 STEP_LEAST = 0.05
 STEP_MOST = 2.0
-STEP_PACE = 0.1  # share of a new step in the mean
+STEP_PACE = 0.1  # [1] weight of a new step in the moving average of steps
 
 
 @compiled

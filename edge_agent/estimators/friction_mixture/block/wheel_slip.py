@@ -19,15 +19,15 @@ from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.thresholds import UTILISED_WINDOW_S
 
-SLOWEST_M_S = 2.5  # below this speed the resolution of wheel speeds looks like slip
-# of the speed, between two wheels: may slide, slides
+SLOWEST_M_S = 2.5  # [m/s] below this speed the resolution of wheel speeds looks like slip
+# [1] difference of two wheel speeds over the speed: a wheel may slide (foot), or slides (peak)
 APART_FOOT = 0.04
 APART_PEAK = 0.08
-# [m/s^2] of a wheel beyond the car's: may slide, slides
+# [m/s^2] difference of a wheel's acceleration from the car's: foot and peak as above
 SPIN_FOOT = 6.0
 SPIN_PEAK = 12.0
-SEEN = 0.3  # membership from which slip counts as having begun
-# [s] beside the time that the rear axle needs to reach the place of the front axle
+SEEN = 0.3  # [1] increase of the membership from which a new slide counts as begun
+# [s] allowance added to the time that the rear axle needs to reach the place of the front axle
 REAR_LAG_S = 0.1
 
 

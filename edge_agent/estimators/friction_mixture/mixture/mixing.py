@@ -43,12 +43,15 @@ from schemas.runtime.jit import compiled
 from schemas.runtime.lanes import lanes_at, largest_lane, put_lanes, select, sum_lanes
 from schemas.runtime.records import LANES
 
-LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
-# of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
+LEAST_MIXING = 1e-3  # [1] smaller shares are not mixed, because they change no digit of the output
+# [1] share of `split_prior`: with a smaller probability the split nodes are deactivated
 SLEEPING_SHARE = 0.5
-FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
-BRINK = 4  # power of doubt in that: a contradiction that merely grows forgets nothing yet
-# of a node's mass in a block: more would overshoot the balance between neighbours
+FORGOTTEN_S = 0.5  # [s] time in which friction returns to its prior once no evidence is used
+# [1] exponent of the doubt in this return. It is large, so that the filter forgets hardly anything
+# while the evidence against the model does not suffice.
+BRINK = 4
+# [1] largest share of a node's probability that moves to its neighbours in a block. A larger share
+# would overshoot the balance between neighbours.
 LARGEST_DRIFT = 0.5
 
 
@@ -127,7 +130,7 @@ def apply_road_change(
     change_road(weight, prior, NODES, change, predicted)
     copy_vector(weight, predicted)
     for j in range(PLACES):
-        # a node that sleeps keeps the state of the mixture, so that it stays finite
+        # An inactive node takes the state of the whole mixture, so that its values stay finite.
         scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0) if j < count else 1.0
         memory.penalty[j] *= 1.0 - scratch.mixing[j]
     share_weights(memory, scratch)

@@ -43,13 +43,17 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU
 
-FACTOR = 9.0  # contradiction: errors are three times what they can be
-LARGEST_RATIO = 4.0  # [nat/s] a burst of half a second contradicts nothing
-CALLED_BACK = 0.5  # of odd_least: once may be a pothole
-LONGEST_PATIENCE = 600.0  # [s]
-RELAPSE = 4.0  # times as long as the last time
-FORGIVEN_S = 300.0  # in which that is forgotten
-STRAIGHT = 0.6  # [m/s^2] a_y up to which it is tried again: there the wheels tell the motion
+# [1] actual over stated innovation variance under a contradiction: errors of three times the size
+FACTOR = 9.0
+# [nat/s] largest growth of the evidence against the model, so that half a second cannot suffice
+LARGEST_RATIO = 4.0
+# [1] share of `odd_least` that a reset of the motion adds. One reset alone may come from a pothole.
+CALLED_BACK = 0.5
+LONGEST_PATIENCE = 600.0  # [s] longest time before the model is tried again
+RELAPSE = 4.0  # [1] factor on this time after each further contradiction
+FORGIVEN_S = 300.0  # [s] time in which evidence against the model and earlier contradictions fade
+# [m/s^2] a_y below which the model is tried again, because the wheels then show the motion
+STRAIGHT = 0.6
 
 
 @compiled
@@ -66,8 +70,8 @@ def update_consistency(
         return
     trust = memory.trust
     constants = design.constants
-    # by what any car may be: a calibration makes the belief of this one narrower, and contradicts
-    # nothing
+    # Use the prior of any car. A calibration narrows the prior of its own car, and deviations from
+    # a narrower prior are no sign of other errors.
     cost = mixture_cost(memory.overall_mean, design.nominal)
     trust.strain = belief_strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior

@@ -24,7 +24,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 from schemas.runtime.lanes import lanes_at, put_lanes
 
-LEAST_VARIANCE = 1e-18  # of a state given the states before it
+LEAST_VARIANCE = 1e-18  # smallest variance of a state, given the states before it
 
 
 @inlined

@@ -82,7 +82,7 @@ def _differentiate_forces(
     derivative = node.derivative
     for state in range(NodeState.SHAPE, STRAIGHT):
         out = derivative[state]
-        if state == NodeState.BIAS_X and all_torques:  # an offset of a_x is then no force
+        if state == NodeState.BIAS_X and all_torques:  # no force is then computed from a_x
             for r in range(ROWS):
                 put_lanes(out, r, 0.0)
             continue

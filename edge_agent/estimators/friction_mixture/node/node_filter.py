@@ -60,8 +60,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes
 
-REAR_ROWS = (2, 3, 5)
-DOUBTED = 0.05  # of distrust_noise, at the brink of it
+REAR_ROWS = (2, 3, 5)  # measurements of the rear wheels and of the rear axle
+# [1] share of `distrust_noise` that applies when the evidence against the model almost suffices
+DOUBTED = 0.05
 
 
 class NodeUpdate(NamedTuple):
@@ -69,9 +70,9 @@ class NodeUpdate(NamedTuple):
     log-likelihood, and the terms from which node weights and penalties are computed.
     """
 
-    log_likelihood: float  # with the inflated R and the price of sliding [nat]
-    moved: float  # change of `belief_cost` [nat]
-    plain: float  # log-likelihood with the plain R, rows taken as independent [nat]
+    log_likelihood: float  # [nat] with the inflated R, minus the penalty for sliding
+    moved: float  # [nat] change of `belief_cost`
+    plain: float  # [nat] log-likelihood before inflation, for independent measurements
 
 
 @compiled

@@ -52,9 +52,11 @@ from schemas.runtime.lanes import (
     select,
 )
 
-# of its friction, that the slippery side gives before the other side takes the rest
+# [1] share of its friction that the slippery side uses at most; the other side carries the rest
 SPLIT_LIMIT = 0.9
-FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
+# [1] smallest slope of the tyre curve. It is above 0, because a wheel's inertia limits the change
+# of its slip within a block.
+FLATTEST = 0.03
 
 
 @inlined
@@ -152,7 +154,8 @@ def find_slips(
     mean_kx = lanes_at(mean, NodeState.LN_KX)
     mean_ky = lanes_at(mean, NodeState.LN_KY)
     for axle in range(2):
-        # slip across is guesswork without side force, and must not bend the force along
+        # Without a measured lateral force the lateral slip is too uncertain to be used. It must not
+        # change the longitudinal force.
         blind = math.isnan(features.side[axle])
         ln_kx = mean_kx + features.informs_x[axle] * (lanes_at(x, NodeState.LN_KX) - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (lanes_at(x, NodeState.LN_KY) - mean_ky)

@@ -28,21 +28,31 @@ from schemas.runtime.lanes import lanes_at, put_lanes
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-STANDING_STD = 0.05  # [m/s] sensors of a wheel that creeps show nothing
-STANDING_RAD_S = 0.05  # a wheel that turns slower stands
-STARTS = 0.25  # [m/s^2] from there within which the car does not start or stop
-# If the wheels of a car faster than SLOW_M_S stand, they are locked, or the filter is lost. A car
-# with locked wheels decelerates by more than this on all but the slipperiest ice.
+# [m/s] error of the velocity zero at standstill: wheel sensors do not see a creeping wheel
+STANDING_STD = 0.05
+STANDING_RAD_S = 0.05  # [rad/s] a wheel that turns more slowly counts as standing
+# [m/s^2] deviation of a_x from its average at standstill beyond which the car may start to move
+STARTS = 0.25
+# [m/s^2] If the wheels stand while the estimated speed exceeds SLOW_M_S, they are locked, or the
+# estimate is wrong. A car with locked wheels decelerates by more than this, except on the most
+# slippery ice.
 SLIDES_M_S2 = 1.0
-LOCKED_SHARE = 0.1  # of the speed: wheels that all turn slower while the car decelerates are locked
-LOST_S = 2.0  # [s] until wheels that stand without that are those of a car that stands
-LONGEST_SLIDE_S = 10.0  # [s] of a car with locked wheels
-AGREE_FLOOR = 0.15  # [m/s] within which wheels always agree
-TURN_SHARE = 0.05  # of the speed difference of the sides in a turn: track and yaw rate
-SIDE_SHARE = 0.5  # share by which sideslip differs from the side force over nominal stiffness
-LEFT_FLOOR = 0.03  # [m/s]
-TURNING = 1.5  # v*r against a_y: both must be small
-FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle follows during distrust
+# [1] share of the speed: slower wheels count as locked while the car decelerates
+LOCKED_SHARE = 0.1
+# [s] time after which standing wheels without that deceleration mean that the car stands
+LOST_S = 2.0
+# [s] longest slide with locked wheels; after it, standing wheels mean that the car stands
+LONGEST_SLIDE_S = 10.0
+AGREE_FLOOR = 0.15  # [m/s] wheel speeds that differ by less always count as equal
+# [1] relative error of the speed difference of both sides in a turn, from track and yaw rate
+TURN_SHARE = 0.05
+# [1] relative error of the sideslip computed from lateral force and nominal stiffness
+SIDE_SHARE = 0.5
+LEFT_FLOOR = 0.03  # [m/s] smallest error of the lateral velocity
+# [1] limit of v*r over the limit of a_y: both must be small, so that the rear axle cannot slide
+TURNING = 1.5
+# [1] a_y over g up to which the rear axle is assumed not to slide while the model is distrusted
+FARTHEST_FOLLOWED = 0.8
 
 
 @compiled

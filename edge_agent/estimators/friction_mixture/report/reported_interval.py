@@ -23,17 +23,21 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU
 
-# safe deceleration rests on it: with .04 it lay above the truth for a sixth of the ice in town
+# [1] quantile level of the lower end. Safe deceleration depends on it: with .04 the lower end was
+# above the true friction for a sixth of the ice in town.
 LOWER_END = 0.03
-# of the belief where nothing is known; where much is, one truth in thirty lay above in town,
-UPPER_END = 0.95
-LEARNED_END = 0.86  # and one in eighty on level drives
-LEARNED = 0.05  # [nat] divergence at which most of it is
-# [1] most by which the upper end comes nearer: a belief that leans to ice has a long upper tail
+UPPER_END = 0.95  # [1] quantile level of the upper end without information
+# [1] quantile level of the upper end with much information. With .95 the true friction was above
+# the upper end in only 1 of 30 cases in town, and in 1 of 80 on level drives, not in 1 of 20.
+LEARNED_END = 0.86
+# [nat] scale of the information (divergence from the prior) over which the level changes
+LEARNED = 0.05
+# [1] largest reduction of the upper end, in friction. A belief that tends to ice has a long upper
+# tail, so the lower level alone could reduce the upper end too far.
 DRAWN_IN = 0.085
-# How much nearer it comes in a car that is as its file says, by level and in friction: what else is
-# wrong of it is small as well. On level drives one truth in eighty had lain above. The lower end
-# stays: safe deceleration rests on it.
+# [1] further reduction of the level, and of the upper end, for a car that agrees with its vehicle
+# file, because its other errors are small too. On level drives the true friction was above the
+# upper end in only 1 of 80 cases. The lower end stays, because safe deceleration depends on it.
 NEARER = 0.15
 
 

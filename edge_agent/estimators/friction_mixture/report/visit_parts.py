@@ -27,12 +27,12 @@ from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-EXCLUDED = math.exp(
-    -3.0
-)  # of the largest likelihood: what lies below it, the surest belief excludes
-ALMOST_WHOLE = 0.9
-COMPATIBLE = 0.5  # as much as may lie there of a belief that takes the surest one's place
-# [nat] half of the range is excluded; a belief that knows less says nothing against another
+# [1] The kept belief excludes a friction whose likelihood is below this share of the largest one.
+EXCLUDED = math.exp(-3.0)
+ALMOST_WHOLE = 0.9  # [1] part of the current belief at excluded frictions that means a jump
+# [1] part at excluded frictions up to which the current belief may replace the kept one
+COMPATIBLE = 0.5
+# [nat] least information of a belief that can show a jump: about half of the range is excluded
 KNOWING = 0.7
 
 

@@ -13,10 +13,11 @@ from schemas.signals import WHEELS
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-# state -> (quantity of the calibration, what the state carries beside it: the pitch and slope that
-# a_x feels, toe and crossfall that steering holds against, another load, slip that the nominal
-# stiffness leaves on a driven wheel, half a sample). Tighter ones (.03, .0003, .0005) made
-# intervals wider on six towns of rough cars: what a state may not carry reads as a contradiction.
+# State -> (quantity of the calibration, deviation due to other effects that the state absorbs).
+# Such effects are pitch and slope in a_x, toe and crossfall in the steering offset, another load,
+# slip of a driven wheel that the nominal stiffness does not explain, and half a sample of delay.
+# Smaller deviations (.03, .0003, .0005) made the intervals wider on six towns of rough cars,
+# because effects that no state may absorb look like a contradiction.
 LEARNED: Final[dict[int, tuple[str, float]]] = {
     NodeState.BIAS_X: ("ax", 0.12),
     NodeState.STEER: ("steer_offset", 0.0015),
@@ -28,7 +29,8 @@ LEARNED: Final[dict[int, tuple[str, float]]] = {
 }
 
 
-EACH_COMPLIANCE: Final = 0.003  # [rad] that another load and other tyres make of understeer per g
+# [rad] change of understeer per g that another load and other tyres cause
+EACH_COMPLIANCE: Final = 0.003
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ class Nominal(NamedTuple):
 
     mean: Annotated[FloatArray, STATES]
     std: Annotated[FloatArray, STATES]
-    time: Annotated[FloatArray, STATES]  # [s] of their return to it
+    time: Annotated[FloatArray, STATES]  # [s] time in which a state returns to its prior
 
 
 class MixtureDesign(NamedTuple):
@@ -44,16 +44,16 @@ class MixtureDesign(NamedTuple):
     """
 
     constants: Constants
-    mu: Annotated[FloatArray, NODES]  # nodes of one friction
+    mu: Annotated[FloatArray, NODES]  # friction of the nodes with one friction for both sides
     prior: Annotated[FloatArray, NODES]
-    sides: Sides  # all nodes
+    sides: Sides  # friction and prior of all nodes
     curve: TyreCurve
     nominal: Nominal
-    fuzzy_inputs: Annotated[FloatArray, 5]  # sets of the adaptation of R
-    fuzzy_outputs: Annotated[FloatArray, 5]
+    fuzzy_inputs: Annotated[FloatArray, 5]  # peaks of the fuzzy sets that adapt R
+    fuzzy_outputs: Annotated[FloatArray, 5]  # [nat] change of ln R for each set
     rules: RuleBase
-    scales: Annotated[FloatArray, 2]  # on nominal variances: wheels, axles
-    adaptive: bool  # whether any rule is applied
+    scales: Annotated[FloatArray, 2]  # factors on the nominal R of wheels and axles
+    adaptive: bool  # True if the fuzzy rules are applied
 
 
 def nominal_states(constants: Constants) -> Nominal:

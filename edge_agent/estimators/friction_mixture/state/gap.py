@@ -22,12 +22,13 @@ from schemas.runtime.jit import compiled
 from schemas.runtime.lanes import put_lanes
 from schemas.signals import S
 
-UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
-YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample, and its offset
-GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
-# below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
+UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] variance of the yaw rate without a gyroscope
+YAW_STD = 0.002  # [rad/s] white noise and offset of a gyroscope sample
+GAP_ACCELERATION = 2.0  # [m/s^2] acceleration that may have acted during a gap without samples
+# [m/s] speed of vehicle and wheels below which slip is not used as evidence, because it is a
+# quotient of small numbers
 SLOWEST_M_S = 1.5
-SLOW_M_S = 2.0 * SLOWEST_M_S  # from here slip counts in full
+SLOW_M_S = 2.0 * SLOWEST_M_S  # [m/s] speed from which slip counts in full
 
 
 @compiled

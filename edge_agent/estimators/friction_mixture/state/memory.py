@@ -24,8 +24,8 @@ from schemas.runtime.records import LaneArray, RecordArray, records
 class PlanarVector:
     """Record of a vector in the plane of the road: x forward, y left."""
 
-    x: float  # ahead
-    y: float  # left
+    x: float
+    y: float
 
 
 class VelocityGain:
@@ -33,9 +33,9 @@ class VelocityGain:
     in the current vehicle axes.
     """
 
-    measured: PlanarVector  # by the measured accelerations
-    leak_y: PlanarVector  # the part of it from a_y
-    unit: PlanarVector  # by 1 m/s^2 ahead, per [m/s^2] of offset
+    measured: PlanarVector  # from the measured accelerations
+    leak_y: PlanarVector  # part of `measured` that comes from a_y
+    unit: PlanarVector  # from a forward acceleration of 1 m/s^2: effect of a sensor offset
 
 
 class BlockSums:
@@ -43,40 +43,40 @@ class BlockSums:
     which the block's means are computed when it ends.
     """
 
-    time: float  # at which it began [s]
-    samples: int
-    angle: float  # turned [rad]
-    cos_sum: float  # of that angle, over the samples
-    sin_sum: float
-    gain: VelocityGain
-    gain_sum: VelocityGain  # over the samples
-    sums: Annotated[FloatArray, INPUTS]  # of the valid samples
-    counts: Annotated[IntArray, INPUTS]
-    missing_x: float  # variance per second of v_x where a_x is missing [m^2/s^3]
-    missing_y: float
-    start_yaw_rate: float  # [rad/s]
-    start_omega: Annotated[FloatArray, 4]  # [rad/s]
+    time: float  # [s] beginning of the block
+    samples: int  # number of samples
+    angle: float  # [rad] yaw angle since the beginning
+    cos_sum: float  # sum of the cosine of this angle over the samples
+    sin_sum: float  # the same sum of the sine
+    gain: VelocityGain  # since the beginning
+    gain_sum: VelocityGain  # sum of `gain` over the samples
+    sums: Annotated[FloatArray, INPUTS]  # sum of the valid samples of each channel
+    counts: Annotated[IntArray, INPUTS]  # number of valid samples of each channel
+    missing_x: float  # [m^2/s^3] variance that v_x gains per second if a_x is missing
+    missing_y: float  # [m^2/s^3] the same for v_y if a_y or the yaw rate is missing
+    start_yaw_rate: float  # [rad/s] at the beginning
+    start_omega: Annotated[FloatArray, 4]  # [rad/s] at the beginning
 
 
 class LastInputs:
     """Record of the latest value of each input signal, which the next sample needs."""
 
-    time: float  # of the last sample [s]
-    position_time: float  # of the last position [s]
-    now: Annotated[FloatArray, INPUTS]  # readings of the last sample, NaN where there is none
-    inertial_time: float  # of the last sample with both accelerations [s]
-    ax: float  # last input used [m/s^2]
+    time: float  # [s] time of the last sample
+    position_time: float  # [s] time of the last position
+    now: Annotated[FloatArray, INPUTS]  # readings of the last sample, NaN where missing
+    inertial_time: float  # [s] time of the last sample with both accelerations
+    ax: float  # [m/s^2] last value used
     ay: float
-    read_ax: float  # last reading, used or refused [m/s^2]
+    read_ax: float  # [m/s^2] last reading, used or rejected
     read_ay: float
-    yaw_rate: float  # scalar filter [rad/s]
-    yaw_rate_var: float
-    omega: Annotated[FloatArray, 4]  # [rad/s]
-    omega_held: Annotated[IntArray, 4]  # readings for which it has been the same
-    omega_step: Annotated[FloatArray, 4]  # width of the steps that it is read in [rad/s]
-    delta: Annotated[FloatArray, 4]  # [rad]
-    delta_before: Annotated[FloatArray, 4]  # in the block before [rad]
-    rear_steering: bool  # whether a rear steering angle has been seen
+    yaw_rate: float  # [rad/s] estimate of the scalar filter
+    yaw_rate_var: float  # [rad^2/s^2] its variance
+    omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds
+    omega_held: Annotated[IntArray, 4]  # number of readings since a wheel speed changed
+    omega_step: Annotated[FloatArray, 4]  # [rad/s] resolution of a wheel speed signal
+    delta: Annotated[FloatArray, 4]  # [rad] steering angles
+    delta_before: Annotated[FloatArray, 4]  # [rad] steering angles in the previous block
+    rear_steering: bool  # True once a rear steering angle has been read
 
 
 class GripInUse:
@@ -84,10 +84,10 @@ class GripInUse:
     acceleration over g [1].
     """
 
-    slow: float  # smoothed, for the nodes
-    fast: float  # smoothed less
-    held: float  # the largest of late: no friction is told below it
-    age: float  # of that [s]
+    slow: float  # smoothed over SLOW_S, for the penalty of nodes
+    fast: float  # smoothed over FAST_S
+    held: float  # recent maximum of `fast`: the reported upper end is not below it
+    age: float  # [s] time since this maximum
 
 
 class RollingMotion:
@@ -95,14 +95,14 @@ class RollingMotion:
     model.
     """
 
-    moved_time: float  # at which a wheel last turned [s]
-    disagreed_time: float  # at which wheels last disagreed [s]
-    resting_ax: float  # a_x while wheels stand, smoothed [m/s^2]
-    stands: bool
-    ahead: float  # v_x by wheels that agree [m/s]; NaN where they do not
-    ahead_std: float
-    left: float  # v_y by a rear axle that follows [m/s]; NaN where it may slide
-    left_std: float
+    moved_time: float  # [s] time at which a wheel last turned
+    disagreed_time: float  # [s] time at which the wheels last disagreed
+    resting_ax: float  # [m/s^2] moving average of a_x while the wheels stand
+    stands: bool  # True while the car stands
+    ahead: float  # [m/s] v_x according to agreeing wheels; NaN if they do not agree
+    ahead_std: float  # [m/s] its standard deviation
+    left: float  # [m/s] v_y according to the rear axle; NaN if this axle may slide
+    left_std: float  # [m/s] its standard deviation
 
 
 class WheelSlip:
@@ -113,38 +113,36 @@ class WheelSlip:
     (`mixture/weighing.py`). A membership is a fuzzy truth value, 0 to 1.
     """
 
-    held: float  # membership of the last second in "a wheel slides" [1]
-    begins: float  # what this block adds to it [1]
-    ended: float  # what of it this block no longer shows [1]
-    axle_held: float  # membership of the last second in "an axle slides on a slippery road" [1]
-    axle_ended: float  # what of it this block no longer shows, though its force is the same [1]
-    rear_unlike_until: (
-        float  # time until which the rear axle is on another surface than the front axle [s]
-    )
+    held: float  # membership of the last second in "a wheel slides"
+    begins: float  # increase of `held` by the current block
+    ended: float  # `held` minus the membership of the current block
+    axle_held: float  # membership of the last second in "an axle slides on a slippery road"
+    axle_ended: float  # the same difference for `axle_held`; 0 if the force has changed
+    # [s] time until which the rear axle may be on another surface than the front axle
+    rear_unlike_until: float
 
 
 class Trust:
     """Record of the consistency test, which asks whether any friction explains the measurements."""
 
-    # squared innovations of the axles over their stated variance, smoothed, as far as unexplained
-    # [1]
+    # [1] moving average of the axles' squared innovations over their stated variance, without the
+    # part that slides or slippery road explain
     ratio: float
-    odd: float  # how much more likely it is of late that none does [nat]
-    distrust: float  # 1 where none does, else 0
-    left: float  # of that, before it is tried again [s]
-    patience: float  # how long it lasted last [s]
-    strain: float  # of what is believed of vehicle and sensors: chi-square over degrees of freedom
-    hurry: (
-        float  # at which offsets, slope and bank return to their prior, beside the usual pace [1/s]
-    )
+    odd: float  # [nat] recent log-likelihood ratio against the model
+    distrust: float  # 1 while the model counts as contradicted, else 0
+    left: float  # [s] time until the model is tried again
+    patience: float  # [s] duration of the last distrust, fading with time
+    strain: float  # [1] chi-square of vehicle and sensor states over degrees of freedom
+    # [1/s] additional rate at which offsets, slope and bank return to their prior
+    hurry: float
 
 
 class Quantiles:
     """Median, lower and upper end (5 % and 95 % quantile) of friction."""
 
     median: float
-    lower: float  # 5 %
-    upper: float  # 95 %
+    lower: float  # 5 % quantile
+    upper: float  # 95 % quantile
     p_slippery: float  # P(mu < SLIPPERY_MU)
 
 
@@ -154,41 +152,36 @@ class MixtureMemory:
     """
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
-    nominal: Nominal  # prior of its states, by what its file knows of them
+    nominal: Nominal  # prior of its states, narrowed by its calibration
     started: bool
-    split: bool  # whether the split nodes take part
+    split: bool  # True while the nodes of split roads are active
     last: LastInputs
     block: BlockSums
     mean: Annotated[LaneArray, GROUPS, STATES]
     covariance: Annotated[LaneArray, GROUPS, STATES, STATES]  # only its lower half is used
-    weight: Annotated[FloatArray, PLACES]
-    visit_weight: Annotated[
-        FloatArray, PLACES
-    ]  # probabilities from the reference prior at the visit's start
-    surest: Annotated[
-        FloatArray, NODES
-    ]  # they where they knew most, since the road last became another
-    information: float  # of them over the prior [nat]
-    patch: Annotated[FloatArray, PATCH_NODES]  # probability of a patch of ice here, by node
-    penalty: Annotated[
-        FloatArray, PLACES
-    ]  # ledger: charged so far for what a node believes of the vehicle [nat]
-    overall_mean: Annotated[FloatArray, STATES]  # moments of the mixture
-    overall_covariance: Annotated[FloatArray, STATES, STATES]
-    actual: Annotated[FloatArray, 2]  # windowed innovation variances: wheels, axles
+    weight: Annotated[FloatArray, PLACES]  # probabilities of the nodes
+    # Probabilities of the nodes that start from the prior with each visit
+    visit_weight: Annotated[FloatArray, PLACES]
+    # Most informative `visit_weight` of the current part of the visit
+    surest: Annotated[FloatArray, NODES]
+    information: float  # [nat] divergence of `surest` from the prior
+    patch: Annotated[FloatArray, PATCH_NODES]  # probability of an ice patch here, per ice node
+    # [nat] amount charged so far for deviations of a node's vehicle and sensor states
+    penalty: Annotated[FloatArray, PLACES]
+    overall_mean: Annotated[FloatArray, STATES]  # mean of the whole mixture
+    overall_covariance: Annotated[FloatArray, STATES, STATES]  # its covariance
+    # Averaged squared innovations and their expected variances: wheels, axles
+    actual: Annotated[FloatArray, 2]
     theoretical: Annotated[FloatArray, 2]
-    factor: Annotated[FloatArray, 2]  # adapted over nominal R
-    last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
-    usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
-    usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
-    usual_slip: Annotated[
-        FloatArray, 2
-    ]  # of axles, across, as linear force over load, smoothed [1]
-    # force over load of the axles, along and across, smoothed [1]
+    factor: Annotated[FloatArray, 2]  # [1] adapted over nominal R: wheels, axles
+    last_side: Annotated[FloatArray, 2]  # [1] axles' lateral force over load in the previous block
+    usual_rolling: Annotated[FloatArray, 4]  # [m/s] smoothed forward speed according to each wheel
+    usual_force: Annotated[FloatArray, 6]  # [1] smoothed force over load of wheels and axles
+    # [1] smoothed lateral slip of the axles, as force over load of a linear tyre
+    usual_slip: Annotated[FloatArray, 2]
+    # [1] smoothed force over load of the axles, along and across
     axle_force: Annotated[FloatArray, 2, 2]
-    drive_odds: Annotated[
-        FloatArray, 3
-    ]  # of a car that drives its rear axle, all wheels, its front axle
+    drive_odds: Annotated[FloatArray, 3]  # probabilities of rear, all-wheel and front drive
     slip: WheelSlip
     rolling: RollingMotion
     grip: GripInUse
@@ -197,9 +190,9 @@ class MixtureMemory:
     friction: Quantiles
     friction_left: Quantiles
     friction_right: Quantiles
-    health: int  # of the last block
-    nis: float  # per row
-    log_likelihood: float  # of what was measured at the sample [nat]
+    health: int  # health flags of the last block
+    nis: float  # normalised squared innovation, mean over the measurements
+    log_likelihood: float  # [nat] of the measurements of the block that ends at the sample
 
 
 def new_filters(

@@ -27,10 +27,12 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import LANES, LaneArray
 
-LEAST_RATIO = 1.45  # of the higher side's friction to the lower one's, to count as split
-LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # edges of the cells of the lower side
-HIGH = (0.36, 0.55, 0.80, 1.20)  # and of the higher: often it is only known to be more
-LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is the mean of the two
+LEAST_RATIO = 1.45  # [1] smallest ratio of the two frictions of a split road
+LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # [1] cell edges of the side with less friction
+# [1] cell edges of the side with more friction. They are coarse, because often only a lower limit
+# of this friction is known.
+HIGH = (0.36, 0.55, 0.80, 1.20)
+LEFT, RIGHT, BOTH = range(3)  # first index of `Sides.share`; BOTH is the mean of the two sides
 
 
 class Sides(NamedTuple):
@@ -40,9 +42,9 @@ class Sides(NamedTuple):
     """
 
     mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
-    lanes: Annotated[LaneArray, GROUPS, 2]  # mu with the nodes side by side
+    lanes: Annotated[LaneArray, GROUPS, 2]  # `mu` in the layout of groups and lanes
     prior: Annotated[FloatArray, ALL_NODES]
-    # of a split node's left side, right side and mean in the cells of the nodes of one friction
+    # Distribution of a split node's friction (LEFT, RIGHT, BOTH) over the nodes of one friction
     share: Annotated[FloatArray, 3, SPLIT_NODES, NODES]
 
 
@@ -54,7 +56,7 @@ class Triangle(NamedTuple):
     left: float
     middle: float
     right: float
-    width: float  # of the cell that it stands for, the share of a uniform prior
+    width: float  # width of its cell, proportional to the uniform prior probability
 
 
 def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:

@@ -22,9 +22,10 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
 from schemas.runtime.lanes import any_lane, floor, gather, inverse_root_of, select
 
-CELLS: Final = 1024  # linear between: errors below 1e-6 of the force
-# (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads
-# beyond the round one
+# Number of cells of a table. Linear interpolation in a cell errs by less than 1e-6 of the force.
+CELLS: Final = 1024
+# (C, E) of the Magic Formula for a sharp and a round tyre. Tyres of passenger cars lie between
+# them; the brush model lies two standard deviations beyond the round tyre.
 SHARP: Final = (1.60, -0.45)
 ROUND: Final = (1.33, 0.05)
 
@@ -32,10 +33,10 @@ ROUND: Final = (1.33, 0.05)
 class TyreCurve(NamedTuple):
     """Tables of the tyre's force curve at CELLS + 1 points, for interpolation."""
 
-    ratio: Annotated[FloatArray, CELLS + 1]  # f/theta over u
-    slope: Annotated[FloatArray, CELLS + 1]  # f' over u
-    shape: Annotated[FloatArray, CELLS + 1]  # over u
-    inverse: Annotated[FloatArray, CELLS + 1]  # theta of the rising branch over t
+    ratio: Annotated[FloatArray, CELLS + 1]  # f/theta as a function of u
+    slope: Annotated[FloatArray, CELLS + 1]  # slope of f as a function of u
+    shape: Annotated[FloatArray, CELLS + 1]  # as a function of u
+    inverse: Annotated[FloatArray, CELLS + 1]  # theta of the rising branch as a function of t
 
 
 def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:

@@ -31,41 +31,39 @@ class BlockFeatures:
     """
 
     duration: float  # [s]
-    speed: float  # |v_x| at the beginning [m/s]
-    cos: float
-    sin: float
+    speed: float  # [m/s] |v_x| at the beginning
+    cos: float  # mean cosine of the yaw angle since the beginning
+    sin: float  # mean sine of this angle
     gain: VelocityGain  # mean over the block
-    yaw_rate: float  # mean [rad/s]
-    novelty: float  # share of the block that is new, with the floor `steady_share` [1]
-    new: float  # membership of forces and lateral slips in "new" [1]
-    demand: float  # larger force over load of the two axles [1]
-    change: float  # measured a_x, mean [m/s^2]
-    steering: float  # mean angle of the front wheels [rad]
-    steer_rate: float  # of it [rad/s]
-    asymmetry: float  # slip left against right beyond force and noise, in force over load [1]
+    yaw_rate: float  # [rad/s] mean
+    novelty: float  # [1] `new`, raised to at least `steady_share`
+    new: float  # [1] membership of forces and lateral slips in "new"
+    demand: float  # [1] larger force over load of the two axles
+    change: float  # [m/s^2] mean of the measured a_x
+    steering: float  # [rad] mean angle of the front wheels
+    steer_rate: float  # [rad/s] its rate of change
+    asymmetry: float  # [1] see `unexplained_slip_difference`
     loads: Annotated[FloatArray, 4]  # [N]
-    spin: Annotated[FloatArray, 4]  # wheel acceleration [rad/s^2]
-    rolling: Annotated[FloatArray, 4]  # R*omega, mean [m/s]; NaN without a reading
-    force: Annotated[FloatArray, 4]  # F_x/F_z [1]
-    force_unit: Annotated[FloatArray, 4]  # its derivative by a_x, where torque is missing [s^2/m]
-    load_share: Annotated[FloatArray, 4]  # wheel load over axle load [1]
+    spin: Annotated[FloatArray, 4]  # [rad/s^2] acceleration of a wheel's rotation
+    rolling: Annotated[FloatArray, 4]  # [m/s] mean of R*omega; NaN without a reading
+    force: Annotated[FloatArray, 4]  # [1] F_x/F_z
+    force_unit: Annotated[FloatArray, 4]  # [s^2/m] its derivative by a_x; 0 if torque is known
+    load_share: Annotated[FloatArray, 4]  # [1] wheel load over axle load
     steer_cos: Annotated[FloatArray, 4]
     steer_sin: Annotated[FloatArray, 4]
-    # velocity of the wheel's centre from the yaw rate, along and across the wheel [m/s]
+    # [m/s] velocity of the wheel's centre from the yaw rate, along and across the wheel
     turn_along: Annotated[FloatArray, 4]
     turn_across: Annotated[FloatArray, 4]
-    side: Annotated[FloatArray, 2]  # F_y/F_z of an axle in the wheel's frame [1]; NaN where unknown
-    side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
-    side_unit: Annotated[FloatArray, 2]  # its derivative by a_y [s^2/m]
-    noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
-    slip_noise: Annotated[
-        FloatArray, ROWS
-    ]  # variance of slip, as linear force over load; half of it is in noise_std
-    abrupt_noise: Annotated[FloatArray, 4]  # variance of slip that came within the block, likewise
-    informs_x: Annotated[
-        FloatArray, 2
-    ]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
-    axle_scale: float  # R of the axles over R as the constants state it
+    side: Annotated[FloatArray, 2]  # [1] F_y/F_z of an axle in the wheel's frame; NaN if unknown
+    side_leak: Annotated[FloatArray, 2]  # [1] its derivative by the leak
+    side_unit: Annotated[FloatArray, 2]  # [s^2/m] its derivative by a_y
+    noise_std: Annotated[FloatArray, ROWS]  # [1] of a residual, where the tyre curve has slope 1
+    # [1] variance of slip, as force over load of a linear tyre; `noise_std` contains half of it
+    slip_noise: Annotated[FloatArray, ROWS]
+    abrupt_noise: Annotated[FloatArray, 4]  # [1] variance of sudden slip, in the same unit
+    # [1] factors, 0 to 1, on the effect of the stiffness states on an axle's slips
+    informs_x: Annotated[FloatArray, 2]
+    axle_scale: float  # [1] adapted R of the axles over the R that the constants state
     informs_y: Annotated[FloatArray, 2]
 
 
@@ -74,17 +72,16 @@ class NodeSlip:
     vector of each node (filter of one friction hypothesis) in a group.
     """
 
-    along: Annotated[LaneArray, 4]  # g_x, linear force over load [1]
+    # Slips are given as force over load of a linear tyre [1].
+    along: Annotated[LaneArray, 4]  # g_x
     across: Annotated[LaneArray, 4]  # g_y
-    size: Annotated[LaneArray, 4]  # of (g_x, g_y)
-    place: Annotated[LaneArray, 4]  # u of the tables over slip, theta/(1 + theta)
-    ratio: Annotated[LaneArray, 4]  # force over that of a linear tyre [1]
-    axle_slip: Annotated[
-        LaneArray, 2
-    ]  # across, mean of an axle's wheels, as linear force over load
-    axle_force: Annotated[LaneArray, 2]  # of it by the tyre curve, over load [1]
-    scale_x: Annotated[LaneArray, 2]  # what a wheel's residual is multiplied by, per axle
-    scale_y: Annotated[LaneArray, 2]  # the same for an axle's residual
+    size: Annotated[LaneArray, 4]  # hypot(g_x, g_y)
+    place: Annotated[LaneArray, 4]  # theta/(1 + theta), the argument of the tables over slip
+    ratio: Annotated[LaneArray, 4]  # force over that of a linear tyre
+    axle_slip: Annotated[LaneArray, 2]  # lateral slip, mean of an axle's wheels by load
+    axle_force: Annotated[LaneArray, 2]  # lateral force over load according to the tyre curve
+    scale_x: Annotated[LaneArray, 2]  # factor on the residuals of an axle's wheels
+    scale_y: Annotated[LaneArray, 2]  # factor on an axle's residual
 
 
 class NodeForces:
@@ -93,45 +90,45 @@ class NodeForces:
     """
 
     force: Annotated[LaneArray, ROWS]
-    slip_at_force: Annotated[LaneArray, ROWS]  # linear force over load that gives it
+    slip_at_force: Annotated[LaneArray, ROWS]  # slip at which the tyre curve gives it
 
 
 class NodeWorkspace:
     """Scratch arrays for the update of one group of nodes (friction hypotheses)."""
 
-    gained_x: Annotated[LaneArray, 1]  # mean velocity gained in the block, by a node's mean [m/s]
+    gained_x: Annotated[LaneArray, 1]  # [m/s] mean velocity gained in the block, per node
     gained_y: Annotated[LaneArray, 1]
-    rolling: Annotated[LaneArray, 4]  # R*omega with radius and lag as the node has them [m/s]
-    steering: Annotated[LaneArray, 1]  # true minus measured steering angle of the front axle [rad]
+    rolling: Annotated[LaneArray, 4]  # [m/s] R*omega, corrected by the node's radius and delay
+    steering: Annotated[LaneArray, 1]  # [rad] true minus measured front steering angle
     mu: Annotated[LaneArray, 2]  # friction on the left and right
     per_mu: Annotated[LaneArray, 2]
     axle_mu: Annotated[LaneArray, 2]  # mean over an axle's wheels by load
     per_axle_mu: Annotated[LaneArray, 2]
-    point: Annotated[LaneArray, STATES]
+    point: Annotated[LaneArray, STATES]  # states at which the residuals are evaluated
     slip: NodeSlip  # at the mean
     moved_slip: NodeSlip  # at another point
     forces: NodeForces  # at the mean
-    moved_forces: NodeForces
-    # force over load by which a tyre one spread sharper differs
+    moved_forces: NodeForces  # at another point
+    # [1] difference of force over load if the tyre is sharper by one standard deviation
     shape_force: Annotated[LaneArray, ROWS]
-    # at the mean, then mean of the cubature points, then innovation
+    # Residual at the mean, then its mean over the cubature points, then the innovation
     residual: Annotated[LaneArray, ROWS]
-    ahead: Annotated[LaneArray, ROWS]
-    behind: Annotated[LaneArray, ROWS]
-    nonlinearity: Annotated[LaneArray, ROWS]  # variance that the rows' curvature adds
-    middle: Annotated[LaneArray, CURVED, ROWS]
-    derivative: Annotated[LaneArray, ACTIVE, ROWS]
+    ahead: Annotated[LaneArray, ROWS]  # residual at the cubature point in positive direction
+    behind: Annotated[LaneArray, ROWS]  # the same in negative direction
+    nonlinearity: Annotated[LaneArray, ROWS]  # variance that the nonlinearity adds
+    middle: Annotated[LaneArray, CURVED, ROWS]  # mean of `ahead` and `behind`
+    derivative: Annotated[LaneArray, ACTIVE, ROWS]  # of the residuals by the linear states
     root: Annotated[LaneArray, STATES, CURVED]  # first columns of the covariance's factor
-    curved: Annotated[LaneArray, CURVED, ROWS]  # deviation of the cubature points in their axes
-    whole: Annotated[LaneArray, CURVED, ROWS]  # the same with the rows' linear part
-    cross: Annotated[LaneArray, STATES, ROWS]  # covariance of the states with the rows
+    curved: Annotated[LaneArray, CURVED, ROWS]  # B of `node_filter`
+    whole: Annotated[LaneArray, CURVED, ROWS]  # B + D*L of `node_filter`
+    cross: Annotated[LaneArray, STATES, ROWS]  # covariance of the states with the measurements
     gain: Annotated[LaneArray, ROWS]  # inverse variances of the innovations
     scaled: Annotated[LaneArray, 1, ROWS]
-    spread: Annotated[LaneArray, ROWS, ROWS]  # covariance of the rows
-    noise: Annotated[LaneArray, ROWS]  # variance of the rows' noise
-    abrupt: Annotated[
-        LaneArray, ROWS
-    ]  # variance of what came within the block: a bump says nothing of later ones
+    spread: Annotated[LaneArray, ROWS, ROWS]  # covariance of the measurements
+    noise: Annotated[LaneArray, ROWS]  # noise variance of the measurements
+    # Noise variance of sudden slip. It is not multiplied by the inflation of R, because a bump
+    # does not affect later blocks.
+    abrupt: Annotated[LaneArray, ROWS]
     turned: Annotated[LaneArray, 2, STATES]  # covariance of the predicted velocity with the states
     velocity: Annotated[LaneArray, STATES]  # covariance of a measured velocity with the states
 
@@ -143,24 +140,24 @@ class Scratch:
 
     features: BlockFeatures
     node: NodeWorkspace
-    mixing: Annotated[FloatArray, PLACES]  # share of foreign probability by road change
+    mixing: Annotated[FloatArray, PLACES]  # share of probability that a road change brought
     share: Annotated[FloatArray, PLACES]  # weight of the active nodes, 0 elsewhere
     updated: Annotated[LaneArray, GROUPS, 2]  # velocity after the measurements [m/s]
-    apart: Annotated[LaneArray, GROUPS, STATES]  # from the mean of the mixture
-    process: Annotated[FloatArray, STATES]  # variances
-    keep: Annotated[FloatArray, STATES]
-    log_likelihood: Annotated[FloatArray, PLACES]
-    plain: Annotated[FloatArray, PLACES]  # the same with the nominal R
-    moved: Annotated[FloatArray, PLACES]  # change of what the belief about the vehicle costs [nat]
-    predicted: Annotated[FloatArray, ALL_NODES]
-    # sums over the nodes by weight, of the wheels and of the axles, first lane by lane
+    apart: Annotated[LaneArray, GROUPS, STATES]  # deviation from the mean of the mixture
+    process: Annotated[FloatArray, STATES]  # process variances of the block
+    keep: Annotated[FloatArray, STATES]  # factors by which states return to their prior
+    log_likelihood: Annotated[FloatArray, PLACES]  # [nat] with the inflated R
+    plain: Annotated[FloatArray, PLACES]  # [nat] log-likelihood with R before inflation
+    moved: Annotated[FloatArray, PLACES]  # [nat] change of `belief_cost`
+    predicted: Annotated[FloatArray, ALL_NODES]  # probabilities after the road change
+    # Sums over the nodes, weighted by probability, of wheels and axles: first per lane, then total
     actual_lanes: Annotated[LaneArray, 2]
     theoretical_lanes: Annotated[LaneArray, 2]
     stated_lanes: Annotated[LaneArray, 1]
     square_lanes: Annotated[LaneArray, 1]
     actual_sum: Annotated[FloatArray, 2]  # squared innovations
     theoretical_sum: Annotated[FloatArray, 2]  # their variances
-    stated_sum: float  # the axles' with R as the constants state it
+    stated_sum: float  # variances of the axles with the R that the constants state
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
     blended: Annotated[FloatArray, NODES]
