@@ -9,7 +9,7 @@ Other programs may rely on the names in `__all__`. Each is loaded at its first u
 
 from __future__ import annotations
 
-import gripmap  # noqa: F401 says which other package hides one of ours, where one does
+import gripmap  # noqa: F401 names another installed package that hides one of ours
 from schemas.runtime import lazy_exports
 
 _FACE = {

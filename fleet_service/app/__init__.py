@@ -4,7 +4,7 @@ metrics.
 
 from typing import Final
 
-# 25 MB that a running service's libraries load where they find them: for matrix products in
-# kernels, of which there are none, and for file systems that only a compaction writes to, which is
-# a process of its own.
+# Modules that libraries load if they are installed, and that a running service never uses (25 MB).
+# SciPy would serve matrix products in compiled functions, which have none. The cloud file systems
+# of Arrow serve only compaction, which runs as a separate process.
 UNUSED: Final = ("scipy", "pyarrow._s3fs", "pyarrow._gcsfs", "pyarrow._azurefs", "pyarrow._hdfs")

@@ -16,13 +16,13 @@ from typing import Final, NamedTuple
 
 from schemas.thresholds import NS
 
-# a step that a time server corrects at once, and that is harmless for reports
+# [ns] Largest jump of the wall clock that the service follows at once. A time server corrects
+# errors of this size in one step, and they are harmless for reports.
 JUMP_NS: Final = 60 * NS
-NEAR_NS: Final = (
-    600 * NS
-)  # a report shows the time if it is younger than this and not part of a backlog
-VOTE_NS: Final = 5 * NS  # time in which every driving vehicle sends a report
-OFF_NS: Final = 86_400 * NS  # after a longer downtime, the wall clock may be wrong
+# [ns] A report confirms the wall clock if it is younger than this and not part of a backlog.
+NEAR_NS: Final = 600 * NS
+VOTE_NS: Final = 5 * NS  # [ns] time in which every driving vehicle sends a report
+OFF_NS: Final = 86_400 * NS  # [ns] after a longer downtime, the wall clock may be wrong
 ANY: Final = 1 << 61  # [ns] possible error of a clock about which nothing is known
 
 
@@ -69,9 +69,9 @@ class SteadyClock:
         self._began = steady()
         self._confirmed = False
         self._sure = 0 <= wall() - seen <= OFF_NS
-        # steady time since which the wall clock differs
+        # steady time [ns] since which the wall clock differs; None if it agrees
         self._doubted: int | None = None
-        # whether each vehicle's reports agree with the wall clock
+        # for each vehicle, True if its reports agree with the wall clock
         self._votes: dict[str, bool] = {}
 
     def now(self) -> int:

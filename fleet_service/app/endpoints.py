@@ -62,7 +62,7 @@ class Endpoints:
             queryables.append(
                 session.declare_queryable(own, lambda query: self._hand_over(query, session))
             )
-        # last, because a client that sees the token may query at once
+        # Declare the token last, because a client may query as soon as it sees the token.
         token = session.liveliness().declare_token(own)
         try:
             yield
@@ -96,7 +96,7 @@ class Endpoints:
     def _enqueue_weather(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        # a longer message is replaced with an empty one, which is refused and counted
+        # A message that is too long is replaced with an empty one, which is refused and counted.
         fits = len(sample.payload) <= wire.MAX_BYTES
         payload = sample.payload.to_bytes() if fits else b""
         message = WeatherMessage(str(sample.key_expr), payload, str(sample.encoding))

@@ -58,7 +58,7 @@ def handle_requests(
         except InputError as error:
             erasure_requests.answer_request(question, error)
             continue
-        if outcome is None:  # the service stops; after its next start it carries out the request
+        if outcome is None:  # the service is stopping; it carries out the request after a restart
             break
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
@@ -140,9 +140,8 @@ def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     Raises:
         InputError, OSError: as for `retention.forget_vehicle`.
     """
-    known = weather.weather_files(
-        root
-    )  # a file that arrives meanwhile is read twice, which changes nothing
+    # A file that arrives after this call is read twice, which does not change the result.
+    known = weather.weather_files(root)
     with erase_files(root, request["vehicle"], request["month"]) as done:
         cut = Cut(*request["cut"])
         checkpoints.save_checkpoint(

@@ -32,11 +32,12 @@ from schemas.errors import InputError
 from schemas.query import MapQuery
 from schemas.runtime.process import trim_memory
 
-MOST_ROWS: Final = 500_000  # maximum number of rows to fuse: some seconds, and 100 MB
-# maximum number of rows near the box, according to the files' footers: half a minute
+MOST_ROWS: Final = 500_000  # largest number of rows to fuse: some seconds of work and 100 MB
+# Largest number of rows in files near the box, according to the files' footers. Reading them takes
+# half a minute.
 LOOKED_ROWS: Final = 20_000_000
-IDLE_S: Final = 60.0  # time for which an idle process waits for the next query
-# number of answers after which the process ends, which frees the memory that it has kept
+IDLE_S: Final = 60.0  # [s] time for which an idle process waits for the next query
+# Number of answers after which a process ends, so that the memory it has accumulated is released.
 ANSWERS: Final = 100
 _HEAD: Final = struct.Struct("<qQ")
 _ERROR = -1
@@ -113,7 +114,7 @@ class HistoricalMaps:
         head (tile number and length) of its first reply.
         """
         if process := self._keep_process(None):
-            with suppress(BrokenPipeError, ChildProcessError):  # the process has just ended
+            with suppress(BrokenPipeError, ChildProcessError):  # if the process has just ended
                 return process, process.ask(question)
             process.end()
         process = _Process(self._root)
@@ -239,7 +240,7 @@ def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
     have been answered.
     """
     pa.set_cpu_count(1)
-    pa.set_io_thread_count(1)  # each thread that reads keeps 20 MB of memory of its own
+    pa.set_io_thread_count(1)  # each reading thread needs 20 MB of memory
     for _ in range(ANSWERS):
         if not select([asked], [], [], IDLE_S)[0] or not (line := asked.readline()):
             return

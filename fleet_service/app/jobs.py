@@ -31,19 +31,21 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 
 log = logging.getLogger(__name__)
-ROUND_ROWS: Final = 250_000  # rows of one round of compaction: a second of work, 150 MB
-# Maximum number of segments that wait for compaction. A query to the archive reads each of
-# them in a millisecond.
+ROUND_ROWS: Final = 250_000  # rows per round of compaction: one second of work and 150 MB
+# Largest number of segments that wait for compaction. A query to the archive reads each of them in
+# a millisecond.
 SEGMENTS_MOST: Final = 10_000
-INVENTORY_S: Final = 300.0  # a scan of thousands of files takes a tenth of a second
-# period in which results of compaction, checkpoints and snapshots are copied to the bucket
+# [s] Period in which the archive's files are counted. Scanning thousands of files takes .1 s.
+INVENTORY_S: Final = 300.0
+# [s] Period in which results of compaction, checkpoints and snapshots are copied to the bucket.
 FOLLOW_S: Final = 30.0
 DAY_S: Final = 86_400.0
-ASKED_S: Final = 2.0  # period of the checks for a requested erasure or hand-over
-# first run of a job after the start; it does not wait for its whole period
+ASKED_S: Final = 2.0  # [s] period of the checks for a requested erasure or hand-over
+# [s] A job runs for the first time at most this long after the start, not only after its period.
 SOON_S: Final = 60.0
-HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
-_NICE: Final = 10  # lower priority than the worker
+# [s] A job that runs for longer counts as hanging. Compaction of a day's backlog takes minutes.
+HANGS_S: Final = 1800.0
+_NICE: Final = 10  # scheduling priority of the jobs' thread: lower than that of the worker
 
 
 class Job(NamedTuple):
@@ -64,9 +66,8 @@ def archive_jobs(
     """
 
     def compaction(stop: threading.Event) -> str | None:
-        if (
-            engine.copy is not None and engine.settlement.failing
-        ):  # compacted, its segments would never be put as such
+        # If compaction ran now, the segments that are not yet in the bucket could never be copied.
+        if engine.copy is not None and engine.settlement.failing:
             return "compaction waits for the archive's copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)
@@ -140,7 +141,7 @@ def archive_jobs(
             checkpoint(stop)
             following(stop)
         except BaseException:
-            holding.to = ""  # the service stays here
+            holding.to = ""  # the hand-over failed; the service keeps its archive
             raise
         holding.leaves = True
         return f"handing over: to {holding.to}"
@@ -213,11 +214,10 @@ class BackgroundJobs:
         self._thread.join()
 
     def _keep(self) -> None:
-        # not permitted everywhere; the jobs matter more than their priority
+        # Setting a priority is not permitted everywhere; then the jobs run with the normal one.
         with suppress(OSError):
-            os.setpriority(
-                os.PRIO_PROCESS, threading.get_native_id(), _NICE
-            )  # of this thread alone, on Linux
+            # On Linux this changes the priority of this thread only.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         began = time.monotonic()
         due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
         while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):

@@ -12,9 +12,11 @@ from schemas.config import ServiceConfig
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
-STALLED_S: Final = 5.0  # time without a pass of the worker's loop, which takes milliseconds
-CLOCK_S: Final = 60.0  # difference from the system's clock that shows that a time server is missing
-FULL: Final = 0.9  # share of the queue
+# [s] A worker whose loop has not passed for this time counts as stalled. A pass takes milliseconds.
+STALLED_S: Final = 5.0
+# [s] Difference between service time and system clock from which a time server seems to be missing.
+CLOCK_S: Final = 60.0
+FULL: Final = 0.9  # share of the queue's capacity from which it counts as full
 _FAMILIES: Final = (  # prefix of the counts, name, label, text
     ("refused.", "refused_messages", "reason", "batches that were refused, by reason"),
     ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),

@@ -25,9 +25,9 @@ from fleet_service.serve.encode import cell_table
 from schemas import mugrid, wire
 from schemas.runtime.jit import kernel_cache
 
-CELLS: Final = 1 << 14  # more than a map has space for at first
+CELLS: Final = 1 << 14  # more cells than a new map has space for, so that its growth is exercised
 COMPILE: Final = "from fleet_service.app.precompile import exercise_map; exercise_map()"
-DONE: Final = "fleet_service.compiled"  # marker in the cache: everything has been compiled
+DONE: Final = "fleet_service.compiled"  # marker file in the cache: all functions are compiled
 
 
 def warm_up() -> None:
@@ -42,7 +42,7 @@ def warm_up() -> None:
             [sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False
         )
         if beside.returncode == 0:
-            with suppress(OSError):  # it is then checked again at the next start
+            with suppress(OSError):  # without the marker, the next start runs this process again
                 done.parent.mkdir(parents=True, exist_ok=True)
                 done.touch()
     exercise_map()
@@ -60,7 +60,7 @@ def exercise_map() -> None:
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
     bound_by_used(level_above_used(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
-    column = np.zeros(1, np.int64)  # like an array from Arrow, which is read-only
+    column = np.zeros(1, np.int64)  # read-only, like an array that Arrow returns
     column.flags.writeable = False
     group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)

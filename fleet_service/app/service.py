@@ -37,16 +37,20 @@ from schemas.runtime import watchdog, zenoh_session
 from schemas.runtime.metrics import serve_metrics
 from schemas.wire import Alert
 
-IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
-# period in which active alerts are published again: a client that returns waits less than 5 s
+IDLE_S: Final = 0.05  # [s] longest wait for a message: segments and tiles are late by at most this
+# [s] Period in which active alerts are published again. A client that reconnects gets them within 5
+# s.
 REPEAT_S: Final = 2.0
-REPEATED: Final = 1000  # alerts per period, 150 kB; further ones follow in the next periods
-# time for one segment or one tile of an answer after which systemd restarts the service
+REPEATED: Final = 1000  # alerts per period (150 kB); further alerts follow in the next periods
+# [s] Longest time for one segment or one tile of an answer. Then systemd restarts the service.
 HANGS_S: Final = 60.0
-STUCK_S: Final = 10.0  # a worker without progress for this time must be replaced by another service
-LEAVE_S: Final = 1.5  # part of the three seconds within which a service must end
-SURVIVED_S: Final = 20.0  # a service that runs for this time was not ended by its checkpoint
-BEHIND: Final = 1000  # waiting messages with which the worker publishes only one tile per pass
+# [s] If the worker makes no progress for this time, another service must take over.
+STUCK_S: Final = 10.0
+LEAVE_S: Final = 1.5  # [s] for the last messages; a service must end within three seconds
+# [s] A service that has run for this time was not ended by a faulty checkpoint.
+SURVIVED_S: Final = 20.0
+# From this number of waiting messages on, the worker publishes only one tile per pass.
+BEHIND: Final = 1000
 
 
 class Service:
@@ -94,7 +98,7 @@ class Service:
         self.engine.settlement.call_when_written(self.inbox.wake)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
-        # failure of the worker; closing the session after it may hang
+        # Exception that ended the worker. Closing the session after it may hang.
         self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
         self._rounds = TileRounds(
@@ -108,7 +112,7 @@ class Service:
         self._status_line = StatusLine(self.engine, self.inbox, self._clock, log_line)
         self._began = self._stepped_at
         self._survived = False
-        self._followed = False  # another service has the lease now
+        self._followed = False  # True once another service has the lease
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then write the waiting rows to disk, acknowledge them, and
@@ -254,7 +258,7 @@ class Service:
         """
         if self.engine.holding.is_lost:
             self._followed = True
-            # after this, nothing that waits for a bucket or a router delays the end for long
+            # From here on, waiting for a bucket or a router must not delay the end for long.
             stop.set()
             self._log_line(
                 "lease lost to another service; senders keep everything that was not acknowledged"
@@ -270,7 +274,7 @@ class Service:
                 break
             self._take(session, messages)
         publish_acks(session, self.engine.settlement.flush())
-        if not leaves:  # otherwise the next owner publishes all tiles
+        if not leaves:  # after a hand-over, the next owner publishes all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status_line.write_line(time.monotonic())
 

@@ -19,15 +19,16 @@ from fleet_service.ingest.dedup import BatchId
 from fleet_service.replication.bucket import CopyError
 from fleet_service.replication.ownership import Ownership
 
-# Maximum number of rows that wait for the disk. At this limit, no message is taken from the
+# Largest number of rows that wait for the disk. Above it, the service takes no message from the
 # queue until a segment is written.
 WAITING_ROWS: Final = 1_000_000
-# the same limit for batches that are on disk but not yet in the copy: 100 MB
+# Largest number of batches that are on disk but not yet in the bucket: 100 MB.
 WAITING_BATCHES: Final = 1_000_000
-# Minimum time between the beginnings of two segments. A segment costs 1.4 ms at a restart and 3 ms
-# to write; with .1 s a restart takes 4 s for the segments since the last checkpoint.
+# [s] Shortest time between the beginnings of two segments. Writing a segment takes 3 ms, and
+# reading it at a restart 1.4 ms. With .1 s, a restart would read segments since the last checkpoint
+# for 4 s.
 LEAST_S: Final = 0.25
-WRITE_SHARE: Final = 0.25  # maximum share of the time in which segments are written
+WRITE_SHARE: Final = 0.25  # largest share of the time in which segments are written
 T = TypeVar("T")
 
 

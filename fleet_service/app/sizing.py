@@ -16,13 +16,13 @@ from schemas import grid
 from schemas.thresholds import EARTH_RADIUS_M
 
 _DAY_S: Final = 86_400.0
-_USED: Final = 0.6  # maximum load of a core: a service must be able to catch up after an outage
-_CELL_M: Final = (
-    2.0 * math.pi * EARTH_RADIUS_M / (1 << grid.CELL_ZOOM)
-)  # edge of a cell at the equator
-_DIAGONAL: Final = 4.0 / math.pi  # cells that a road of random direction touches, per edge length
+_USED: Final = 0.6  # largest planned load of a core, so that a service can catch up after an outage
+# [m] edge of a cell at the equator
+_CELL_M: Final = 2.0 * math.pi * EARTH_RADIUS_M / (1 << grid.CELL_ZOOM)
+# Number of cells that a road of random direction touches, per edge length of a cell.
+_DIAGONAL: Final = 4.0 / math.pi
 _DIRECTIONS: Final = 2
-_EPOCH_S: Final = 60.0  # step of the checkpoint
+_EPOCH_S: Final = 60.0  # [s] the checkpoint advances in steps of this length
 
 
 class Costs(NamedTuple):
@@ -66,7 +66,7 @@ COSTS: Final = Costs(
     router_s=49e-6,
     wire_bytes=130.0,
     archive_bytes=40.0,
-    values=0.15,  # .14 to .17 on four whole ways of the lab
+    values=0.15,  # .14 to .17 in four complete end-to-end drives of the lab
 )
 
 

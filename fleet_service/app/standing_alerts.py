@@ -29,9 +29,8 @@ class StandingAlerts:
     def __init__(self, shared: SharedState) -> None:
         self._shared = shared
         self._turn = 0  # position of the next alert to repeat
-        self._erased: list[
-            Alert
-        ] = []  # alerts that ended by erasure; their end is not published yet
+        # alerts that ended because their data were erased, and whose end is not published yet
+        self._erased: list[Alert] = []
 
     @property
     def count(self) -> int:

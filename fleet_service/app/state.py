@@ -39,13 +39,15 @@ from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 
-# After this time, which is 56 times the mean time between changes (fusion.constants.CHANGE_S),
-# nothing of a belief is left.
+# [ns] Time after the last visit after which a cell may be dropped. It is 56 times the mean time
+# between changes (fusion.constants.CHANGE_S), so that the belief has become the prior.
 KEPT_NS: Final = 7 * DAY_NS
-# minimum share of cells to drop; for fewer it is not worth copying the others
+# Smallest share of the cells that is worth dropping, because all other cells must be copied.
 LEAST_DROPPED: Final = 0.01
-VISITORS: Final = "visitors"  # a table of a checkpoint
-SLOTS: Final = 20_000  # slots per step: the lock is held for 40 ms, and little memory is needed
+VISITORS: Final = "visitors"  # name of a table in checkpoints
+# Number of slots that are processed at once. The lock is then held for 40 ms, and memory stays
+# small.
+SLOTS: Final = 20_000
 
 
 class ServiceState(NamedTuple):
@@ -152,9 +154,8 @@ def load_state(
     fusion.enrolled = config.fleet is not None
     streams = begin.streams
     public = None
-    if (
-        config.public_vehicles > 1
-    ):  # without public cells in the checkpoint, cells are shown only after new visits
+    # If the checkpoint contains no public cells, a cell is shown only after new visits.
+    if config.public_vehicles > 1:
         kept = begin.extra_tables
         known = {VISITORS, WAITING, PRESENT} <= kept.keys() and len(kept[VISITORS]["bits"])
         visitors = Visitors.of(fusion, kept[VISITORS]) if known else Visitors(fusion)
@@ -162,7 +163,7 @@ def load_state(
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)
-    # weather first, because it affects the observations
+    # Weather comes first, because it affects how observations are fused.
     used = archived_reports(root, damaged=damaged)
     fusion.update_weather(
         archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
@@ -173,7 +174,8 @@ def load_state(
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
-        # after a checkpoint, the replay needs `streams` as it was then, so the update comes later
+        # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so update it
+        # later.
         noting = None if begin.cut else beside.submit(noted)
         for slots in chain(restored, (updated.slots for updated in rest)):
             alerts.update(slots)
@@ -182,7 +184,7 @@ def load_state(
             noted()
         else:
             noting.result()
-    pa.default_memory_pool().release_unused()  # memory that was needed to read the archive
+    pa.default_memory_pool().release_unused()  # memory from reading the archive
     memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, public)
     memory.drop_old()
     return memory

@@ -13,7 +13,7 @@ from schemas.runtime.process import LogLine
 from schemas.wire import Kind
 
 STATUS_S: Final = 5.0
-LAG_S: Final = 1.0  # difference of the system's clock that is worth a message
+LAG_S: Final = 1.0  # [s] least difference of the system clock that the status line mentions
 
 
 class StatusLine:

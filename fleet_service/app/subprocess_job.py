@@ -12,7 +12,7 @@ from typing import Final
 
 from schemas.errors import InputError
 
-LOOK_S: Final = 0.1  # period of the checks whether to stop
+LOOK_S: Final = 0.1  # [s] period of the checks whether the service stops
 
 
 def run_module(
@@ -34,7 +34,7 @@ def run_module(
                 output, errors = child.communicate(document, LOOK_S)
                 break
             except subprocess.TimeoutExpired:
-                document = None  # the text has been passed to the process
+                document = None  # the process has already received the text
                 if stop.is_set():
                     child.terminate()
                     return None

@@ -11,8 +11,9 @@ from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import Any, Final, TypeVar
 
-WAIT_S: Final = 0.2  # period of the checks whether the service stops
-# wait for a written segment; with a full disk there is none, and other jobs must make room
+WAIT_S: Final = 0.2  # [s] period of the checks whether the service stops
+# [s] Longest wait for a segment to be written. With a full disk none is written, and the jobs that
+# make space must not wait for it.
 MOST_S: Final = 10.0
 T = TypeVar("T")
 
@@ -56,5 +57,5 @@ class Tasks:
             if done.set_running_or_notify_cancel():
                 try:
                     done.set_result(work())
-                except Exception as error:  # noqa: BLE001 who wanted it is told
+                except Exception as error:  # noqa: BLE001 the waiting thread gets it
                     done.set_exception(error)

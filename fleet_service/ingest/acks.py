@@ -12,8 +12,8 @@ from fleet_service.ingest.dedup import BatchId, SequenceTracker
 from schemas.wire import Kind, StreamAck, encode_ack
 from schemas.wire.batches import Head
 
-# A message must not be larger than its receiver accepts (wire.MAX_BYTES): 16 streams of 24
-# refusals of 150 bytes.
+# Limit that keeps an ack below the largest message that a receiver accepts (wire.MAX_BYTES). A
+# stream may have 24 refusals of 150 bytes.
 STREAMS_PER_ACK: Final = 16
 ITEMS_PER_STREAM: Final = 24
 AckedStream = tuple[int, Kind, int]  # boot, kind, region
@@ -113,7 +113,8 @@ def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
     numbers may be repeated and unsorted.
     """
     ordered = sorted(set(numbers))
-    if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # the most frequent case
+    # The most frequent case: the numbers are consecutive.
+    if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:
         return ((ordered[0], ordered[-1]),)
     out: list[tuple[int, int]] = []
     for n in ordered:

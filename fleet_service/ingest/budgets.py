@@ -14,17 +14,19 @@ import numpy as np
 
 from schemas.numeric import BoolArray, IntArray
 
-# A car on roads that are all new passes 3 cells of 10 m per second, and a cell takes 1 kB.
+# New cells (visited by no other vehicle) that a vehicle may report. A car on new roads passes 3
+# cells of 10 m per second; 14,000 per hour allow for that. A cell takes 1 kB of memory.
 NEW_CELLS_PER_HOUR: Final = 14_000.0
-# an hour on such roads during an outage of the service: its backlog still reaches the map
+# An hour on such roads: after an outage of the service, a backlog of an hour still reaches the map.
 NEW_CELLS_AT_ONCE: Final = 11_000.0
-# Such cells are kept for a week: 1 000 km of roads on which nobody else drives, 100 MB at
-# once, and as much per week.
+# Such cells are stored for a week. The limit allows 1,000 km of new roads per week, which take 100
+# MB.
 NEW_CELLS_PER_WEEK: Final = 100_000
-# One start, two kinds, and one region per quarter of an hour; some starts after an outage.
+# A vehicle opens two streams per region, one of each kind, and enters a region per quarter of an
+# hour. The rest is for restarts of the agent after an outage.
 STREAMS_PER_HOUR: Final = 60.0
 STREAMS_AT_ONCE: Final = 120.0
-VEHICLES: Final = 200_000  # maximum number of vehicles that are remembered
+VEHICLES: Final = 200_000  # largest number of vehicles that are remembered
 HOUR: Final = 3600.0
 WEEK_HOURS: Final = 168.0
 
@@ -73,7 +75,7 @@ class NewCells:
         starts = np.flatnonzero(np.diff(who, prepend=who[:1] - 1))
         counts = np.diff(starts, append=len(who))
         place = np.cumsum(np.diff(where, prepend=where[:1]) != 0)
-        place -= np.repeat(place[starts], counts)  # number of a row's cell among its vehicle's
+        place -= np.repeat(place[starts], counts)  # number of the row's cell within its vehicle
         wanted = place[starts + counts - 1] + 1
         for name, start, count, cells in np.column_stack(
             [who[starts], starts, counts, wanted]

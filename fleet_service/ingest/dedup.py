@@ -20,14 +20,13 @@ from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
-# Maximum number of batches above the first missing one: an agent sends old ones first, so some
-# hundreds are missing after an outage.
+# Largest distance of a batch's number from the first missing one of its stream. An agent sends old
+# batches first, so after an outage only some hundreds are missing.
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
-StreamKey = tuple[
-    int, int, Kind, int
-]  # numbers of the vehicle's pseudonym and of its start, kind, region
+# pseudonym of the vehicle and of its start (as numbers), kind, region
+StreamKey = tuple[int, int, Kind, int]
 
 
 class SequenceTracker:
@@ -81,9 +80,8 @@ class SequenceTracker:
         """Record sequence numbers of accepted batches (messages with records) of this stream
         (vehicle, start, kind, region), given in ascending order.
         """
-        if (
-            seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1
-        ):  # the most frequent case: consecutive numbers
+        # the most frequent case: consecutive numbers
+        if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:
             self.raise_to(seqs[-1] + 1)
         else:
             for seq in seqs:
@@ -111,7 +109,7 @@ class SequenceTracker:
                 self.seen = _NONE
 
 
-BatchId = tuple[SequenceTracker, int]  # and seq
+BatchId = tuple[SequenceTracker, int]  # stream and sequence number
 
 
 class ArchivedRows(NamedTuple):
@@ -244,7 +242,7 @@ class SequenceTrackers:
         for stream, least, last in zip(streams, held, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)
-        # few, because senders store little
+        # Only few rows are above the watermark, because senders store little.
         above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])
         above = above[np.lexsort((seq[above], group[above]))]
         starts = np.flatnonzero(np.diff(group[above], prepend=-1))

@@ -41,22 +41,21 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 
-# Work per step of the worker, so that a flood delays alerts, answers and segments only briefly.
-# The cost is mainly per record; 160 bytes count as one record.
+# Limits for one step of the worker, so that a flood of messages delays alerts, answers and segments
+# only briefly. The cost is mainly per record; 160 bytes count as one record.
 STEP_MESSAGES: Final = 4096
 STEP_BYTES: Final = 768 * 1024
-# A step costs as much as a hundred records even for one message. Therefore messages that arrive
-# shortly after the first are processed with it, unless enough are waiting. At 2 000 messages per
-# second this takes a fifth of the processor time, and the interpreter is free for answers.
+# [s] Time for which the worker waits for further messages after the first of a step, unless
+# GATHERED are waiting. A step costs as much as a hundred records even for one message. At 2,000
+# messages per second, steps then take a fifth of the processor time.
 GATHER_S: Final = 0.01
-GATHERED: Final = 64  # messages
-QUEUE_BYTES: Final = (
-    64 << 20
-)  # maximum work that waits: half a minute, whatever the number of messages
-FORGET_NS: Final = 600 * NS  # period of the checks for streams that are too old
-KNOWN_NS: Final = (
-    MAP_DAYS + 2
-) * DAY_NS  # a restart reads whole days again, and then checks which batches are known
+GATHERED: Final = 64
+# Largest size of all waiting messages. They take half a minute of work, however many they are.
+QUEUE_BYTES: Final = 64 << 20
+FORGET_NS: Final = 600 * NS  # [ns] period in which streams that are too old are dropped
+# [ns] Time for which streams are remembered. After a restart, the service reads whole days again
+# and must recognise all their batches.
+KNOWN_NS: Final = (MAP_DAYS + 2) * DAY_NS
 
 
 class Message(NamedTuple):
@@ -79,7 +78,7 @@ class Inbox:
     """
 
     def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
-        # without Python locks: a fifth of the cost; None only wakes the thread in `drain`
+        # SimpleQueue has no Python locks and costs a fifth. None only wakes the thread in `drain`.
         self._queue: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._capacity = capacity
         self._counts = counts
@@ -176,7 +175,7 @@ class BatchIntake:
         self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read_erasures(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
-        self._pending: set[BatchId] = set()  # accepted, not yet on disk
+        self._pending: set[BatchId] = set()  # batches that are accepted but not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {
             kind: {} for kind in Kind
         }
@@ -249,9 +248,8 @@ class BatchIntake:
                 rules[broken[place]].rule == "time"
                 and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt
             ):
-                self._counts["clock_doubted"] += (
-                    1  # neither accepted nor refused; the sender keeps it
-                )
+                # The batch is neither accepted nor refused, so the sender keeps and repeats it.
+                self._counts["clock_doubted"] += 1
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
@@ -288,7 +286,7 @@ class BatchIntake:
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():
-                with suppress(OSError):  # without the month's key the batch is not accepted
+                with suppress(OSError):  # without the month's key, `_new` does not accept the batch
                     pseudonym = self._pseudonyms.of(str(owners[place].name), int(time[place]))
                     out[place] = int(time[place]) < self._erased.vehicles.get(
                         pseudonym_number(pseudonym), 0
@@ -347,7 +345,7 @@ class BatchIntake:
             self._counts["key_failures"] += 1
             return None
         key = (pseudonym, boot, kind, region)
-        if key not in self._streams:  # older archives contain start numbers as they were sent
+        if key not in self._streams:  # older archives contain the unchanged start numbers
             key = (pseudonym, boot_pseudonym, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
             self._counts["too_many_streams"] += 1
@@ -369,9 +367,8 @@ class BatchIntake:
         rows["row"] -= np.repeat((np.cumsum(sizes) - sizes).astype(np.int32), sizes)
         good = np.ones(len(batches), bool)
         owner = np.repeat(np.arange(len(batches)), sizes)
-        for index in np.flatnonzero(
-            broken >= 0
-        ).tolist():  # only refused rows are processed one by one
+        # Only refused rows are processed one by one.
+        for index in np.flatnonzero(broken >= 0).tolist():
             place = int(owner[index])
             if good[place]:
                 good[place] = False
@@ -383,9 +380,9 @@ class BatchIntake:
         newest = _newest_times(rows[FIRST_TIME[kind]], sizes).tolist()
         for place, at in compress(enumerate(newest), good.tolist()):
             stream, seq = batches[place]
-            if not stream.accept(
-                seq, at
-            ):  # no space to record it: older batches must come first, so this is no rejection
+            # If there is no space to record the batch, older batches must come first. The batch is
+            # not rejected, so the sender repeats it.
+            if not stream.accept(seq, at):
                 self._counts["too_many_gaps"] += 1
                 good[place] = False
         if not good.all():
@@ -397,9 +394,9 @@ class BatchIntake:
         return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
-        if (
-            refusal.rule != "vehicle"
-        ):  # otherwise neither the name in the batch nor the stream belongs to the sender
+        # By the rule "vehicle", name and stream in the batch do not belong to the sender. A
+        # rejection would then stop the batches of another vehicle.
+        if refusal.rule != "vehicle":
             self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 

@@ -23,31 +23,33 @@ from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
-FASTEST: Final = 70.0  # m/s; faster than any road vehicle and than the effect of clock errors
-LEAP_M: Final = 2_000.0  # budget for position jumps after a tunnel or a ferry
-LEAP_M_PER_S: Final = 0.5  # rate at which the budget for jumps refills
-ANCHORS: Final = 16  # 280 bytes a vehicle
-VEHICLES: Final = 200_000  # maximum number of vehicles that are remembered
-_RECENT_NS: Final = (
-    10 * NS
-)  # added to an anchor's age, so that the newest anchors are not treated as infinitely dense
-_DETOUR_M: Final = 2_000.0  # detour between two anchors, compared with the straight line
-_START: Final = 64  # vehicles for which there is space at first
+# [m/s] Faster than any road vehicle, even with the error of its clock.
+FASTEST: Final = 70.0
+LEAP_M: Final = 2_000.0  # [m] budget for jumps of the position after a tunnel or a ferry
+LEAP_M_PER_S: Final = 0.5  # [m/s] rate at which this budget is refilled
+ANCHORS: Final = 16  # remembered points of a path; they take 280 bytes per vehicle
+VEHICLES: Final = 200_000  # largest number of vehicles that are remembered
+# [ns] Added to the age of an anchor. Without it, the newest anchors would count as infinitely
+# dense.
+_RECENT_NS: Final = 10 * NS
+# [m] Largest plausible detour between two anchors, beyond the straight line, if one was dropped
+# there.
+_DETOUR_M: Final = 2_000.0
+_START: Final = 64  # number of vehicles for which memory is allocated at the start
 
 
 class VehiclePaths:
     """Recent path (times and places) of each vehicle since the start of the service."""
 
     def __init__(self) -> None:
-        self._rows: dict[int, int] = {}  # row in the arrays, by vehicle
+        self._rows: dict[int, int] = {}  # row of each vehicle in the arrays
         self._make_room(_START)
 
     def _make_room(self, rows: int) -> None:
         self._time: IntArray = np.zeros((rows, ANCHORS), np.int64)
         self._place: Float32Array = np.zeros((rows, ANCHORS, 2), np.float32)
-        self._is_gap: BoolArray = np.zeros(
-            (rows, ANCHORS), np.bool_
-        )  # an anchor after this one was dropped
+        # True if an anchor after this one was dropped
+        self._is_gap: BoolArray = np.zeros((rows, ANCHORS), np.bool_)
         self._count: IntArray = np.zeros(rows, np.int64)
         self._leap: FloatArray = np.full(rows, LEAP_M)
 

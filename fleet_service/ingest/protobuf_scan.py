@@ -24,20 +24,21 @@ from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
 
 NUMBERS: Final = ("boot", "region", "seq", "first_held")
 TEXTS: Final = ("vehicle", "estimator")
-_WIDTH: Final = {  # bytes of an element; 0: varints
+# bytes per element; 0 for varints
+_WIDTH: Final = {
     FieldDescriptor.TYPE_SFIXED64: 8,
     FieldDescriptor.TYPE_DOUBLE: 8,
     FieldDescriptor.TYPE_FLOAT: 4,
     FieldDescriptor.TYPE_INT32: 0,
     FieldDescriptor.TYPE_BYTES: 1,
 }
-# wire types
+# protobuf wire types
 _VARINT = 0
 _FIXED64 = 1
 _RUN = 2
-_FIELDS: Final = 64  # field numbers below
+_FIELDS: Final = 64  # all field numbers are below this
 _UNKNOWN: Final = -1
-_TEXT: Final = len(NUMBERS)  # roles: numbers, texts, columns
+_TEXT: Final = len(NUMBERS)  # roles of fields: first the numbers, then the texts, then the columns
 _COLUMN: Final = _TEXT + len(TEXTS)
 
 
@@ -210,7 +211,7 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
     """
     data = scan.data
     out = scan.out
-    if role == 0:  # boot
+    if role == 0:  # `boot`, the only number with a fixed length
         if wire != _FIXED64 or end - at < 8:
             return -1
         value = 0
@@ -256,7 +257,8 @@ def _copy_bytes(
     for k in range(len(begins)):
         sent = data[begins[k] : begins[k] + lengths[k]]
         written = into[to : to + lengths[k]]
-        for position in range(len(written)):  # in slices, so that many bytes are copied at once
+        # Indexing slices instead of `data` lets the compiler copy many bytes at once.
+        for position in range(len(written)):
             written[position] = sent[position]
         to += lengths_out[k]
 

@@ -13,12 +13,12 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Final
 
-# Cost of the smallest message, which must be read, checked and refused: a few dozen records.
+# Cost [bytes] of the smallest message. Reading, checking and refusing it costs a few dozen records.
 LEAST_BYTES: Final = 1024
 JSON: Final = "application/json"
-JSON_COST: Final = 10  # factor per byte compared with protobuf: 64 kB take the worker 23 ms
-# Names with a bucket of their own. A larger number can only come from invented names, which share
-# one bucket.
+JSON_COST: Final = 10  # cost of a JSON byte relative to protobuf; the worker needs 23 ms for 64 kB
+# Largest number of names with a bucket of their own. More names can only be invented ones; they
+# share one bucket.
 MOST_NAMES: Final = 100_000
 _OTHERS: Final = ""
 
@@ -47,7 +47,7 @@ class RateLimiter:
         self._known = known
         self._counts = counts
         self._clock = clock
-        # remaining amount, and time of this state [s]
+        # remaining amount [bytes] of each name, and the time [s] to which it applies
         self._buckets: dict[str, tuple[float, float]] = {}
         self._swept = -float("inf")
 

@@ -27,16 +27,17 @@ from schemas.wire import NEEDED, Columns, Kind
 from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
-MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
-# limit for a batch; agents end batches after ten minutes, and send each second
+MAX_VISIT_NS: Final = 86_400_000_000_000  # [ns] a car may park in its cell for a day
+# [ns] Longest time between rows of a batch. Agents send every second, and end a batch after ten
+# minutes at the latest.
 MAX_SPAN_NS: Final = 3_600_000_000_000
-YAW_TOLERANCE: Final = np.radians(
-    75.0
-)  # between yaw and the sector's axis: 45° and the angle of a bend within one visit
+# [rad] Largest angle between yaw and the axis of the heading sector: 45°, and the bend in one
+# visit.
+YAW_TOLERANCE: Final = np.radians(75.0)
 ESTIMATOR_PATTERN: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-KEYS_REMEMBERED: Final = (
-    1 << 16
-)  # a vehicle has two; reading one costs as much as all other checks of a message
+# Number of parsed keys that are cached; a vehicle has two. Parsing one costs as much as all other
+# checks of a message.
+KEYS_REMEMBERED: Final = 1 << 16
 _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
@@ -77,8 +78,8 @@ class Clock(NamedTuple):
     now: int
     ahead: int
     oldest: int
-    doubt: int = 0  # range after `ahead` in which a record is neither accepted nor refused
-    least: int | None = None  # lower bound of the true time; None if it is `now`
+    doubt: int = 0
+    least: int | None = None
 
     @property
     def horizon(self) -> int:
@@ -276,7 +277,7 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     beside = np.flatnonzero(wrong_cell)
     if len(beside):
         wrong_cell[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
-    with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
+    with np.errstate(invalid="ignore"):  # an infinite yaw violates its range and is refused there
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu = columns["mu"]
     lower = columns["mu_lower"]

@@ -37,13 +37,16 @@ from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
-# maximum number of waiting reports: the regions of a continent; the oldest are dropped
+# Largest number of waiting reports, enough for the regions of a continent; the oldest are dropped.
 WAITING: Final = 10_000
-MOST_BYTES: Final = 4096  # limit of a report; a report with a prior as text has a thousand bytes
-# tomorrow's forecast is accepted; a report for next year comes from a wrong clock
+MOST_BYTES: Final = 4096  # largest size of a report; with a prior as text it has about 1,000 bytes
+# [ns] How far a report's time may be ahead: a day for forecasts. Beyond, the sender's clock is
+# wrong.
 AHEAD_NS: Final = 86_400 * NS
-_DIGITS: Final = 20  # of the time in a file's name [ns]
-_TURNS: Final = 100  # after so many restarts there must be another problem
+_DIGITS: Final = 20  # digits of the time [ns] in a file's name
+# Number of attempts to read the files while others join them. After these, there is another
+# problem.
+_TURNS: Final = 100
 COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 
@@ -114,7 +117,7 @@ class WeatherInbox:
         try:
             make_folder(self._folder)
             write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet", SEGMENT)
-        # a report that is not archived must not take effect; the next one comes within the hour
+        # A report that is not archived must not take effect. The next one comes within the hour.
         except OSError:
             self._counts["weather_failures"] += 1
             return None
@@ -178,7 +181,7 @@ def archived_reports(
                 load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths
             ]
             break
-        except FileNotFoundError:  # joined into a daily file meanwhile
+        except FileNotFoundError:  # another process has joined the file into a daily file
             continue
     else:
         raise OSError(f"the weather of {root} changes faster than it can be read")

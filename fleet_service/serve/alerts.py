@@ -21,28 +21,33 @@ from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import CALLED_SHARE, NS, SLIPPERY_MU
 from schemas.wire import Alert
 
-# P(slippery). Of 20 tuning fleets that take a wet curve gently on winter tyres, one raises a false
-# alert with .9, nine with .8. With .7, .96 of the slippery cell-minutes below are under alert.
+# P(slippery) from which an alert is raised. Of 20 tuning fleets on winter tyres that drove gently
+# through a wet curve, one raised a false alert with .9 and nine with .8. With .7, alerts covered
+# .96 of the slippery cell-minutes of the towns mentioned at LEAST_SOURCES.
 RAISE_ABOVE: Final = CALLED_SHARE
-# ... and by its own reports alone no less than without any
+# Smallest P(slippery) from the cell's own reports with which an alert may be raised: that of the
+# prior.
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
-# grip must be as certain as ice was, because clearing too early is the more serious error
+# P(slippery) below which an alert is cleared. It is stricter than raising, because clearing too
+# early is the more serious error.
 CLEAR_BELOW: Final = 0.05
-# an alert without confirmation ends as soon as ice is less likely than grip
+# P(slippery) below which an alert without confirmation ends: grip is then more likely than ice.
 FADE_BELOW: Final = 0.5
-# Minimum number of vehicles that reported ice in the cell or, unless a source of grip opposes, on
-# the stretch: one lying vehicle or one bad sensor raises no alert. Of the slippery cell-minutes of
-# eight tuning towns, .926 are under alert with the stretch, .907 without.
+# Smallest number of vehicles that reported ice, so that one lying vehicle or one bad sensor raises
+# no alert. They may have reported it on the stretch, or in the cell only if a source of grip
+# opposes. In eight tuning towns, alerts covered .926 of the slippery cell-minutes with stretches,
+# .907 without.
 LEAST_SOURCES: Final = 2
-# MOST_SOURCES in this cell are needed unless each source of grip is older than those of ice by more
-# than this: a road changes, so earlier visits do not contradict ice. With one minute instead of
-# ten, three trusted vehicles that flood a dry cell raised an alert in two of six tuning towns.
+# [ns] MOST_SOURCES sources of ice in the cell are needed, unless every source of grip is older than
+# the second newest source of ice by at least this. Earlier sources of grip do not contradict ice,
+# because roads change. With one minute instead of ten, three trusted vehicles that flood a dry cell
+# raised an alert in two of six tuning towns.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 4
-# sources count for an hour; older reports of ice concern an older state of the road
+# [ns] Time for which a source counts. Older reports of ice are about an earlier state of the road.
 SOURCE_NS: Final = 3600 * NS
-TIME_STEP_NS: Final = 60 * NS  # rounding of alert times if persons are kept private
-QUIET_NS: Final = 1800 * NS  # an alert may end if nobody has confirmed ice for this time
+TIME_STEP_NS: Final = 60 * NS  # [ns] alert times are rounded to this if persons are kept private
+QUIET_NS: Final = 1800 * NS  # [ns] an alert may fade if no vehicle has confirmed ice for this time
 
 
 class Alerts:
@@ -100,7 +105,7 @@ class Alerts:
         likely = self._suspects(slots[slippery > LIKELY])
         likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
-        # time of an alert that was caused by an update of a neighbouring cell
+        # An alert that an update of a neighbouring cell causes gets the newest time of the update.
         now = time.max(initial=0)
         raised = np.where(np.isin(likely, slots), self._fusion.live.time[likely], now)
         out = []

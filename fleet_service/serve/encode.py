@@ -21,7 +21,8 @@ _BASES: Final = pa.array(["bound", "measured", "borrowed"])
 _BOUND = 0
 _BORROWED = 2
 _SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
-_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head ends the stream
+# A message of this form (continuation marker, metadata length 0) ends an Arrow stream.
+_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:

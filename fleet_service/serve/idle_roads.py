@@ -18,12 +18,13 @@ from schemas import grid
 from schemas.numeric import FloatArray
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
-OTHERS_NEEDED: Final = 3  # distinct vehicles that have ever reported a road that is not idle
+# A road that fewer distinct vehicles have ever reported is idle.
+OTHERS_NEEDED: Final = 3
 MOST_AREAS: Final = 2
-AREA_M: Final = 1_000.0  # radius of an area around its first alert
-# time for which an area counts, in which roads rarely change (fusion.constants.CHANGE_S)
+AREA_M: Final = 1_000.0  # [m] radius of an area around its first alert
+# [ns] Time for which an area counts. Roads rarely change within it (fusion.constants.CHANGE_S).
 AREA_NS: Final = 3 * 3600 * NS
-VEHICLES: Final = 100_000  # maximum number of vehicles that are remembered
+VEHICLES: Final = 100_000  # largest number of vehicles that are remembered
 
 
 class IdleRoads:

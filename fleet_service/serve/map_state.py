@@ -13,7 +13,8 @@ from fleet_service.fusion.store.store import distinct_values
 from schemas import grid
 from schemas.numeric import IntArray
 
-# parts of a tile's index before they are joined; each costs as much as thirty slots
+# Largest number of parts of a tile's index. Then they are joined, because one part costs as much
+# memory as thirty slots.
 PARTS: Final = 32
 
 
@@ -26,12 +27,12 @@ class MapState:
 
     def __init__(self, fusion: Fusion) -> None:
         self.fusion = fusion
-        # In parts, which are joined when the slots are requested.
+        # slots of each tile in parts, which are joined when the slots are requested
         self._slots: dict[int, list[NDArray[np.int32]]] = defaultdict(list)
         self._indexed = 0
         self._dirty: set[int] = set()
         self._changed: dict[int, int] = {}
-        self.change = 0  # counter of changes
+        self.change = 0  # number of changes so far
 
     def mark_changed(self, slots: IntArray) -> None:
         """Record that slots (one per cell and heading sector) were updated, so that their tiles

@@ -20,8 +20,8 @@ from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 
 PRIOR_SHARE: Final = 0.5
-REACH: Final = 10  # cells, some 130 m
-# Factor of a neighbour's share per further cell: in the drawn towns, a surface is five to ten
+REACH: Final = 10  # largest distance of a neighbour in cells, some 130 m
+# Factor on the neighbours' share per further cell. In the simulated towns, a surface is five to ten
 # cells long.
 KEPT: Final = 0.8
 

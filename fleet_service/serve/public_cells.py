@@ -34,13 +34,13 @@ from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
-PERIOD_NS: Final = 300 * NS  # step of the publication times
-WINDOW_NS: Final = 3600 * NS  # time within which enough vehicles must be in a tile
-# Increase of P(slippery), or decrease of the median, that is published at once. Values of visits
-# to one surface differ less.
+PERIOD_NS: Final = 300 * NS  # [ns] time between two publications
+WINDOW_NS: Final = 3600 * NS  # [ns] time within which enough vehicles must have visited a tile
+# A cell is published at once if its P(slippery) rises, or its median falls, by at least this.
+# Visits to one unchanged surface differ less.
 MORE_SLIPPERY: Final = 0.05
 LESS_MU: Final = 0.1
-# names of tables of `columns`
+# names of tables in the result of `columns`
 WAITING: Final = "waiting"
 PRESENT: Final = "present"
 
@@ -73,8 +73,8 @@ class PublicCells:
         self._rows = Rows(no_beliefs(0), np.zeros(0, CELL), fusion.store.state.live.reporters)
         self._shown = np.zeros(0, np.bool_)
         self._pending = np.zeros(0, np.uint64)
-        self._size = 0  # slots in use
-        self._present: dict[int, int] = {}  # vehicles per tile within the hour, as bits
+        self._size = 0  # number of slots in use
+        self._present: dict[int, int] = {}  # set of vehicles of the hour per tile, as bits
         self._period = 0
         self._published: list[IntArray] = []
         self._add_slots()
@@ -166,7 +166,8 @@ class PublicCells:
             del self._present[tile]
         if is_new_hour:
             self._present.clear()
-            slots = np.flatnonzero(self._shown)  # the time window of the visitors advances
+            # Vehicles may have left the time window meanwhile, so count them again.
+            slots = np.flatnonzero(self._shown)
             self._shown[slots] = self.visitors.count(slots, now) >= self._least
         if ready:
             slots = np.flatnonzero(self._pending)
@@ -252,7 +253,8 @@ class PublicCells:
         live = self._fusion.store.state.live.cells[new]
         self._rows.belief[new] = FULL
         self._rows.cells["key"][new] = live["key"]
-        self._rows.cells["time"][new] = live["time"]  # only for its age; the cell has no vehicles
+        # The time is needed only for the age of the belief. The cell counts no vehicles yet.
+        self._rows.cells["time"][new] = live["time"]
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:

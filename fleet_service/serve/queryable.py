@@ -38,24 +38,27 @@ from schemas.query import Format, MapQuery
 
 log = logging.getLogger(__name__)
 TEXT: Final = "text/plain"
-# Factor of the cost per cell for each format: one tile as text is cheap, a city is not.
+# Cost of one cell, by format. Therefore one tile is a cheap answer in each format, but a city as
+# text is not.
 COST: Final = {Format.ARROW: 1, Format.JSON: 20, Format.GEOJSON: 20}
-TILE_COST: Final = 750  # cost of a tile in addition to its cells: half a millisecond
-LIGHT: Final = 30_000  # limit of a cheap answer: 20 ms in Arrow format
-# limit of an answer: ten million cells in Arrow (700 MB), or half a million as text (250 MB)
+TILE_COST: Final = 750  # cost of a tile in addition to its cells: half a millisecond of work
+LIGHT: Final = 30_000  # largest cost of a cheap answer: 20 ms of work in Arrow format
+# Largest cost of an answer: ten million cells in Arrow (700 MB), or half a million as text (250
+# MB).
 MOST: Final = 10_000_000
-PER_S: Final = 1_500_000  # cost of the answers per second
-LIGHT_PER_S: Final = (
-    PER_S / 2
-)  # the same for cheap answers in Zenoh's thread, which come one after the other
-# maximum number of waiting queries; further ones get an error that asks for a retry
+PER_S: Final = 1_500_000  # [1/s] cost that the service can answer per second
+# [1/s] The same for cheap answers, which Zenoh's thread gives one after the other.
+LIGHT_PER_S: Final = PER_S / 2
+# Largest number of waiting queries. Further ones get an error that asks the client to try again.
 WAITING: Final = 64
-# pause after a tile of an expensive answer, as a multiple of its time, for cheap answers
+# Pause after each tile of an expensive answer, as a multiple of the tile's time. Cheap answers can
+# use the processor in it.
 REST: Final = 1.0
 LONGEST_REST_S: Final = 0.05
-# maximum number of queries about the past, including the one being answered
+# Largest number of queries about the past, including the one that is being answered.
 PAST_WAITING: Final = 8
-PAST_WAIT_S: Final = 4.0  # longest wait of such a query for its turn; clients wait longer
+# [s] Longest wait of such a query for its turn. Clients wait longer than this.
+PAST_WAIT_S: Final = 4.0
 
 
 def _past_is_busy() -> InputError:
@@ -138,10 +141,10 @@ class MapQueryable:
         self._counts = counts
         self._past = threading.Lock()
         self._past_waiting = threading.BoundedSemaphore(PAST_WAITING)
-        self._heavy: list[_QueuedQuery] = []  # a heap
+        self._heavy: list[_QueuedQuery] = []  # heap, with the next query first
         self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
-        self._busy_since: float | None = None  # start of the current tile of an expensive answer
+        self._busy_since: float | None = None  # time [s] at which the current tile was begun
         self._some = threading.Condition()
 
     @property
@@ -156,11 +159,10 @@ class MapQueryable:
         """Handle one map query: answer it at once, queue it, or refuse it."""
         self._counts["queries"] += 1
         try:
-            # the stub does not declare it as iterable
+            # `zenoh.Parameters` is iterable, but its type stub does not declare this.
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
-            wanted = query.parse(
-                {name: value for name, value in pairs if not name.startswith("_")}
-            )  # Zenoh's own parameters
+            # Names that begin with "_" are Zenoh's own parameters.
+            wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})
             if wanted.at is None:
                 asked = self._answering.size(wanted, *_key_filter(request))
                 cost = asked.cells * COST[wanted.format]
@@ -277,11 +279,10 @@ class MapQueryable:
         except InputError as error:
             answered.whole = True
             self._refuse(request, error)
-        except zenoh.ZError:  # the session was closed meanwhile; nobody receives the reply
+        except zenoh.ZError:  # the session has been closed, so nobody receives the reply
             answered.whole = True
-        except (
-            Exception
-        ) as error:  # whatever it is: a query that ends without a reply says that there is no data
+        # Catch every error. A query that ends without a reply would mean that there are no data.
+        except Exception as error:
             answered.whole = True
             self._counts["answer_failures"] += 1
             log.exception("a query failed")
@@ -294,9 +295,8 @@ class MapQueryable:
             request.drop()
 
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
-        field = (
-            error.field if error.field in MapQuery.model_fields else "query"
-        )  # otherwise the text of the client's own error
+        # Other field names are free text of the client, which must not become names of counters.
+        field = error.field if error.field in MapQuery.model_fields else "query"
         self._counts[f"bad_queries.{field}"] += 1
         with request:
             request.reply_err(str(error), encoding=TEXT)

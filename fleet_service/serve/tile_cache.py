@@ -24,17 +24,13 @@ from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
-SHOWN_NS: Final = NS  # the age that a tile published once a second may have
+# [ns] Age up to which a cached tile is used; published tiles are up to a second old too.
+SHOWN_NS: Final = NS
 KEPT_BYTES: Final = 32 << 20
-SELECTED_BY: Final = (
-    "vehicles",
-    "west",
-    "south",
-    "east",
-    "north",
-)  # columns by which a query selects cells
+# columns by which a query selects cells
+SELECTED_BY: Final = ("vehicles", "west", "south", "east", "north")
 
-NOTHING: Final = (math.inf, math.inf, -math.inf, -math.inf)  # an area that no box touches
+NOTHING: Final = (math.inf, math.inf, -math.inf, -math.inf)  # empty area, which no box touches
 
 
 class ShownTile(NamedTuple):
@@ -83,8 +79,8 @@ class TileCache:
         self._least = least
         self._public = public
         self._kept: dict[int, ShownTile] = {}
-        self._held = 0  # bytes
-        self._acknowledged = 0  # number of the newest change that every reader must see
+        self._held = 0  # [bytes] size of all cached tiles
+        self._acknowledged = 0  # number of the newest change that each reader must see
 
     def acknowledge(self) -> None:
         """Record that everything in the map has been acknowledged or alerted. Cached tiles made

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
-# time per pass of the worker's loop; a segment is delayed by about as much
+# [s] Time for tiles per pass of the worker's loop. A segment is delayed by about as much.
 SHARE_S: Final = 0.02
 
 

@@ -15,18 +15,20 @@ from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.thresholds import NS
 
 CountArray = NDArray[np.integer[Any]]
-# of the interval
+# levels of the published interval's ends
 LOWER = 0.05
 UPPER = 0.95
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # A cell is `measured` in three cases: a value has lowered its upper end by more than numerical
-# errors and ageing do, or has halved the interval, or the cell is more likely slippery than not.
-# Otherwise only a lower bound is known.
+# errors and ageing do; a value has halved the interval; or the cell is more likely slippery than
+# not. Otherwise only a lower bound is known.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
 KNOWN_SLIPPERY: Final = 0.5
-TIME_STEP_NS: Final = 900 * NS  # a quarter of an hour, in which several cars pass on a street
+# [ns] Published times are rounded to this, a quarter of an hour, in which several cars pass a
+# street.
+TIME_STEP_NS: Final = 900 * NS
 COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) for m in (1, 2, 5))])
 
 

@@ -17,13 +17,12 @@ from fleet_service.fusion import Fusion, Observations
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
-PART_NS: Final = (
-    12 * 3600 * NS
-)  # the window is the current part of a day and the one before: 12 to 24 hours
+# [ns] Length of a part of the window. The window is the current part and the one before, so it
+# covers 12 to 24 hours.
+PART_NS: Final = 12 * 3600 * NS
 PARTS: Final = 2
-_FIBONACCI: Final = np.uint64(
-    0x9E3779B97F4A7C15
-)  # 2⁶⁴ divided by the golden ratio: its multiples are far apart
+# 2⁶⁴ divided by the golden ratio: the multiples of this number are far apart (Fibonacci hashing).
+_FIBONACCI: Final = np.uint64(0x9E3779B97F4A7C15)
 _SHIFT: Final = np.uint64(58)
 
 
@@ -38,7 +37,7 @@ class Visitors:
     def __init__(self, fusion: Fusion) -> None:
         self._fusion = fusion
         self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
-        self._part = 0  # number of the newest part of the window
+        self._part = 0  # number of the newest part of the window, counted from the epoch
 
     def add(self, o: Observations) -> None:
         """Record, for each cell that the observations `o` report, the vehicles that report it."""
