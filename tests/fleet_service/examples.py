@@ -21,9 +21,9 @@ LONGITUDE = 11.97
 CELL = int(grid.cell_of(LATITUDE, LONGITUDE))
 REGION = int(grid.region_of(CELL))
 TILE = int(grid.tile_of(CELL))
-START = 1_700_000_000 * 10**9  # ns
+START = 1_700_000_000 * 10**9  # [ns] time of the first observation
 SECOND = 10**9
-STD = 0.06  # of a good visit's value
+STD = 0.06  # standard deviation of a good measurement of mu
 Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 

@@ -35,7 +35,7 @@ from tests.fleet_service.examples import SECOND, batch
 from tests.ports import free_ports
 from tests.waiting import until
 
-# of cells near Gothenburg
+# Column and row of cells near Gothenburg.
 X = 1_118_000
 Y = 630_000
 

@@ -163,10 +163,11 @@ def test_run_and_watch_as_processes_from_start_to_signal(
         assert watch.stdout.readline() == "watching\n"
         fleet = Fleet(session).await_services()
         fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
+        # The tile may be printed before or after its alert.
         awaited = {
             "alert RAISED at 57.69",
             "tile 12003202",
-        }  # a tile may be told before its alert, or after
+        }
         for line in iter(watch.stdout.readline, ""):
             slippery = line.startswith("alert") or "likely slippery" in line
             awaited -= {begin for begin in awaited if line.startswith(begin) and slippery}

@@ -65,9 +65,9 @@ USUAL: Final = {
     "certs": CERTS,
     "rebuild": ["rebuild", *ARCHIVE, "--out", "{out}/r", "--to", "2024-10-04T23:59:50"],
 }
-BOX: Final = "11,57,13,59"  # around one of two towns
-# command -> option -> another value; or the words with which, and those without which, it is to be
-# seen
+BOX: Final = "11,57,13,59"  # a box around one of two towns
+# Each command's options: another value, or a pair of command lines with and without the option. The
+# output must differ.
 CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
     "compact": {
         "--archive": "{b}",
@@ -128,22 +128,26 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
 }
 SHOWN_BELOW: Final = {
     "retention": {"--yes"},
+    # These options are covered by test_commands.py, archive/test_retention.py and app/test_copy.py.
     "forget": {
         "--yes",
         "--put-to",
         "--config",
-    },  # test_commands.py; archive/test_retention.py; app/test_copy.py
+    },
     "completion": {"shell"},
-    "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
-    "run": {"--config", "--archive", "--weather", "--standby"},  # shards/test_successor.py
-    "export": {  # client/test_datex.py, archive/test_iceberg.py
+    "certs": {"--renew-days", "--revoke", "--dry-run"},  # covered by enrolment/test_certificates.py
+    # Covered by shards/test_successor.py.
+    "run": {"--config", "--archive", "--weather", "--standby"},
+    "export": {  # covered by client/test_datex.py and archive/test_iceberg.py
         *("--country", "--supplier", "--status", "--follow", "--connect", "--config"),
         *("--catalog", "--namespace", "--at"),
-        *("--exclude-ice", "--last", "--roads"),  # test_refused_files.py
+        *("--exclude-ice", "--last", "--roads"),  # covered by test_refused_files.py
     },
-    "size": {"--vehicles", "--road-km", "--latitude", "--rate", "--json"},  # app/test_sizing.py
-    "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
-    "analyze": {"--roads", "--level", "--within", "--last"},  # analytics/roads/test_contract.py
+    # Covered by app/test_sizing.py.
+    "size": {"--vehicles", "--road-km", "--latitude", "--rate", "--json"},
+    "roads": {"extract", "--out", "--id", "--name"},  # covered by analytics/roads/test_join.py
+    # Covered by analytics/roads/test_contract.py.
+    "analyze": {"--roads", "--level", "--within", "--last"},
     "query": {
         "--bbox",
         "--route",
@@ -169,7 +173,7 @@ SHOWN_BELOW: Final = {
         "--publisher",
         "--state",
     },
-    "page": {  # page/test_server.py
+    "page": {  # covered by page/test_server.py
         "--archive",
         "--host",
         "--port",
@@ -186,7 +190,7 @@ SHOWN_BELOW: Final = {
         "--connect",
         "--config",
     },
-    "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_handover.py
+    "hand-over": {"region", "--to", "--connect", "--config"},  # covered by shards/test_handover.py
     "watch": {
         "--bbox",
         "--connect",
@@ -198,7 +202,7 @@ SHOWN_BELOW: Final = {
         "--health-port",
     },
 }
-# command -> the modules in which these options are given, beside this one
+# Other modules that call the command with these options.
 GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "retention": ("../test_commands",),
     "forget": ("../test_commands", "archive/test_retention", "app/test_copy"),
@@ -216,7 +220,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "cits": ("client/cits/test_command",),
     "hand-over": ("shards/test_handover",),
 }
-# A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
+# A campaign takes minutes; tests/fleet_service/lab/test_evaluate.py runs a small one.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end", "--only"}
 
 
@@ -368,9 +372,8 @@ def test_every_option_of_a_command_changes_what_it_does(
     assert first == again
     assert first.code == 0, first.said
     seen = run_command(other, tmp_path / "other", capsys)
-    if option == "--engine" and importlib.util.find_spec(
-        "pyspark"
-    ):  # the answer is the same: test_spark
+    # Spark gives the same answer, which test_spark checks.
+    if option == "--engine" and importlib.util.find_spec("pyspark"):
         assert seen == first
         return
     assert seen != first

@@ -31,7 +31,7 @@ from tests.fleet_service.archive.kept import DATA
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.secured import make_enrolment
 
-# Settings of the configuration: another value, and what shows it.
+# Settings of the configuration: another value, and a function whose result must differ.
 Show = Callable[[ServiceConfig, Path], object]
 
 
@@ -183,9 +183,9 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "segment_s": (1.0, of_service(turns)),
     "put_s": (0.1, of_service(turns)),
 }
-# Where the network or the operator sees them: zenoh and regions where two services share the world,
-# in app/test_service.py, the archive and its copy in app/test_copy.py, the lease and who waits for
-# it in shards/test_successor.py, the others in tests/schemas/runtime and app/test_metrics.py.
+# Settings whose effect other tests show. `zenoh` and `regions` are covered by app/test_service.py,
+# the archive and its copy by app/test_copy.py. The lease and the standby are covered by
+# shards/test_successor.py. tests/schemas/runtime and app/test_metrics.py cover the rest.
 SEEN_OUTSIDE: Final = {
     "zenoh",
     "regions",

@@ -16,7 +16,8 @@ from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from schemas import grid
 from schemas.numeric import IntArray
 
-# Sums are added in another order. Everything else (percentiles, counts, times) is exact in both.
+# Tolerances. The two engines add sums in different orders. Percentiles, counts and times are exact
+# in both.
 RELATIVE = 1e-9
 ABSOLUTE = 1e-9
 Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]

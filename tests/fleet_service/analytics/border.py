@@ -21,8 +21,8 @@ from schemas import grid
 from schemas.thresholds import NS
 from schemas.wire import Kind
 
-BORDER: Final = 11.25  # degrees east; zones are 2.8125 wide
-FAR: Final = 5.0  # degrees further west
+BORDER: Final = 11.25  # [deg] longitude between two zones; a zone is 2.8125° wide
+FAR: Final = 5.0  # [deg] distance of a place further west
 UNTIL: Final = START_NS + DAY_S * NS
 NUMBERS: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "observations", "age_s")
 

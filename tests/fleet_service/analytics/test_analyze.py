@@ -35,9 +35,8 @@ def analyze(archive: Path, *words: str) -> int:
     return main(["analyze", words[0], "--archive", str(archive), *DAYS, *words[1:]])
 
 
-@pytest.mark.parametrize(
-    "name", sorted(set(QUESTIONS) - {"contract"})
-)  # which wants roads: roads/test_contract.py
+# The question "contract" needs roads; roads/test_contract.py covers it.
+@pytest.mark.parametrize("name", sorted(set(QUESTIONS) - {"contract"}))
 def test_every_question_prints_a_table_and_says_what_it_reads(
     archive: Path, stations: Path, name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -51,7 +50,8 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     lines = said.out.splitlines()
     answer = pq.read_table(out)
     flat = [f.name for f in answer.schema if not pa.types.is_nested(f.type)]
-    place = ("latitude", "longitude")  # of a cell's middle, in what is printed
+    # The printed table has the cell's centre in place of its number.
+    place = ("latitude", "longitude")
     assert [name for name in lines[0].split() if name not in place] == [
         name for name in flat if name not in place
     ]
@@ -59,9 +59,8 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else list_explained(name)
 
 
-MAP = {
-    field.name for field in tables.MAP_CELL
-}  # that map-columns.md explains: tests/deploy/test_docs.py
+# Columns of the map that map-columns.md explains; tests/deploy/test_docs.py checks it.
+MAP = {field.name for field in tables.MAP_CELL}
 
 
 def list_explained(question: str) -> set[str]:

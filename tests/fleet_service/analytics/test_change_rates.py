@@ -20,8 +20,8 @@ from schemas.thresholds import SLIPPERY_MU
 
 Ask = Callable[..., pa.Table]
 RATE = 1.0 / 1800.0
-MISREAD = 0.05  # of one reading
-PI = 0.3  # slippery share of roads
+MISREAD = 0.05  # probability that a single reading is wrong
+PI = 0.3  # share of slippery roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
@@ -74,7 +74,7 @@ def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
         assert found["rate_lower"] is not None
         assert found["rate_upper"] is not None
         held += found["rate_lower"] <= 3600 * RATE <= found["rate_upper"]
-    assert held >= 14  # of 18 expected; less happens by chance once in 40
+    assert held >= 14  # 18 are expected; fewer than 14 occur by chance once in 40 runs
 
 
 def test_few_days_have_no_interval() -> None:

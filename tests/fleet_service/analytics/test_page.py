@@ -18,7 +18,7 @@ from tests.browser import open_page
 from tests.fleet_service.analytics.test_analyze import DAYS
 from tests.fleet_service.examples import CELL
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
 PLACED = [name for name, question in QUESTIONS.items() if question.colour]
 

@@ -18,7 +18,7 @@ from tests.fleet_service.examples import CELL
 BENT = grid.interleave(
     np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000
 ).tolist()
-NOON_US = 1_769_515_200_000_000  # 27 January 2026
+NOON_US = 1_769_515_200_000_000  # 27 January 2026, noon, in microseconds
 
 
 def draw_figure(name: str, table: pa.Table) -> Figure:

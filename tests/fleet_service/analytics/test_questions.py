@@ -139,7 +139,7 @@ def test_planted_change_lies_in_the_before_after_interval(
     expected = (weight * (means["mean"][True] - means["mean"][False])).sum() / weight.sum()
     assert found["difference"] == pytest.approx(expected, abs=1e-9)
     assert found["cells"] == len(means)
-    assert found["lower"] < 0.0 < found["upper"]  # nothing was treated
+    assert found["lower"] < 0.0 < found["upper"]  # there is no effect, because nothing was treated
     assert 0.002 < found["upper"] - found["lower"] < 0.1
     assert found["vehicles"] <= WORLD.vehicles
 
@@ -157,9 +157,8 @@ def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
         vehicles = 25
         each = 16
         vehicle = np.repeat(np.arange(vehicles), each)
-        after = np.repeat(
-            rng.random(vehicles) < 0.5, each
-        )  # a vehicle drives before or after: its bias does not cancel
+        # A vehicle drives either before or after the treatment, so its bias does not cancel.
+        after = np.repeat(rng.random(vehicles) < 0.5, each)
         mu = (
             0.6
             + 0.1 * after
@@ -246,9 +245,8 @@ def test_weather_takes_the_nearest_station_s_reading_of_the_hour(
     assert found["values"].to_dict() == groups.size().to_dict()
     np.testing.assert_allclose(found["mu_p10"], groups.quantile(0.1), atol=1e-9)
     np.testing.assert_allclose(found["mu_mean"], groups.mean(), atol=1e-9)
-    assert (
-        found["share_slippery"].iloc[0] > 3 * found["share_slippery"].iloc[-1]
-    )  # colder is more slippery
+    # Colder roads are more often slippery.
+    assert found["share_slippery"].iloc[0] > 3 * found["share_slippery"].iloc[-1]
     assert found.index.min() < -2
 
 

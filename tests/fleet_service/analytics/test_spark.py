@@ -24,9 +24,8 @@ def test_spark_reads_the_archive(archive: Path) -> None:
     assert by_spark(archive) == pytest.approx(seen)
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in QUESTIONS if name != "replay"]
-)  # which asks no engine
+# The question "replay" uses no query engine.
+@pytest.mark.parametrize("name", [name for name in QUESTIONS if name != "replay"])
 def test_engines_agree(
     asked: Callable[..., pa.Table], stations: Path, links: Path, name: str
 ) -> None:

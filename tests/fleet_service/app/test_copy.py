@@ -35,7 +35,7 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
 
-PATIENCE_S = 120.0  # a start, on a machine that is busy
+PATIENCE_S = 120.0  # time for a start on a busy machine
 VEHICLES = 4
 BATCHES = 12
 
@@ -95,16 +95,16 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         missing = rows - sum(
             table.num_rows for table in reading.read_tables(new, Kind.OBSERVATION, ["row"])
         )
-        assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
+        # This is the figure `cluster.empty_disk.rows_missing`.
+        assert (rows, missing) == (3 * len(first + second), 0)
         assert engine.alerts.count > 0
         found = read_image(engine)
         assert found.keys() == expected.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         take(engine, first + second)
         assert engine.counts["duplicates"] == len(first + second)
-        assert (
-            len(engine.settlement.flush()) == VEHICLES
-        )  # they are acknowledged again, and nothing is written
+        # The repeated batches are acknowledged again, but not written again.
+        assert len(engine.settlement.flush()) == VEHICLES
         assert len(segments.list_segments(new, Kind.OBSERVATION)) == len(
             segments.list_segments(root, Kind.OBSERVATION)
         )
@@ -150,9 +150,9 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
             1,
             0,
         )
-        take(engine, sent)  # what comes again is known, and not acknowledged for that
+        take(engine, sent)  # repeated batches are recognised, and not acknowledged early
         assert engine.settlement.flush() == []
-        assert engine.state.fusion.size > 0  # the map goes on
+        assert engine.state.fusion.size > 0  # the map is updated all the same
         bucket.start()
         acks: list[tuple[str, bytes]] = []
 
@@ -231,7 +231,7 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
             PATIENCE_S,
         )
         assert SECRET not in health(address)
-        assert len(fleet.list_unsettled(during)) == len(during)  # nothing of it is acknowledged
+        assert len(fleet.list_unsettled(during)) == len(during)  # no batch is acknowledged
         bucket.bring_back(kind)
         until(lambda: drive(fleet, during), PATIENCE_S)
         process.terminate()

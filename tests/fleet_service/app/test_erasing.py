@@ -40,8 +40,8 @@ from tests.waiting import until
 
 GONE = "sim-009"
 OTHERS = ("sim-001", "sim-002", "sim-003")
-ALONE = LATITUDE - 0.002  # a cell that nobody else visits, in the same tile
-PATIENCE_S = 120.0  # a start, and a process that imports everything, on a machine that is busy
+ALONE = LATITUDE - 0.002  # latitude of a cell in the same tile that no other vehicle visits
+PATIENCE_S = 120.0  # time for a start and for a process that imports everything, on a busy machine
 MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 

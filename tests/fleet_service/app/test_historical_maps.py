@@ -78,7 +78,8 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
     with pytest.raises(
         InputError, match="at: the query would read too much of the archive; use a smaller bbox"
     ):
-        list(historical_maps.replies_to(root, question(bbox=NEAR)))  # as many lie in the box itself
+        # The box itself contains as many rows.
+        list(historical_maps.replies_to(root, question(bbox=NEAR)))
     monkeypatch.setattr(historical_maps, "LOOKED_ROWS", 399)
     with pytest.raises(InputError, match="at: the query would read too much"):
         list(asker.ask(question(bbox=NEAR), lambda _: True))

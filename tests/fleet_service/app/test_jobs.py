@@ -53,7 +53,8 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
     )
     with running(router, tmp_path) as again:
         assert again.service.engine.state.fusion.live.visits[0] == 30
-        assert main(["compact", "--archive", str(tmp_path)]) == 0  # beside it
+        # The command runs next to the service.
+        assert main(["compact", "--archive", str(tmp_path)]) == 0
 
 
 def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
         closing(Engine(ServiceConfig(), tmp_path)) as engine,
         pytest.raises(OSError, match="no segment"),
     ):
-        engine.checkpoint(threading.Event())  # the worker, which nobody is here, flushes nothing
+        engine.checkpoint(threading.Event())  # no worker runs here, so nothing is written
 
 
 def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(

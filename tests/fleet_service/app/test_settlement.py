@@ -35,7 +35,7 @@ def test_rows_that_wait_are_written_before_the_period_ends(tmp_path: Path) -> No
         assert engine.settlement.until_early_s(0.0) == 0.0, "there was no segment yet"
         assert engine.settlement.flush(), "the batch is acknowledged"
         assert engine.settlement.until_early_s(0.0) == math.inf
-        engine.settlement.flush()  # without rows, this is not a segment
+        engine.settlement.flush()  # a flush without rows writes no segment
         ingest_one(engine, 2)
         began = engine.settlement._log.begun_s
         engine.settlement._log.write_s = 0.0

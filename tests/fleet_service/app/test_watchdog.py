@@ -36,7 +36,7 @@ def test_signs_of_life_end_with_a_reason_when_an_answer_hangs(
 
             until(count_said)
             manager.setblocking(False)
-            with suppress(BlockingIOError):  # what came before
+            with suppress(BlockingIOError):  # discard earlier notifications
                 while manager.recv(64):
                     pass
             before = count_said()

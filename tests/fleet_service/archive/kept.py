@@ -42,9 +42,9 @@ from tests.waiting import until
 
 DATA: Final = Path(__file__).parent / "data"
 MIDNIGHT: Final = 20_001 * 86_400 * SECOND
-PLACES: Final = ((57.7, 11.97), (48.1, 11.6))  # in two zones
+PLACES: Final = ((57.7, 11.97), (48.1, 11.6))  # places in two zones
 VEHICLES: Final = 8
-ROUNDS: Final = 12  # half of them before the midnight and the checkpoint
+ROUNDS: Final = 12  # half of the rounds lie before midnight and before the checkpoint
 ROUND_NS: Final = 40 * SECOND
 COLUMNS: Final = (
     "cell",

@@ -13,8 +13,8 @@ from schemas import grid, mugrid, tables
 from schemas.wire import Kind
 
 DAY_NS = 86_400 * 10**9
-START = 20_000 * DAY_NS + DAY_NS - 600 * 10**9  # ten minutes before midnight
-PLACES = ((57.7, 11.97), (48.1, 11.6))  # in two zones
+START = 20_000 * DAY_NS + DAY_NS - 600 * 10**9  # [ns] ten minutes before midnight
+PLACES = ((57.7, 11.97), (48.1, 11.6))  # places in two zones
 
 
 def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:

@@ -73,9 +73,8 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         order.clear()
         acks = engine.settlement.flush()
         order.append("ack")
-        who = (
-            ["file", "folder"] if seq == 1 else []
-        )  # number of the vehicle on the map, if it is new
+        # Operations that store the number of a new vehicle; a known vehicle needs none.
+        who = ["file", "folder"] if seq == 1 else []
         assert order == [*who, "file", "rename", "folder", "ack"]
         assert read_settled(acks) == {"sim-001": [(seq, seq)]}
 

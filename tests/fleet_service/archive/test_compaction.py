@@ -120,9 +120,8 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
 
     for name in ("rename", "unlink", "mkdir"):
         monkeypatch.setattr(Path, name, count_calls(name, getattr(Path, name)))
-    monkeypatch.setattr(
-        os, "fsync", count_calls("fsync", lambda _: None)
-    )  # only the process dies here, so the disk need not sync
+    # Only the process dies in this test, so the disk need not sync.
+    monkeypatch.setattr(os, "fsync", count_calls("fsync", lambda _: None))
     monkeypatch.setattr(files, "write_table", count_calls("write", files.write_table))
     monkeypatch.setattr(compaction, "write_table", count_calls("write", files.write_table))
     return seen
@@ -151,7 +150,7 @@ def test_it_may_die_before_any_change_of_the_disk(
         for kind in Kind:
             assert identities(root, kind) == whole[kind], instant
             assert len(set(public(root, kind))) == len(public(root, kind)), instant
-        fill(root, 1, 16, seed=7)  # the service goes on
+        fill(root, 1, 16, seed=7)  # the service continues
         compact(root)
         for kind in Kind:
             assert public(root, kind) == whole[kind] + later[kind], instant
@@ -165,9 +164,8 @@ def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
         with pytest.raises(DiedError):
             compact(tmp_path)
     assert len(segments.list_segments(tmp_path, Kind.OBSERVATION)) == 2
-    assert (
-        compact(tmp_path).rows == 2 * ROWS
-    )  # of states; the observations are only removed from the inbox
+    # These are rows of states. The observations are only removed from the inbox.
+    assert compact(tmp_path).rows == 2 * ROWS
     assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
 
 
@@ -257,7 +255,7 @@ def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: P
             engine.intake.ingest(messages[k : k + 4], time_ns())
             engine.settlement.flush()
             if k == 8:
-                compact(tmp_path)  # while the service runs
+                compact(tmp_path)  # compaction while the service runs
         at = int(engine.state.fusion.live.time.max())
         before = engine.state.fusion.beliefs(np.arange(engine.state.fusion.size), at)
     for _ in range(2):

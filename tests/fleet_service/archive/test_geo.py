@@ -85,9 +85,8 @@ def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> N
     whole = box(west, south, east, north)
     assert quarters.union_all().symmetric_difference(whole).area < 1e-9 * whole.area
     assert quarters.area.sum() == pytest.approx(whole.area)
-    for sector, (x, y) in enumerate(
-        ((1, 0), (0, 1), (-1, 0), (0, -1))
-    ):  # east, north, west, south of the middle
+    # Direction of each sector from the cell's centre: east, north, west, south.
+    for sector, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         off = quarters.iloc[sector].centroid
         assert (off.x - whole.centroid.x) * x + (off.y - whole.centroid.y) * y > 0.0
     (square,) = geo.geojson_shapes(geo.with_cells(pa.table({"cell": [CELL]})))

@@ -49,16 +49,17 @@ def test_compacted_files_are_registered_once_and_the_log_never(
     root = tmp_path / "archive"
     writer = fill(root, 2, 100)
     compact(root)
-    writer.write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 30, 9))  # waits in the inbox
+    writer.write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 30, 9))  # these rows wait in the inbox
+    # Files of two days, two zones and two kinds.
     assert export_tables(root, capsys) == {
         "added": 8,
         "dropped": 0,
         "rows": 400,
-    }  # two days, two zones, two kinds
+    }
     assert export_tables(root, capsys) == {"added": 0, "dropped": 0, "rows": 400}
     assert rows_different(root, uri(root)) == 0
     compact(root)
-    assert rows_different(root, uri(root)) == 30  # not yet
+    assert rows_different(root, uri(root)) == 30  # the new rows are not exported yet
     assert export_tables(root, capsys)["rows"] == 430
     assert rows_different(root, uri(root)) == 0
     table = table_of(uri(root), Kind.OBSERVATION)
@@ -77,7 +78,8 @@ def test_what_retention_removes_leaves_the_tables_first(
     compact(root)
     export_tables(root, capsys)
     assert retention.retire_rows(root, 31, DATE + timedelta(days=32)) == (2, 4)
-    assert rows_different(root, uri(root)) == 0  # read whole: no table names a file that is gone
+    # All rows can be read, so no table refers to a deleted file.
+    assert rows_different(root, uri(root)) == 0
     told = export_tables(root, capsys)
     assert (told["added"], told["dropped"]) == (0, 0)
     assert 0 < told["rows"] < 400
@@ -119,13 +121,13 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         main(["forget", "--archive", str(root), "--vehicle", "sim-003", "--period", MONTH, "--yes"])
         == 0
     )
-    seen = (
-        table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()
-    )  # rewritten files are out, and it can be read
+    # The rewritten files are no longer listed, and the table can be read.
+    seen = table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()
     assert names[3] not in seen["vehicle"].to_pylist()
     for kind in Kind:
         table = table_of(uri(root), kind)
-        for snapshot in table.snapshots():  # a former one has the vehicle, and its files are gone
+        # An earlier snapshot lists the vehicle, but its files are deleted.
+        for snapshot in table.snapshots():
             with suppress(FileNotFoundError):
                 former = table.scan(snapshot_id=snapshot.snapshot_id).to_arrow()
                 assert names[3] not in former["vehicle"].to_pylist()

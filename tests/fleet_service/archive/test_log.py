@@ -37,7 +37,7 @@ def test_what_is_added_while_a_segment_is_written_waits_for_the_next(
     add(log, "first", 1)
     log.begin()
     add(log, "second", 2)
-    log.begin()  # does nothing: the first was not ended
+    log.begin()  # does nothing: the first segment has not ended yet
     assert log.unsettled == 2
     assert log.end() == ["first"]
     assert (log.rows, log.unsettled) == (3, 1)
@@ -68,10 +68,11 @@ def test_failed_writes_are_not_settled_and_come_once_with_the_next(
     log.begin()
     with pytest.raises(OSError, match="states"):
         log.end()
+    # The observations are written, but are settled only together with the states.
     assert (log.rows, log.unsettled) == (
         3,
         2,
-    )  # the observations are written, but settled with the rest
+    )
     add(log, "later", 3)
     with pytest.raises(OSError, match="states"):
         log.flush()

@@ -58,14 +58,14 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
     whole = len(identities(tmp_path, Kind.OBSERVATION))
     done = retention.retire_rows(tmp_path, 31, DATE + timedelta(days=32))
-    assert done == (2, 4)  # a day of observations and one of states, two zones each
+    assert done == (2, 4)  # one day of observations and one of states, in two zones each
     left = len(identities(tmp_path, Kind.OBSERVATION))
     assert 0 < left < whole
     rolled = [
         pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")
     ]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == whole - left
-    assert rollup.complete_parts(tmp_path) == 2  # those of the day that stayed
+    assert rollup.complete_parts(tmp_path) == 2  # parts of the day that was kept
 
 
 def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
     with closing(Engine(ServiceConfig(), root)) as engine:
-        for k in range(8):  # six vehicles in one cell, and two others alone
+        for k in range(8):  # six vehicles visit one cell, two others have cells of their own
             latitude = LATITUDE if k < 6 else LATITUDE - 0.001 * k
             one = batch(
                 f"car-{k:03}",
@@ -132,16 +132,19 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
         "--yes",
         "--vehicle",
     ]
+    # The row of a cell with five other visitors stays. The row of a cell that only the erased
+    # vehicle visited is deleted.
     for vehicle, cells in (
         ("car-001", 3),
         ("car-007", 2),
-    ):  # a line of five others stays, that of nobody else goes
+    ):
         assert main([*words, vehicle]) == 0
         for folder in (root, there):
             table = pq.read_table(folder / snapshot.relative_to(root), partitioning=None)
             assert (table.num_rows, b"geo" in (table.schema.metadata or {})) == (cells, True)
             shared = table.filter(pc.field("vehicles") > 1)
-            for name in ("first_time", "last_time"):  # of a line that the vehicle was in
+            # Times of a cell that the vehicle visited are rounded to hours.
+            for name in ("first_time", "last_time"):
                 assert shared[name][0].value % (3600 * 10**6) == 0
             gone = Pseudonyms(root / "keys").of(vehicle, now).encode()
             assert not [path for path in folder.rglob("*.parquet") if gone in path.read_bytes()]
@@ -191,7 +194,7 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
         assert acknowledge_batch(engine, old, after + SECOND) == ["durable"]
         assert acknowledge_batch(engine, later, after + SECOND) == ["durable"]
     assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
-    for _ in range(2):  # replayed from the log, then from a checkpoint
+    for _ in range(2):  # first replayed from the log, then from a checkpoint
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
             assert acknowledge_batch(engine, old, after + SECOND) == [ERASED], (
                 "settled, or its car would send it for ever"

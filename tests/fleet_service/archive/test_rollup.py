@@ -21,7 +21,7 @@ from schemas import mugrid, tables
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill
 
-# other columns are added up
+# How to merge these columns; all other columns are summed.
 JOIN: dict[str, Callable[..., Any]] = {
     "mu_min": min,
     "mu_max": max,
@@ -51,7 +51,7 @@ def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
 
 def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
     fill(tmp_path, 3, 120)
-    compact(tmp_path, round_rows=120)  # three rounds, three parts of an hour
+    compact(tmp_path, round_rows=120)  # three rounds, so each hour has three parts
     assert rollup.complete_parts(tmp_path) == 12
     assert rollup.complete_parts(tmp_path) == 0
     rows = pa.concat_tables(reading.read_tables(tmp_path, Kind.OBSERVATION))
@@ -84,7 +84,7 @@ def test_merged_parts_are_the_sums_over_all_rows(tmp_path: Path) -> None:
 
 
 def test_bits_count_distinct_vehicles_also_across_parts(tmp_path: Path) -> None:
-    fill(tmp_path, 6, 60)  # five vehicles each, thirty in all
+    fill(tmp_path, 6, 60)  # five vehicles in each of six segments: thirty in all
     compact(tmp_path, round_rows=60)
     rollup.complete_parts(tmp_path)
     bits = np.bitwise_or.reduce([row["vehicle_bits"] for row in merge_parts(tmp_path).values()])

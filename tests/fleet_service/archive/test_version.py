@@ -62,9 +62,8 @@ def same(found: dict[str, Any], made: dict[str, Any]) -> None:
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
     for now, line in zip(found["cells"], made["cells"], strict=True):
-        then = line | (
-            {"mu": None} if line["basis"] == "bound" else {}
-        )  # since 1.2 a bound has no mu
+        # Since version 1.2 a lower bound has no mu.
+        then = line | ({"mu": None} if line["basis"] == "bound" else {})
         assert now == {name: pytest.approx(then[name], abs=1e-5) for name in COLUMNS}
 
 
@@ -279,7 +278,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
     archive = ["--archive", str(old), "--out", str(old / "out.csv")]
     for what, encoding in (("observations", COMPACTED), ("rollup", ROLLUP), ("map", MAP)):
         rewrite_file(next((old / what).rglob("*.parquet")), lambda table: table, "2.0", encoding)
-        more = ["--snapshot"] if what == "map" else []  # replays read the last month only
+        more = ["--snapshot"] if what == "map" else []  # replays read only the last month
         assert cli.main(["export", what, *archive, *more]) == 2
         assert "is of version 2.0" in capsys.readouterr().err
     rewrite_file(segments.list_segments(old, Kind.OBSERVATION)[0], lambda table: table, "3.1")
@@ -356,14 +355,15 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
         assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
         assert list(engine.queries.answer(past, lambda _: True, now_of(ROUNDS)))
-        heard = caplog.text + capfd.readouterr().err  # past maps are read in a separate process
+        heard = caplog.text + capfd.readouterr().err  # a separate process reads historical maps
         assert all(f"{path} is damaged and is ignored" in heard for path in harmed)
         assert all(path.exists() for path in harmed)
         assert not list(old.rglob("*.bad"))
     compact(old)
     assert [path.name for path in old.rglob("*.bad")] == [harmed[0].name + ".bad"]
     with closing(Engine(ServiceConfig(), old)) as engine:
-        assert engine.counts["files_set_aside"] == 3  # the roll-up is no file that it reads
+        # The service does not read the damaged roll-up file.
+        assert engine.counts["files_set_aside"] == 3
 
 
 def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ SPACES = {
 
 
 @cache
-def schema() -> Any:  # noqa: ANN401 the validator is its library's own
+def schema() -> Any:  # noqa: ANN401 a type of the validator's library
     if not SCHEMA.exists():
         pytest.skip(f"the schema of DATEX II is not at {SCHEMA}")
     import xmlschema

@@ -36,7 +36,7 @@ from tests.secured import (
 )
 from tests.waiting import matched, until
 
-# What does not depend on the routers: clients and service look for themselves.
+# Attacks that fail whatever the routers do, because clients and service check for themselves.
 HELD_WITHOUT_ROUTERS = {
     "certificate_without_its_key",
     "plain_tcp",
@@ -133,7 +133,8 @@ def is_heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool
     with listener.declare_subscriber(
         f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())
     ):
-        publisher = listener.declare_publisher(key(name))  # only a service learns who subscribes
+        # Only a session with the service's rights learns who subscribes.
+        publisher = listener.declare_publisher(key(name))
 
         def has_arrived() -> bool:
             vehicle.put(key(name), b"here")
@@ -196,9 +197,8 @@ def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: N
             much_later.enrol(make_enrolment(), step)
         for router in ROUTERS:
             running.stop(router)
-        for router in (
-            ROUTERS
-        ):  # they trust only the new authority, so that the old certificates are worth nothing
+        # The routers now trust only the new authority, so the old certificates are worthless.
+        for router in ROUTERS:
             running.start(router)
         assert is_heard(honest, HONEST, service)
 
@@ -272,7 +272,7 @@ def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
 
         until(has_arrived)
         assert set(heard_by[HONEST] + heard_by["owner-0"]) == {b"ice"}
-        # what was put before this has been at the others' routers too
+        # A query's answer shows that earlier messages have reached the other routers, too.
         for name in (other, SERVICE, READER, "owner-1"):
             list(sessions[name].get(f"{keys.ROOT}/map/**"))
             assert b"ice" not in heard_by[name]

@@ -137,8 +137,8 @@ def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> N
         at(folder).enrol(make_enrolment())
 
 
-# A name with a wrong letter near its end: a pattern that can read the letters before in many ways
-# tries them all.
+# A long name with a wrong character near its end. A pattern that can match the part before in many
+# ways would try all of them.
 LONG = "a" * 62 + "_b"
 
 

@@ -17,7 +17,7 @@ from schemas.numeric import BoolArray, FloatArray
 from tests.fleet_service.examples import CELL, at_least, belief, observations, value
 
 ICY = 0.15
-FLAGGED = 1  # vehicle with a working controller
+FLAGGED = 1  # number of the vehicle with a working slip controller
 
 
 def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations:

@@ -10,7 +10,8 @@ from fleet_service.fusion.fuse import RecordedResult
 from tests.fleet_service.examples import CELL, START, belief, observations, slippery, value
 from tests.fleet_service.fusion.test_order import difference, drive
 
-LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)  # somebody reports "now"
+# A report that sets the current time.
+LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)
 
 
 def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, Updated]]]:

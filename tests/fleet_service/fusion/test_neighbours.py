@@ -28,8 +28,8 @@ from tests.fleet_service.examples import (
 )
 
 X, Y = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
-DIRECTIONS = ((1, 0), (0, -1), (-1, 0), (0, 1))  # of the sectors, in columns and rows
-UNTESTED = at_least([0.3])  # one gentle driver
+DIRECTIONS = ((1, 0), (0, -1), (-1, 0), (0, 1))  # direction of each sector in columns and rows
+UNTESTED = at_least([0.3])  # lower bound from one gentle driver
 
 
 def east(steps: int, north: int = 0) -> int:

@@ -16,7 +16,7 @@ from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from tests.fleet_service.examples import CELL, LATITUDE, observations, value
 
-WIDTH_M = 10.2  # of a cell at LATITUDE
+WIDTH_M = 10.2  # [m] width of a cell at LATITUDE
 
 
 def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, FloatArray]:
@@ -76,7 +76,7 @@ def test_good_fix_stays_in_its_cell_and_poor_one_spreads_along_heading() -> None
 
 
 def test_a_visit_is_not_spread_into_another_region() -> None:
-    border = grid.cell_of(LATITUDE, 0.0)  # where two regions meet
+    border = grid.cell_of(LATITUDE, 0.0)  # a cell where two regions meet
     cells, share = spread(6.0, 0.0, int(border))
     assert (cells >= 0).sum() == 1
     assert share.sum() < 0.3
@@ -93,7 +93,8 @@ def test_all_cells_together_learn_no_more_than_one_would(
     sure.update(o)
     unsure.update(dataclasses.replace(o, other=cells, other_share=share))
     total = sum(information(kept) for kept in read_beliefs(unsure))
-    assert total <= information(read_beliefs(sure)[0]) + 2e-3  # rounding of the 16 bits
+    # Tolerance: probabilities are rounded to 16 bits.
+    assert total <= information(read_beliefs(sure)[0]) + 2e-3
 
 
 def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
@@ -107,4 +108,5 @@ def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
     own, beside = read_beliefs(fusion)[slots]
     assert information(own) > 3 * information(beside) > 0.0
     assert fusion.live.vehicles[slots].tolist() == fusion.live.visits[slots].tolist() == [1, 0]
-    assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)  # a newcomer's
+    # A new vehicle's weight is 0.75.
+    assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)

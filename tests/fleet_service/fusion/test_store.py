@@ -59,7 +59,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
     slots = fusion.slots_of(cells, np.zeros(40, np.int64))
     assert (fusion.sources(slots, ICE, START - 1) > 0).sum(axis=1).tolist() == [1] * 40
     fusion.update(observations([4 * HOUR], [1], value([0.8]), CELL))
-    assert fusion.store.state.used[REPORTERS_USED] == 1  # the window's
+    # Only the reporter in the time window has a record.
+    assert fusion.store.state.used[REPORTERS_USED] == 1
     before = belief(fusion, CELL + 7)
     fusion.update(
         observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7)
@@ -103,9 +104,8 @@ def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
     for cell in cells[:10].tolist():
         np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-12)
     for cell in cells[10:20].tolist():
-        np.testing.assert_allclose(
-            belief(fusion, cell), belief(whole, cell), atol=1e-3
-        )  # 16 bits a bin at rest
+        # A cell at rest stores 16 bits per bin.
+        np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-3)
     assert fusion.live.vehicles[: fusion.size].max() < 40
 
 

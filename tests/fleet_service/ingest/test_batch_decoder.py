@@ -27,7 +27,7 @@ _FLOAT = st.floats(width=32)
 
 
 @st.composite
-# protobuf messages are untyped
+# protobuf messages have no types.
 def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
     """Return a random message of a `kind` (observations or states): records with some of the
     columns and arbitrary values.
@@ -132,14 +132,14 @@ def _encode_run(number: int, body: bytes) -> bytes:
     "more",
     [
         _encode_run(40, b"unknown"),
-        _encode_run(31, bytes([1, 1])),  # health a second time, which appends
+        _encode_run(31, bytes([1, 1])),  # health a second time, which appends to the column
         _encode_run(25, struct.pack("<2f", 1.0, 2.0)) + _encode_run(25, b""),
-        b"\x98\x00" + b"\x01",  # field 3 by a tag that is longer than it need be
+        b"\x98\x00" + b"\x01",  # tag of field 3, encoded longer than necessary
         bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", 1.0),  # speed, not packed
-        bytes([2 << 3 | 1]) + bytes(8),  # boot a second time, which replaces
+        bytes([2 << 3 | 1]) + bytes(8),  # boot a second time, which replaces the first
         _encode_run(33, b"\x00" * 7),
-        _encode_run(32, b"\x80" * 9 + b"\x02" + b"\x00"),  # more than 64 bits
-        _encode_run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # more than 32 bits
+        _encode_run(32, b"\x80" * 9 + b"\x02" + b"\x00"),  # a number of more than 64 bits
+        _encode_run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # a number of more than 32 bits
     ],
 )
 def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> None:

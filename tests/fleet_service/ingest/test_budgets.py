@@ -156,7 +156,7 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
     whole = read_numbers(path.parent)
     data = bytearray(path.read_bytes())
     data[30] ^= 1
-    path.write_bytes(data + b"half a li")  # what a full disk leaves of an append
+    path.write_bytes(data + b"half a li")  # an append that a full disk cut off
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.counts["witnesses_damaged"] == 2
         assert len(read_numbers(path.parent)) == 2

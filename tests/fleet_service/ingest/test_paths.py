@@ -13,7 +13,7 @@ from fleet_service.ingest import paths
 from fleet_service.ingest.paths import ANCHORS, FASTEST, LEAP_M, VehiclePaths
 from tests.fleet_service.examples import SECOND, START
 
-METRE = 1.0 / 111_195.0  # of longitude on the equator [deg]
+METRE = 1.0 / 111_195.0  # [deg] longitude per metre on the equator
 CAR = 7
 
 

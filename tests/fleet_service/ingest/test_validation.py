@@ -234,7 +234,8 @@ def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> No
     assert (seq, row) == (7, -1)
     assert reason.startswith("mu: has 1 records")
     assert desk.counts["refused.mu"] == 1
-    pb.vehicle = "sim-002"  # on another's key: whose it is, is not known
+    # With another vehicle's key the sender is unknown, so no rejection is sent.
+    pb.vehicle = "sim-002"
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString()))
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), b"\xff" * 40))
     assert desk.list_rejected() == []

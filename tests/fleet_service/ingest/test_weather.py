@@ -152,7 +152,8 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     now = start + 5000 * SECOND
     np.testing.assert_allclose(beliefs(again, now), beliefs(engine, now), atol=1e-6)
     assert np.abs(beliefs(dry, now) - beliefs(engine, now)).max() > 1e-3
-    assert len(archived_reports(tmp_path / "a").time) == 2  # the file's row is known already
+    # The row of the file is recognised as a duplicate.
+    assert len(archived_reports(tmp_path / "a").time) == 2
     assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(
         tables.WEATHER_ARCHIVE
     )
@@ -181,7 +182,7 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     path = weather_files(root)[2]
     shutil.copy(path, tmp_path / path.name)
     assert (join_daily_files(root), join_daily_files(root), len(weather_files(root))) == (5, 0, 1)
-    shutil.copy(tmp_path / path.name, path)  # a power loss before its name was gone
+    shutil.copy(tmp_path / path.name, path)  # a power loss before the file name was removed
     assert len(archived_reports(root).time) == 7
     for kept in (1, 0):
         assert len(checkpoints.list_checkpoints(root)) == kept
@@ -198,7 +199,7 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
 def test_a_running_service_takes_weather_over_its_key(
     service: Running, session: zenoh.Session, start: Callable[..., Any]
 ) -> None:
-    # by default a put is dropped where the link is busy for a millisecond
+    # By default Zenoh drops a put if the link is busy for a millisecond.
     publisher = session.declare_publisher(
         keys.weather_key(REGION), congestion_control=zenoh.CongestionControl.BLOCK
     )

@@ -21,7 +21,7 @@ from tests.fleet_service.examples import CELL, START, observations, value
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # compiles the estimator where nobody did before
+@pytest.mark.timeout(600)  # time to compile the estimator
 def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:
         world = ["--scenario", end_to_end.HILLS.scenario, "--rough", "0.5"]
@@ -105,7 +105,7 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
 
     rows = visits((0, 10.0, 0.2), (0, 2.0, 0.9))
     assert end_to_end.false_ice([alert(0, 20.0)], rows) == (0, 0)
-    assert end_to_end.false_ice([alert(0, 5.0)], rows) == (1, 0)  # the ice came later
+    assert end_to_end.false_ice([alert(0, 5.0)], rows) == (1, 0)  # the ice came after the alert
     assert end_to_end.false_ice([alert(1, 20.0), alert(2, 20.0)], rows) == (1, 1)
     assert end_to_end.false_ice([], rows) == (0, 0)
 

@@ -51,7 +51,8 @@ def test_vehicle_of_a_town_is_one_of_the_ways_on_the_towns_road() -> None:
     found = resampled.resample_visits(rng, visits, ways, VEHICLES)
     ratio = found.reports.reading / found.mu
     kept = [np.unique(np.round(ratio[found.vehicle == vehicle], 6)) for vehicle in range(VEHICLES)]
-    assert all(len(of) == 1 for of in kept)  # what persists in a vehicle does in the town
+    # A vehicle's persistent error is the same in the whole town.
+    assert all(len(of) == 1 for of in kept)
     assert len({float(of[0]) for of in kept}) == VEHICLES
     assert found.reports.used == pytest.approx(0.5 * visits.mu)
     inside = (found.reports.reading > 0.2) & (found.reports.reading < 1.1)

@@ -11,7 +11,7 @@ def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) ->
     """Return the colour of a cell with a measured mu, its 5 % and 95 % quantiles, and its
     probability of being slippery.
     """
-    width = round(upper - lower, 6)  # a step of the records is .005
+    width = round(upper - lower, 6)  # the grid of the records has steps of .005
     if upper < SLIPPERY_MU or width < NARROW:
         return FOUR[sum(mu >= edge for edge in EDGES)]
     if p_slippery > KNOWN_SLIPPERY:

@@ -20,9 +20,9 @@ def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
     source = file_of("axe-core", "axe.min.js")
     if source is None:
         return None
-    seen.page.emulate_media(
-        reduced_motion="reduce"
-    )  # a colour that is just fading in is not the one that is read
+    # Without animations: the contrast of a colour that is still fading in would be measured
+    # wrongly.
+    seen.page.emulate_media(reduced_motion="reduce")
     seen.page.evaluate(f"() => {{ {source.read_text()} }}")
     found: list[str] = []
     for tab in tabs:

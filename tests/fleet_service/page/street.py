@@ -14,13 +14,15 @@ from schemas import grid, mugrid, wire
 from schemas.numeric import FloatArray, IntArray
 from tests.fleet_service.examples import CELL, at_least, batch, send, value
 
-VISIT_NS: Final = 600_000_000  # 10 m at 17 m/s
-ROLLED: Final = 0.25  # grip used where a part is only passed
+VISIT_NS: Final = 600_000_000  # [ns] time for 10 m at 17 m/s
+ROLLED: Final = 0.25  # grip used where a vehicle only rolls through
+# Longitudinal and lateral share of the used grip: braking, accelerating, turning. Visits with the
+# same manoeuvre share an error.
 WAYS: Final = (
     (-1.0, 0.0),
     (1.0, 0.0),
     (0.0, 1.0),
-)  # braking, driving, turning: visits that do the same share an error
+)
 EAST, NORTH, WEST, SOUTH = range(4)
 CARS: Final = tuple(f"car-{name}" for name in ("one", "two", "three", "four", "five", "six"))
 MIDDLE: Final = tuple(int(v) for v in grid.deinterleave(CELL))

@@ -108,7 +108,7 @@ class Transport:
         """Record that the simulated connection was closed."""
         self.is_aborted = True
 
-    def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as asyncio has it
+    def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as in asyncio
         """Return the network address of the simulated connection's client."""
         return (self._host, 1) if name == "peername" else None
 
@@ -121,7 +121,7 @@ def accept(
     """
     protocol = BoundedProtocol.__new__(BoundedProtocol)
 
-    def call_later(seconds: float, call: Any, *args: Any) -> Any:  # noqa: ANN401 as asyncio has it
+    def call_later(seconds: float, call: Any, *args: Any) -> Any:  # noqa: ANN401 as in asyncio
         timers.append((seconds, lambda: call(*args)))
         return SimpleNamespace()
 
@@ -171,7 +171,7 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
 ) -> None:
     monkeypatch.setattr(connections, "HEAD_S", 0.2)
 
-    async def answer_empty(_: object, __: object, send: Any) -> None:  # noqa: ANN401 as ASGI has it
+    async def answer_empty(_: object, __: object, send: Any) -> None:  # noqa: ANN401 as in ASGI
         await send({"type": "http.response.start", "status": 204, "headers": []})
         await send({"type": "http.response.body"})
 

@@ -151,7 +151,8 @@ def test_a_person_sees_the_file_below_the_map_without_any_network(
         assert sum("/base/" in url for url in seen.requests) < 30
 
 
-# A quarter of the middle: that no service watches here is hatched over it.
+# True if at least a quarter of the map's middle is blue. The page draws hatching over the rest,
+# because no service covers it.
 _BLUE: Final = """(() => {
   const map = document.getElementById("map"), x = map.width >> 1, y = map.height >> 1;
   const points = map.getContext("2d").getImageData(x - 20, y - 20, 40, 40).data;

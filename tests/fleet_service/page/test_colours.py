@@ -25,7 +25,7 @@ from tests.fleet_service.page.cell_colours import colour_of
 from tests.fleet_service.page.contrast import THEMES, class_contrasts, text_contrasts
 
 LEAST = 10.0
-STEP = 5.0  # of lightness between two classes that follow each other in danger
+STEP = 5.0  # least difference in lightness between neighbouring classes of danger
 ALL = (*FOUR, *TWO, LITTLE, GROUND)
 DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
 

@@ -94,9 +94,8 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
             until(lambda: out.read_bytes() == begun)
         with page_of(router, datex=DatexFile(OURS, out, print)) as address:
             pulled = pull(address)
-            until(
-                lambda: text(records(pulled())[0], ".//com:overallEndTime")
-            )  # nothing stands any more
+            # No alert is active any more.
+            until(lambda: text(records(pulled())[0], ".//com:overallEndTime"))
             put(session, CELLS, raised=True, at=START + NS)
             until(lambda: len(records(pulled())) == 2)
             put(session, CELLS, raised=False, at=START + 2 * NS)
@@ -129,7 +128,7 @@ def test_silence_of_a_service_that_went_ends_nothing(
     with page_of(router, datex=file) as address:
         pulled = pull(address)
         with made_up_service(session):
-            until(lambda: pulled() != NOTHING)  # it was asked what stands: nothing, so far
+            until(lambda: pulled() != NOTHING)  # the service was asked and has no active alert yet
             put(session, CELLS, raised=True)
             until(lambda: records(pulled()))
         until(lambda: not json.loads(ask(address, "/health")[2])["regions"][0]["served"])

@@ -24,8 +24,8 @@ from tests.fleet_service.page.test_server import ask
 from tests.waiting import until
 
 ITEMS = "/collections/grip/items"
-# In a process of their own: GDAL keeps the interpreter while it waits for the page, which is in
-# this one.
+# Each reader runs in a process of its own. GDAL blocks the interpreter while it waits for the page,
+# which this process serves.
 READERS = {
     "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
     "geopandas": (
@@ -35,7 +35,7 @@ READERS = {
 }
 
 
-def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
+def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas lacks types
     """Return the map's features as the program `reader` reads them from the page at `address`."""
     out = folder / f"{reader}.parquet"
     script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
@@ -203,9 +203,8 @@ def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str)
 
 
 def test_no_service_is_no_empty_map(bare: str) -> None:
-    until(
-        lambda: ask(bare, ITEMS)[0] == 503
-    )  # the page is the module's: it may still hear another test's service
+    # The module's page may still receive the service of an earlier test.
+    until(lambda: ask(bare, ITEMS)[0] == 503)
     assert ask(bare, ITEMS)[2].startswith(b"no service")
 
 

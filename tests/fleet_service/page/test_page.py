@@ -23,12 +23,13 @@ from tests.fleet_service.page.conftest import Drive, RunningPage
 from tests.structure import ROOT
 from tests.waiting import until
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
 PICTURES: Final = ROOT / ".page"
 READY: Final = "body[data-ready]"
 ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
-# Script that tells whether all ice is drawn; before the first picture there are no kinds.
+# JavaScript expression that is true when all ice is drawn. Before the first picture `kinds` is
+# missing.
 ICE_DRAWN: Final = f"document.body.dataset.kinds?.split(',')[0] == {street.count_known('ice')}"
 
 
@@ -77,9 +78,8 @@ def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
 
 def waits(seen: Opened, script: str) -> None:
     """Wait until a JavaScript expression that is evaluated in the page is true."""
-    until(
-        lambda: seen.page.evaluate(script)
-    )  # the page's own policy forbids Playwright to poll inside it
+    # The page's content security policy does not allow Playwright to poll inside the page.
+    until(lambda: seen.page.evaluate(script))
 
 
 def cell_of(part: str, index: int = 1) -> int:
@@ -119,9 +119,8 @@ def test_all_cells_are_drawn_in_their_class_and_bounds_are_hollow(
         assert painted > 100
         near(seen, cell_of("passed", 3), 21)
         only = f"(all => all[{HOLLOW}] > 0 && all.slice(0, {HOLLOW}).every(n => n === '0'))"
-        waits(
-            seen, f"{only}(document.body.dataset.kinds.split(','))"
-        )  # the last picture was of all of them
+        # The last picture shows all of these cells.
+        waits(seen, f"{only}(document.body.dataset.kinds.split(','))")
         assert seen.page.evaluate(_COLOURED) == 0, "a bound has no colour"
         look(seen, "bounds")
 
@@ -289,7 +288,8 @@ def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
 def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage) -> None:
     with open_map(page) as seen:
         waits(seen, "gripmap.live.state")
-        seen.page.evaluate("gripmap.live.source.close()")  # no error event comes of that
+        # Closing the source causes no error event.
+        seen.page.evaluate("gripmap.live.source.close()")
         waits(seen, "document.getElementById('live').textContent.startsWith('○ last update')")
 
 

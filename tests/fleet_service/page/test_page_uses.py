@@ -37,7 +37,7 @@ from tests.fleet_service.page.test_page import (
 )
 from tests.waiting import until
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
 WALL: Final = {"width": 3840, "height": 2160}
 _HEARD: Final = """() => {
@@ -73,13 +73,12 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
             "}) }"
         )
         assert page.service is not None
-        page.service.end()  # no further moment comes while it is played
+        page.service.end()  # so that no new moment is added during the playback
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.locator("#play").click()
         assert seen.page.locator("#play").inner_text() != "play"
-        until(
-            lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0
-        )  # a moment each .7 s
+        # The playback shows a new moment each 0.7 s.
+        until(lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0)
         played: list[list[str]] = seen.page.evaluate("played")
         moments = [int(at) for at, _ in played[:-1]]
         assert moments == sorted(moments)
@@ -101,7 +100,7 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
         silent.wait_for_selector("body[data-ready]", state="attached")
         for one in (seen.page, silent):
             one.evaluate(_HEARD)
-            # called before the loop goes on
+            # the function runs before the next iteration (B023)
             until(lambda: one.evaluate("gripmap.state.hasAlerts"))  # noqa: B023
         seen.page.locator("#tab-alerts").click()
         assert not seen.page.locator("#sound").is_checked()

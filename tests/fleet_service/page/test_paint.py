@@ -27,11 +27,11 @@ from tests.fleet_service.page.test_page import (
     waits,
 )
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
 PLACES: Final = 12
-# Squares of known ground in a row, of two tiles; says how many points of each colour there are in
-# the row's middle.
+# Draw a row of squares of known ground in two tiles. Return the number of points of each colour in
+# the middle of the row.
 _ROW: Final = """async ([side, first, unknown]) => {
   const { Pixels } = await import("/static/pixels.js");
   const { setColours, kindOf } = await import("/static/colours.js");
@@ -132,7 +132,7 @@ def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
                 "gripmap.map.drawNow() }",
                 ends,
             )
-            dots = 2 * 100  # at its ends
+            dots = 2 * 100  # points at the ends of the route
             assert seen.page.evaluate(_POINTS, ice) >= before - dots, zoom
             assert seen.page.evaluate(_COLOURED) > before
             look(seen, f"route_{zoom:g}")

@@ -20,12 +20,13 @@ from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
 from tests.fleet_service.page.test_page import ICE, cell_of, look, near, open_map, waits
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
-ASIDE: Final = 1  # cells from the reported positions to the road of the map, as receivers err
+# Distance in cells between reported positions and the map's road, like the error of a receiver.
+ASIDE: Final = 1
 STREET: Final = "Main Street"
 _DRAWN: Final = "document.body.dataset.kinds?.split(',')[{kind}] == {count}"
-# Screen position of the middle of a drawn ribbon of one kind, on a lane to the east.
+# Screen position of the middle of a ribbon of the given kind on an eastward lane.
 _RIBBON: Final = """kind => {
   const { state: { roads }, map: { view } } = gripmap;
   for (const lane of roads.lanes) {

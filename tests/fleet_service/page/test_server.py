@@ -241,7 +241,8 @@ def test_one_cell_is_told_as_the_service_has_it(page: RunningPage, drive: Drive)
     def fetch_cell() -> dict[str, Any]:
         return dict(json.loads(ask(page.address, f"/cell/{ice}/{street.EAST}")[2]) or {})
 
-    until(lambda: fetch_cell().get("observations") == len(street.CARS))  # all cars are on the map
+    # Wait until all cars are on the map.
+    until(lambda: fetch_cell().get("observations") == len(street.CARS))
     told = fetch_cell()
     assert told["mu_lower"] < told["mu"] < 0.25
     assert told["safe_speed"]["50"] < told["safe_speed"]["100"] < 15.0
@@ -366,7 +367,7 @@ def test_every_option_of_the_command_does_what_it_says(
         ]
         status, headers, _ = ask(address, "/", Host="map.example")
         assert (status, ask(address, "/", Host="other.example")[0]) == (200, 421)
-        until(lambda: ask(address, "/datex2/situation.xml")[0] == 503)  # no service is there
+        until(lambda: ask(address, "/datex2/situation.xml")[0] == 503)  # no service is running
         assert "img-src 'self' data: https://t.example;" in headers["content-security-policy"]
         page.send_signal(signal.SIGTERM)
         page.wait(30.0)

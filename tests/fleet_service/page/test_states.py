@@ -27,13 +27,13 @@ from tests.fleet_service.page.test_page import (
     waits,
 )
 
-pytestmark = pytest.mark.campaign  # a browser takes seconds to start
+pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
 FOLDER: Final = PICTURES / "states"
 LAPTOP: Final[Any] = {"width": 1366, "height": 768}
 
 
-# Number of buttons at the first picture that a page draws.
+# Number of buttons when the page draws its first picture.
 _FIRST_PICTURE: Final = """document.addEventListener("DOMContentLoaded", () => new MutationObserver(
   () => { globalThis.buttonsBefore ??= document.getElementById("controls").childElementCount; }
 ).observe(document.body, { attributeFilter: ["data-drawn"] }))"""
@@ -234,7 +234,7 @@ def test_print_has_moment_legend_and_map_and_stays_readable_in_grey(
         assert min(np.diff(shades[:6])) >= 8, "the more dangerous, the darker"
 
 
-# The middles of the printed legend's samples, from the most dangerous one.
+# Centres of the samples in the printed legend, beginning with the most dangerous class.
 _LADDER: Final = """[...document.querySelectorAll("#paper .ladder .ribbon")].map(one => {
   const box = one.getBoundingClientRect();
   return [scrollX + box.left + box.width / 2, scrollY + box.top + box.height / 2];

@@ -32,7 +32,7 @@ def store_tables(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
 
 @pytest.mark.parametrize("cut", [0, 1, 700, 1500])
 def test_fusion_from_its_checkpoint_continues_bit_for_bit(cut: int) -> None:
-    o = drive(11, 1500, 8.0 * 3600.0)  # longer than vehicles are remembered
+    o = drive(11, 1500, 8.0 * 3600.0)  # longer than the memory of vehicles
     order = delay_arrivals(o, 100.0, 12)
     whole = Fusion(LATENESS_S)
     whole.update_weather(reports((0.5, RAIN)))

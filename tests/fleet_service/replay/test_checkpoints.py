@@ -197,10 +197,11 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
             if k == 56:
                 compact(tmp_path)
                 keep(engine, tmp_path)
-        keep(engine, tmp_path)  # and nothing after it
+        keep(engine, tmp_path)  # no message follows this checkpoint
         live = read_state(engine)
         assert engine.state.fusion.waiting
-    for kept in (2, 1, 0):  # from the last checkpoint, from the one before, from the log alone
+    # Start from the last checkpoint, from the one before, and from the log alone.
+    for kept in (2, 1, 0):
         assert len(checkpoints.list_checkpoints(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             found = read_state(again)
@@ -217,9 +218,8 @@ def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
-        engine.intake.ingest(
-            [icy(k, 2, 0.5) for k in range(4)], time.time_ns()
-        )  # dies before its segment
+        # The service dies before it writes these messages to a segment.
+        engine.intake.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 4
         again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
@@ -241,7 +241,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
         file = path / "cells.arrow"
         if harm == "truncate":
             file.write_bytes(file.read_bytes()[:100])
-        elif harm == "flip":  # a number that compiled code would follow, to anywhere
+        elif harm == "flip":  # a changed number that compiled code would use as an index
             data = bytearray(file.read_bytes())
             data[len(data) // 2] ^= 0x40
             file.write_bytes(data)
@@ -298,7 +298,7 @@ def test_compacted_file_across_the_checkpoint_is_not_replayed_twice(tmp_path: Pa
         keep(engine, tmp_path)
         engine.intake.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())
         engine.settlement.flush()
-    compact(tmp_path)  # both segments in one file
+    compact(tmp_path)  # joins both segments in one file
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 8
         again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())

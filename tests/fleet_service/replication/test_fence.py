@@ -55,10 +55,10 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
     two.copy.upload_segments([])
     two.copy.sync()
     known_there = dict(known)
-    meets(one, 5)  # the frozen one wakes
+    meets(one, 5)  # the frozen service resumes
     join_daily_files(one.root)
     one.copy.upload_segments([])
-    # as if it had been frozen right behind its looks
+    # As if it had been frozen right after its checks.
     one.copy.bucket.may_write = lambda: True
     one.copy.bucket.assert_alone = None
     one.copy.sync()

@@ -38,7 +38,7 @@ from tests.standbys import Host, open_hosts, restore_archive
 from tests.waiting import until
 
 RESEND_S = 1.0
-LEASE_S = 4.0  # lease time of services in threads: a request may take a quarter of it
+LEASE_S = 4.0  # lease time of services in threads; a request may take a quarter of it
 
 
 def freeze_host(host: Host) -> None:
@@ -75,14 +75,15 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         if how == "frozen":
             one.part.send_signal(signal.SIGCONT)
         one.to_router.restore()
+        # A service that is cut off from the bucket learns of its successor by the token.
         if how not in {
             "killed",
             "stopped",
-        }:  # a service cut off from the bucket learns of its successor by the token
+        }:
             assert one.part.wait(PATIENCE_S) == 1
             assert one.has_said("lease lost to another service")
         one.to_bucket.restore()
-        one.part.start()  # it is now the standby, whose folder becomes a copy of the bucket
+        one.part.start()  # it is now the standby, and its folder becomes a copy of the bucket
         one.part.line_with("standby: ")
         two.part.stop()
         one.part.line_with("ready: ")
@@ -161,11 +162,12 @@ class Machine:
         self.root = root
         told = {"standby": standby, "lease_s": LEASE_S, "archive": bucket.settings}
         self.config = ServiceConfig.model_validate(told)
+        # A router is reachable, and no token is active.
         there = (
             lambda: True,
             lambda _: False,
             lambda: None,
-        )  # it reaches a router, and no token stands
+        )
         signs = there if standby else None
         held = acquire_archive(self.config, root, threading.Event(), say, signs)
         assert held is not None
@@ -207,30 +209,30 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
         one.write(seed)
     assert acknowledges(one)
     one.freeze()
-    two = Machine(tmp_path / "two", bucket)  # waits until the lease is old
+    two = Machine(tmp_path / "two", bucket)  # the constructor waits until the lease is old
     assert not acknowledges(one)
     before = rows_in(two.root, Kind.OBSERVATION)
     assert len(before) == 15
-    # It wakes amid of everything: a segment, a compaction that is put, the deletes of what was
-    # compacted.
+    # The frozen service resumes in the middle of its work: it writes a segment, compacts, uploads
+    # the result and deletes the compacted files.
     one.write(3)
     assert not acknowledges(one)
     compact(one.root)
     with pytest.raises(CopyError):
         one.copy.sync()
-    # as if it had been frozen just after it checked its lease
+    # As if it had been frozen right after the check of its lease.
     one.copy.bucket.may_write = lambda: True
     with pytest.raises(CopyError, match="another service has the lease"):
         one.copy.sync()
     names = bucket.read_objects()
     assert any(name.startswith("observations/") for name in names)
-    assert sum(name.startswith("inbox/") for name in names) == 4  # nothing was deleted
+    assert sum(name.startswith("inbox/") for name in names) == 4  # the bucket still has these files
     compact(two.root)
     two.copy.sync()
     for root in (two.root, restore_archive(tmp_path / "new", bucket)):
         assert sorted(rows_in(root, Kind.OBSERVATION)) == sorted(before)
     two.close()
-    again = Machine(tmp_path / "two", bucket)  # its start removes objects that do not count
+    again = Machine(tmp_path / "two", bucket)  # at its start it removes invalid objects
     assert not [name for name in bucket.read_objects() if name.startswith("inbox/")]
     again.close()
     one.close()
@@ -260,7 +262,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
 ) -> None:
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
-    with monkeypatch.context() as killed:  # between the disk and the bucket
+    with monkeypatch.context() as killed:  # failure between writing to disk and uploading
         killed.setattr(one.log, "_upload", lambda _: None)
         one.write(1)
     has_read = threading.Event()
@@ -279,7 +281,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     one.freeze()
     one.log.close()
     assert one.holding.lease is not None
-    one.holding.lease.lost = True  # so that it releases nothing
+    one.holding.lease.lost = True  # so that it does not release the lease
     one.holding.close()
     two = Machine(tmp_path / "two", bucket)
     assert len(rows_in(two.root, Kind.OBSERVATION)) == 5
@@ -390,7 +392,7 @@ def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float
 ) -> None:
     now = [100.0]
-    # The clock that stands still while a machine is suspended is not asked.
+    # `monotonic` stops while a machine is suspended, so the lease must not use it.
     clock = SimpleNamespace(monotonic=lambda: 0.0, clock_gettime=lambda _: now[0], time=time.time)
     monkeypatch.setattr("fleet_service.replication.lease.time", clock)
     lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)

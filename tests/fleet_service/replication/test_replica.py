@@ -90,9 +90,8 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
         with pytest.raises(CopyError):
             log.flush()
         log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 8), [8])
-        with pytest.raises(
-            CopyError, match="is tried again"
-        ):  # at once, and nothing was asked of the network
+        # The error comes at once, without a request to the network.
+        with pytest.raises(CopyError, match="is tried again"):
             log.flush()
         assert (copy.backoff.failures, log.unsettled, log.rows) == (1, 2, 0)
         assert copy.backoff.away_s > 0
@@ -190,7 +189,7 @@ def test_what_was_cut_off_is_made_good_at_the_next_start(
     copy = make(root)
     with closing(fill_log(root, copy)):
         copy.close()
-    with closing(fill_log(root, None, range(3, 4))):  # written and not put
+    with closing(fill_log(root, None, range(3, 4))):  # written to disk, but not uploaded
         damaged = segments.list_segments(root, Kind.OBSERVATION)[0]
         whole = damaged.read_bytes()
         set_aside(damaged, "a bit has turned")

@@ -48,7 +48,7 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
 
 
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
-    # too far from each other to tell
+    # These cells are too far apart to influence each other.
     fusion = Fusion(120.0)
     cells = 64 * np.arange(40)
     for vehicle in range(3):
@@ -71,9 +71,8 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
         if p > RAISE_ABOVE
     }
     assert told.items() <= known.items()
-    assert {cell for cell, p in known.items() if p > 0.95} <= set(
-        told
-    )  # evidence below 1 nat supports no alert
+    # Evidence below 1 nat supports no alert.
+    assert {cell for cell, p in known.items() if p > 0.95} <= set(told)
     assert 0 < len(told) < fusion.size
 
 
@@ -126,7 +125,7 @@ def report_in_turn(
     alerts = Alerts(fusion)
     under = []
     for k, vehicle in enumerate([*vehicles, *others]):
-        later = k >= len(vehicles)  # by then the first ones are known
+        later = k >= len(vehicles)  # by then the first vehicles are known
         updated = fusion.update(
             observations([20.0 * k + wait * later], [vehicle], value([then if later else mu]))
         )
@@ -154,7 +153,7 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
 ) -> None:
     fusion = Fusion(120.0)
     (before, here, behind) = grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
-    for cell in (before, here, behind):  # of a road where more grip was used than ice has
+    for cell in (before, here, behind):  # on this road vehicles used more grip than ice has
         seconds = 20.0 * np.arange(drivers)
         fusion.update(
             observations(seconds, np.arange(drivers), at_least(np.full(drivers, 0.5)), cell)
@@ -175,9 +174,8 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
     for used, stands in ((0.7, False), (0.5, True)):
         fusion, alerts, _ = icy([1, 2, 3])
-        updated = fusion.update(
-            observations([100.0, 101.0], [4, 5], value([0.85, 0.85]))
-        )  # the belief turns
+        # These reports change the belief to a dry road.
+        updated = fusion.update(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))
         later = fusion.update(
             observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used)))
         )
@@ -241,7 +239,7 @@ def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
     slot = np.zeros(1, np.int64)
     assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
     rng = np.random.default_rng(3)
-    for cell in range(40):  # elsewhere the first two report ice as dry
+    for cell in range(40):  # elsewhere the first two vehicles report ice as dry
         who = rng.permutation(12)
         mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
         fusion.update(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))

@@ -41,9 +41,9 @@ from tests.fleet_service.examples import (
 )
 
 Start = Callable[[int], Engine]
-MORE = tuple(
-    f"sim-01{k}" for k in range(5)
-)  # two vehicles may share a bit of 64, three of five never in practice
+# Five more vehicles. Two vehicles may share one of the 64 bits, but five practically never have
+# fewer than three bits.
+MORE = tuple(f"sim-01{k}" for k in range(5))
 
 
 @pytest.fixture
@@ -221,7 +221,7 @@ def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, ba
     hear(engine, *MORE, now=began)
     (before,) = rows(engine, shown)
     hear(engine, "lone-0", now=shown)
-    for k, name in enumerate(names):  # in an hour each
+    for k, name in enumerate(names):  # one vehicle each hour
         now = shown + (k + 1) * 3600 * SECOND
         one = batch(name, 1, now, [0.8], **beside)
         engine.intake.ingest([Message(Kind.OBSERVATION, key(name), wire.encode(one), "")], now)

@@ -73,9 +73,8 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
         "a tile",
         f"query: failed in the service ({type(failure).__name__}); ask again later",
     ]
-    until(
-        lambda: texts(session, key + parameters) == ["a tile"]
-    )  # the past before is let go a moment after its answer
+    # The previous query about the past releases its place a moment after its answer.
+    until(lambda: texts(session, key + parameters) == ["a tile"])
     assert counts["answer_failures"] == 1
     querier.undeclare()
     queryable.undeclare()
@@ -135,7 +134,8 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     matched(querier)
     heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
     assert texts(session, key) == ["a tile"]
-    until(lambda: replies.hangs_s > 0.0)  # without limit: the operator sees that the service hangs
+    # Query without a time limit: the operator must see that the service hangs.
+    until(lambda: replies.hangs_s > 0.0)
     light_came.set()
     assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
     until(lambda: replies.hangs_s == 0.0)
@@ -143,7 +143,8 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     queryable.undeclare()
 
 
-COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of each kind
+# Cost of a query by its `min_vehicles`; one query of each kind.
+COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}
 
 
 class Half:

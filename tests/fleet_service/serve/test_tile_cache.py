@@ -48,14 +48,15 @@ def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state:
     assert made.shown(TILE, NOW + tile_cache.SHOWN_NS) is first
     later = made.shown(TILE, NOW + tile_cache.SHOWN_NS + 1)
     assert later.cells["age_s"][0].as_py() > first.cells["age_s"][0].as_py()
-    assert made.shown(TILE, NOW - 1) is not later  # the clock jumped back
+    assert made.shown(TILE, NOW - 1) is not later  # the clock was set back
 
 
 def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
     assert vehicles(made, NOW) == [1]
     visit(state, 2)
-    assert vehicles(made, NOW + 1) == [1]  # no reader was promised the second one
+    # The second visit is not acknowledged yet, so the old tile may be shown.
+    assert vehicles(made, NOW + 1) == [1]
     assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [2]
     visit(state, 3)
     made.acknowledge()
@@ -91,7 +92,8 @@ def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(
     young = made.shown(TILE + 2, NOW)
     assert made.shown(TILE + 2, NOW) is young
     assert made.shown(TILE, NOW) is not made.shown(TILE + 1, NOW)
-    assert made.shown(TILE + 2, NOW) is not young  # the two above came after it
+    # Two newer tiles have displaced it from the cache.
+    assert made.shown(TILE + 2, NOW) is not young
 
 
 def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:

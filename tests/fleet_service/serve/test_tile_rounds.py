@@ -9,7 +9,7 @@ from collections import Counter
 
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 
-COST_S = SHARE_S / 2.0  # that a tile takes
+COST_S = SHARE_S / 2.0  # time to make a tile
 
 
 class Made:
@@ -54,9 +54,8 @@ def test_a_turn_puts_at_most_its_share_and_every_tile_has_its_turn() -> None:
 
 def test_skipped_tile_rounds_are_counted_and_changes_come_in_the_next() -> None:
     made = Made()
-    made.changed = set(
-        range(300)
-    )  # three seconds of tiles alone, and as much of the rest of the turns
+    # The tiles alone take three seconds, and the other work of the loop takes as long.
+    made.changed = set(range(300))
     while len(made.puts) < 300:
         made.turn(SHARE_S)
         made.changed |= {3, 5}

@@ -110,7 +110,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         found = read_image(engine)
         assert expected.keys() == found.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
-        again = Fleet(session)  # repeated batches are recognised there
+        again = Fleet(session)  # the new owner recognises repeated batches
         until(make_driver(again, sent), PATIENCE_S)
         assert engine.counts["duplicates"] >= len(sent)
         config = tmp_path / "config.json"
@@ -154,5 +154,6 @@ def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
     assert two.wait(threading.Event(), print, lambda: 0, None)
     assert two.former_holders == ("one",)
     two.release("one")
-    assert three.wait(threading.Event(), print, lambda: 0, None)  # at the end every service may
+    # At the end every service may take over.
+    assert three.wait(threading.Event(), print, lambda: 0, None)
     assert three.former_holders == ("one", "two")

@@ -32,8 +32,8 @@ from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import SECOND, batch, send
 from tests.waiting import until
 
-# Three regions side by side, and a street that begins in the east, so that no order of tiles is its
-# own.
+# Three neighbouring regions. The street begins in the east, so that its order differs from every
+# order of the tiles.
 MIDDLE = int(grid.region_of(int(grid.cell_of(57.7, 11.97))))
 COLUMN, ROW = (int(one) for one in grid.deinterleave(MIDDLE))
 REGIONS = grid.interleave(np.array([COLUMN - 1, COLUMN, COLUMN + 1]), np.array([ROW] * 3)).tolist()
@@ -143,7 +143,7 @@ def test_answers_over_three_services_are_ordered_and_name_gaps(
             for parameters in asked:
                 answer = ask(router, **parameters)
                 silent += answer.missing != (NAMES[1],)
-            assert silent == 0  # cluster.silent_regions
+            assert silent == 0  # this is the figure `cluster.silent_regions`
             part = ask(router, route=ROUTE).table
             assert part is not None
             assert 0 < part.num_rows < along.table.num_rows
@@ -184,9 +184,8 @@ def test_a_second_service_of_a_region_refuses_to_start(
         running(router, tmp_path / "one", name="first", regions=[wide]),
         ThreadPoolExecutor() as both,
     ):
-        list(
-            both.map(assert_refused, ("first", "second"))
-        )  # also one of the same name, on another machine
+        # A service of the same name on another machine is refused, too.
+        list(both.map(assert_refused, ("first", "second")))
     with (
         zenoh_session(router) as other,
         claim_regions(other, "second", NAMES[1:2], threading.Event()) as mine,
@@ -305,7 +304,7 @@ def test_a_leaving_service_may_be_asked_instead_of_its_successor(
         def replies(*_: object) -> Iterator[tuple[str, bytes]]:
             held.__exit__(None, None, None)
             until(lambda: len(presence.active_tokens(third)) == 1)
-            if comes_back:  # a frozen one wakes
+            if comes_back:  # a frozen service resumes
                 again.__enter__()
                 until(lambda: len(presence.active_tokens(third)) == 2)
             return iter(())
