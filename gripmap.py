@@ -40,7 +40,7 @@ def _check_packages() -> None:
 _check_packages()
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever a face holds
+def __getattr__(name: str) -> Any:  # noqa: ANN401 any public object of a package
     """Return a public name of `edge_agent` or `fleet_service`, imported when it is first used."""
     for face in FACES:
         package = importlib.import_module(face)

@@ -32,7 +32,7 @@ from schemas.thresholds import NS
 from schemas.wire import Columns
 
 RATE_HZ = 100.0
-BLOCK = 50  # samples
+BLOCK = 50  # [samples] length of a block
 START_NS = 1_800_000_000 * NS
 REPORT_S = 30.0
 

@@ -45,12 +45,12 @@ from schemas.runtime.figures import Figure
 from schemas.thresholds import NS, SLIPPERY_MU
 
 RATE_HZ: Final = 100.0
-BLOCK: Final = 50  # samples: half a second
+BLOCK: Final = 50  # [samples] half a second
 START_NS: Final = 1_800_000_000 * NS
 LATENESS_S: Final = 120.0
-ASKED_S: Final = 30.0  # between two looks at the tiles
-SEEDS: Final = 20  # of a campaign whose bars count
-LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
+ASKED_S: Final = 30.0  # time between two readings of the map's tiles
+SEEDS: Final = 20  # drives of a campaign that is compared with targets
+LOST: Final = 0.98  # share of the available grip at which a wheel counts as sliding
 
 
 @dataclass
@@ -59,17 +59,19 @@ class Drive:
     "new ice" is the ice that appears during the drive. A lap is one passage of a car over it.
     """
 
-    # (vehicle, lap) of the laps in which a wheel lost its grip on the new ice
+    # (vehicle, lap) of the laps in which a wheel lost its grip on the new ice.
     slid: set[tuple[int, int]] = field(default_factory=set)
-    # (vehicle, lap) of all laps
+    # (vehicle, lap) of all laps.
     passed: set[tuple[int, int]] = field(default_factory=set)
     alert_passes: float = float("nan")  # number of laps before the first alert of the new ice
-    # per cell that several vehicles visited: True if the map's interval contains the true friction
+    # For each cell that several vehicles visited: True if the map's interval contains the true
+    # friction.
     inside: list[bool] = field(default_factory=list)
     visits: int = 0  # number of visits (passages of a cell) that were fused into the map
     alerts: int = 0  # number of alerts on the new ice
     warnings: int = 0  # number of warnings that the cars gave
-    # absolute error of the friction estimate in cells that the map knows: with and without the map
+    # Absolute errors of the friction estimate with and without the map, in cells that the map
+    # knows.
     known_error: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -97,7 +99,7 @@ class ListeningTown:
         self._asked = -ASKED_S
         self._lap = np.zeros(vehicles, np.int64)
         self._on = np.zeros(vehicles, np.bool_)
-        self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
+        self._true: dict[int, float] = {}  # friction of each place when it was last driven over
 
     def run(self, duration_s: float) -> Drive:
         """Simulate a drive of the town's cars for `duration_s` [s], and evaluate the map at its

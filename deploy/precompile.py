@@ -57,7 +57,8 @@ def main(words: list[str]) -> int:
         for done in (*service, *replays):
             lines += done.result()
         if not papers:
-            lines += _run_process(folder, LIBRARY)  # of the kernels that the replay has compiled
+            # Build the library of the kernels that the replay has compiled.
+            lines += _run_process(folder, LIBRARY)
     print(f"compiled in {time.monotonic() - began:.0f} s", *lines, sep="\n", flush=True)
     return 0
 

@@ -46,7 +46,8 @@ def load_configuration(
         settings.insert_json5(
             "listen/endpoints", json.dumps([listen] if isinstance(listen, str) else list(listen))
         )
-        settings.insert_json5("adminspace/enabled", "true")  # tells the port that port 0 became
+        # The admin space reports the actual port if port 0 was given.
+        settings.insert_json5("adminspace/enabled", "true")
     return settings
 
 
@@ -102,8 +103,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run a router with parsed options until a signal ends it; return the exit code."""
-    # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's
-    # main thread.
+    # Zenoh's threads inherit the signal mask. A signal that one of them received would never wake
+    # Python's main thread.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         session, endpoints = open_router(args.config, args.listen)
@@ -126,6 +127,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    # Zenoh may hang where one of two connected routers is closed, then or when the interpreter
-    # ends; a router has nothing to save.
+    # Zenoh may hang when one of two connected routers closes, at once or when the interpreter ends.
+    # A router has nothing to save.
     force_exit(main())

@@ -10,7 +10,8 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 
-# Machado, Oliveira and Fernandes (2009), table 1, severity 1.0, for linear RGB.
+# Colour vision deficiencies after Machado, Oliveira and Fernandes (2009), table 1, severity 1.0,
+# for linear RGB.
 SIGHTS: Final[dict[str, FloatArray]] = {
     "normal": np.eye(3),
     "protanopia": np.array(
@@ -35,7 +36,7 @@ SIGHTS: Final[dict[str, FloatArray]] = {
         ]
     ),
 }
-# sRGB to XYZ, D65 (IEC 61966-2-1), and its white.
+# Matrix from sRGB to XYZ and white point for D65 (IEC 61966-2-1).
 _XYZ: Final = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 )

@@ -39,11 +39,12 @@ from schemas.wire.tile import decode_tile
 from tests.structure import ROOT
 
 SEEDS: Final = ROOT / "tests" / "data" / "fuzz"
-# of processor time, for inputs of at most LONGEST bytes, which take milliseconds
+# Processor time that counts as a hang. An input of at most LONGEST bytes normally takes
+# milliseconds.
 SLOW_S: Final = 5.0
 LONGEST: Final = 8192
 CODE: Final = tuple(str(ROOT / name) for name in ("schemas", "edge_agent", "fleet_service"))
-# that readers of lines catch
+# Exceptions that the readers of lines catch.
 GNSS_ERRORS: Final = (ValueError, TypeError, OverflowError, RecursionError)
 WORDS: Final = (
     *(
@@ -189,14 +190,14 @@ class Fuzzer:
             self._parser.parse(data)
         except self._parser.allowed:
             pass
-        except Exception:  # noqa: BLE001 whatever it is, it is a crash
+        except Exception:  # noqa: BLE001 any other exception is a crash
             sys.settrace(None)
             self._crashes += 1
             self._keep("crash", data)
             traceback.print_exc()
         finally:
             sys.settrace(None)
-        # the first inputs may compile kernels
+        # The first inputs may compile kernels, so their time does not count.
         if not always and time.process_time() - began > SLOW_S:
             self._hangs += 1
             self._keep("hang", data)
@@ -204,7 +205,7 @@ class Fuzzer:
             self._corpus.append(data)
             self._keep("corpus", data)
 
-    # the type that `sys.settrace` requires
+    # `sys.settrace` requires this type.
     def _trace_call(self, frame: FrameType, event: str, _: Any) -> Any:  # noqa: ANN401
         if not frame.f_code.co_filename.startswith(CODE):
             return None

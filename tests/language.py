@@ -25,7 +25,8 @@ PACKAGES: Final = ("schemas", "edge_agent", "fleet_service", "deploy", "tests")
 CEILINGS: Final = ROOT / "tests" / "language_ceilings.json"
 LONGEST_TEST_NAME: Final = 70
 LONGEST_SENTENCE: Final = 30  # [words]
-NOT_OURS: Final = ("NOTICE.md", "results.md")  # a licence; texts of figures
+# A licence, and a page whose text comes from the figures.
+NOT_OURS: Final = ("NOTICE.md", "results.md")
 
 # A docstring begins with an imperative verb or a noun phrase.
 OPENING: Final = re.compile(r"(What|Who|Whether|Of|How)\b")

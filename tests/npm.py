@@ -28,11 +28,11 @@ class Package(NamedTuple):
 
 
 PACKAGES: Final = {
-    "axe-core": Package(  # MPL-2.0
+    "axe-core": Package(  # licence: MPL-2.0
         "4.11.0",
         {"axe.min.js": "e9e5863c33a874f09bc01acd9234b7e3c871479f5eef8802fa582544465e6d01"},
     ),
-    "maplibre-gl": Package(  # BSD-3-Clause
+    "maplibre-gl": Package(  # licence: BSD-3-Clause
         "5.24.0",
         {
             "dist/maplibre-gl.js": (

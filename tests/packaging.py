@@ -31,7 +31,7 @@ from pathlib import Path
 for package in (schemas, edge_agent, fleet_service, deploy):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package
 """
-# the kernels in the wheel give the estimates of those that Numba compiles here, to the last digits
+# The wheel's native kernels must give the same estimates as kernels that Numba compiles here.
 NATIVE = """
 import sys
 from edge_agent.app.native_library import use_agent_library
@@ -47,10 +47,12 @@ for name in ("mu", "mu_lower", "mu_upper"):
     np.testing.assert_allclose(made[name].to_numpy(), by_numba[name].to_numpy(), rtol=1e-5)
 assert "numba" not in sys.modules
 """
+# A foreign folder of this name hides the installed package. The import of each module listed here
+# must then report this.
 HIDING = {
     "schemas": ("gripmap", "edge_agent", "fleet_service"),
     "deploy": ("gripmap",),
-}  # what says so
+}
 VERSIONS = ("3.11", "3.12", "3.13")
 WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 OUTGOING: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
-USUAL_OUTGOING: Final = 32768  # Linux's first port of outgoing connections
+USUAL_OUTGOING: Final = 32768  # first port of outgoing connections by Linux's default
 FIRST: Final = 15_000
 
 

@@ -34,7 +34,7 @@ CALLS: Final = {
 }
 PRODUCT: Final = ("schemas", "edge_agent", "fleet_service", "deploy")
 CHARACTERS: Final = frozenset(range(128))
-MANY: Final = 64  # repeats; fewer take no time
+MANY: Final = 64  # number of repeats; matches of shorter texts take no time
 Characters = frozenset[int]
 
 
@@ -88,7 +88,7 @@ def _never_fails(parts: list[Part], start: int) -> bool:
     return all(part.is_optional for part in parts[start + 1 :])
 
 
-def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 the parser's own tuples
+def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 tuples of the parser
     """Return True if a repeated group ends with a repeat of characters with which the group can
     begin again, so that the matcher can divide a text in many ways.
     """

@@ -115,7 +115,7 @@ class Network:
         """Start a router from its configuration file, on its previous port if it had one."""
         file = self.folder / f"{router}.json5"
         config = json.loads(file.read_text())
-        if router != ROUTERS[0]:  # the file names fixed ports; here they are free ones
+        if router != ROUTERS[0]:  # the file has fixed ports; this test uses free ones
             config["connect"] = {"endpoints": [self.between[ROUTERS[0]]], "retry": RETRY}
         if not self.capped:
             del config["downsampling"]
@@ -156,7 +156,8 @@ class Network:
             ):
                 arrived = threading.Event()
                 subscriber = here.declare_subscriber(PROBE, partial(_set_arrived, arrived))
-                # a put each time: a publisher from before the link may never hear that it matches
+                # Repeat a put. A publisher that is older than the link may never learn of its
+                # subscriber.
                 until(partial(_has_arrived, there, arrived))
                 subscriber.undeclare()
 

@@ -25,12 +25,11 @@ def spark_session(count: int) -> Iterator[Any]:
     from pyspark.sql import SparkSession
 
     if (other := SparkSession.getActiveSession()) is not None:
-        other.stop()  # it would be taken, with its own cores
-    os.environ.setdefault(
-        "PYSPARK_PYTHON", sys.executable
-    )  # as `spark.session` does, for what it then finds
-    # of the environment, Spark looks only at what it holds when its Java starts: the second session
-    # would be the first
+        other.stop()  # an active session would be reused with its own number of cores
+    # `spark.session` uses the same setting.
+    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
+    # Spark reads the environment only when its Java process starts. Otherwise the second session
+    # would equal the first one.
     builder = SparkSession.builder.master(f"local[{count},{TRIES}]").config(
         "spark.ui.showConsoleProgress", "false"
     )

@@ -327,8 +327,8 @@ def _is_number(node: ast.AST) -> bool:
     return plain and bool(constants) and all(type(value) in (int, float) for value in constants)
 
 
-# Beginnings of the names of methods that a base class calls: of `ast.NodeVisitor`, of Proton's
-# `MessagingHandler`, and of `http.server.BaseHTTPRequestHandler`.
+# Prefixes of methods that a library calls: `ast.NodeVisitor`, Proton's `MessagingHandler` and
+# `http.server.BaseHTTPRequestHandler`.
 LIBRARY_CALLS: Final = ("visit_", "on_", "log_message")
 
 

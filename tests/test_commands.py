@@ -152,7 +152,7 @@ def on_terminal(command: list[str], answer: str) -> str:
         try:
             while block := os.read(here, 4096):
                 said += block
-        except OSError:  # the other side has left
+        except OSError:  # the program has closed its terminal
             pass
         assert process.wait(60) == 0
     os.close(here)

@@ -22,7 +22,7 @@ HALVES = {"edge_agent": "edge-agent", "fleet_service": "fleet-service"}
 README_WORDS = 450
 FIRST_COMMAND_WITHIN = 120
 ROOM_LINES = 60
-CONTRACT = "schemas/README.md"  # reference for other languages, not the README of a room
+CONTRACT = "schemas/README.md"  # reference for other languages, not an overview of a folder
 
 
 @pytest.mark.parametrize("half", HALVES)

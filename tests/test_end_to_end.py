@@ -139,9 +139,9 @@ def test_three_braking_cars_tell_ice_within_six_hundredths(system: System) -> No
         cell["vehicles"]: float(str(cell["p_slippery"]))
         for cell in sorted(excited, key=_most_slippery_first)
     }
-    assert (
-        slippery[2] >= 0.75
-    )  # the least of the cells that two passed, and of those that all three did
+    # Smallest probability among the cells that two vehicles visited, and below among those of all
+    # three.
+    assert slippery[2] >= 0.75
     assert slippery[3] >= 0.85
 
 
@@ -149,13 +149,12 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     excited = slippery_cells(system)
     assert len(excited) > 5
     below = [float(str(cell["mu_lower"])) for cell in excited]
-    assert (
-        max(below) <= ICE + 0.02
-    )  # where they stop, the drift of the median takes the lower end along
+    # In the cells where the vehicles stop, the drift of the median also moves the lower bound.
+    assert max(below) <= ICE + 0.02
     assert sum(lower <= ICE for lower in below) >= 0.9 * len(below)
     for cell in excited:
         assert float(str(cell["mu_upper"])) >= ICE
-        assert float(str(cell["p_slippery"])) >= 0.5  # of a road that nobody knows it is .3
+        assert float(str(cell["p_slippery"])) >= 0.5  # an unknown road has .3
         assert float(str(cell["mu"])) < 0.4
     cells = system.query_cells("format=json;min_vehicles=2")
     rows = list_archived(system.folder)
@@ -166,9 +165,8 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     for cell in cells:
         found = again[cell["cell"], cell["sector"]]
         assert found["vehicles"] == cell["vehicles"]
-        assert found["mu"] == (
-            None if cell["mu"] is None else pytest.approx(cell["mu"], abs=0.01)
-        )  # it forgets
+        # The belief fades towards the prior.
+        assert found["mu"] == (None if cell["mu"] is None else pytest.approx(cell["mu"], abs=0.01))
 
 
 def _most_slippery_first(cell: dict[str, object]) -> float:

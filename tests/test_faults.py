@@ -131,10 +131,12 @@ def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_pa
 
 @pytest.mark.campaign
 def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
+    # Both histories once lost rows: an interrupted compaction had renamed files without syncing
+    # them.
     found_bugs = (
         1064,
         1938,
-    )  # files that an interrupted compaction renamed but did not sync, and then regarded as safe
+    )
     assert [
         problem for number in (*range(12), *found_bugs) for problem in run_log_history(number)
     ] == []
@@ -155,10 +157,12 @@ def find_violations(number: int, folder: Path) -> list[str]:
 
 @pytest.mark.campaign
 def test_no_history_on_a_forgetful_disk_loses_or_doubles_anything(tmp_path: Path) -> None:
+    # In history 45, the last rows of an erased vehicle were accepted again. In 84, rows of the
+    # previous month were fused twice.
     found_bugs = (
         45,
         84,
-    )  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
+    )
     assert [
         problem
         for number in (*range(3), *found_bugs)

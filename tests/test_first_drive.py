@@ -18,7 +18,7 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 
-@pytest.mark.timeout(900)  # the kernels of both halves may have to be compiled
+@pytest.mark.timeout(900)  # time to compile the kernels of agent and service
 def test_the_real_minute_comes_onto_the_map_under_three_names(
     minute: tuple[Cells, list[str]],
 ) -> None:

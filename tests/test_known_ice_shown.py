@@ -8,7 +8,7 @@ import pytest
 
 from tests.usability.known_ice import KnownIce, find_hidden
 
-pytestmark = pytest.mark.campaign  # two pages in a browser
+pytestmark = pytest.mark.campaign  # opens two pages in a browser
 
 
 def test_no_output_draws_known_ice_as_unknown(tmp_path: Path) -> None:

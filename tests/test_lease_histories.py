@@ -9,7 +9,7 @@ import pytest
 from tests.faults.lease import judge_seeds, judge_without_comparison, judge_without_expiry
 from tests.faults.lease_histories import Event, ServiceHistory, Verdict, judge_history
 
-# A renewal repeated the turn of one that had failed and took effect late.
+# In this history a renewal once repeated the turn of a failed renewal, which took effect late.
 FOUND_BUG = 32
 SEEDS = (*range(12), FOUND_BUG)
 

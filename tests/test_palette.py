@@ -16,7 +16,7 @@ from edge_agent.estimators import ESTIMATORS as REGISTERED
 from schemas.runtime.palette import ESTIMATORS, GRIP, GRIP_RANGE, SURFACES, TRUTH, shade
 from tests.colour_vision import SIGHTS, colour_difference, to_lab
 
-LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
+LEAST = 10.0  # CIEDE2000 difference; side by side, 2.3 is just noticeable
 
 
 def test_the_difference_is_the_published_one() -> None:

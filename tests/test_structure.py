@@ -15,9 +15,9 @@ import pytest
 from tests import structure
 from tests.structure import MOST_PARAMETERS, PACKAGES, ROOT, list_imports, parse
 
-LONGEST_FILE = 530  # lines; beyond that a file does more than one thing
+LONGEST_FILE = 530  # [lines] a longer file does more than one thing
 
-# Which packages of this project a package may import, beside itself.
+# Other packages of this project that each package may import.
 MAY_IMPORT = {
     "schemas": set(),
     "edge_agent": {"schemas"},
@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "deploy": {"schemas", "edge_agent", "fleet_service"},
 }
 
-# Which rooms of its own package a room may import: the way of the data, and no way back.
+# Other folders of its package that each folder may import: only in the direction of the data.
 ROOMS: dict[str, dict[str, set[str]]] = {
     "edge_agent": {
         "inputs": set(),
@@ -98,7 +98,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
     },
 }
 MOST_ARROWS = {"edge_agent": 29, "fleet_service": 34}
-JUDGED_BY = "lab"  # nothing that is judged imports what judges; commands start both
+# Evaluated code does not import the evaluating code in this folder; commands start both.
+JUDGED_BY = "lab"
 
 # The pure core takes time and randomness as arguments and does no input or output.
 PURE = (
@@ -119,8 +120,8 @@ PURE = (
         for name in ("alerts", "idle_roads", "map_state", "neighbour_fill", "view", "visitors")
     ),
 )
-# Beside it, what turns one thing in memory into another: tables and messages too, but no input or
-# output either.
+# Modules outside the pure core that convert data in memory. They may use tables and messages, but
+# no input or output.
 SANS_IO = (
     "edge_agent/publish/batching.py",
     "edge_agent/ahead/cell_decoder.py",
@@ -153,8 +154,8 @@ IMPURE = {
     "zenoh",
 }
 IMPURE_CALLS = {"open", "print", "input"}
-# What the pure core may use of the contract: numbers, names and errors, no messages, tables or
-# transport.
+# Modules of `schemas` that the pure core may use: numbers, names and errors, but no messages,
+# tables or transport.
 PURE_SCHEMAS = {
     "config",
     "errors",
@@ -172,7 +173,7 @@ PURE_SCHEMAS = {
     "wire",
 }
 
-# Top-level entries of the design, section 2; dot files and lock files may lie beside them.
+# Top-level entries as in section 2 of the design; dot files and lock files may be added.
 TOP_LEVEL = {
     "pyproject.toml",
     "README.md",
@@ -188,11 +189,11 @@ TOP_LEVEL = {
     "SECURITY.md",
     "CITATION.cff",
     "constraints.txt",
-    "gripmap.py",  # the one import name of the four packages
+    "gripmap.py",  # common import name of the four packages
 }
-# What Python's own tools leave behind in a working copy; never part of a commit.
+# Files that Python's tools leave in a working copy and that are never committed.
 LEFT_BEHIND = ("__pycache__", "gripmap.egg-info", "build", "dist")
-TRIED = "try"  # where the README's commands write; git ignores it
+TRIED = "try"  # folder into which the README's commands write; git ignores it
 
 
 def all_sources(*folders: str) -> list[Path]:
@@ -327,7 +328,7 @@ def test_a_name_of_a_class_stands_for_one_thing() -> None:
     assert not found, "\n".join(f"{name}: {', '.join(places)}" for name, places in found.items())
 
 
-# Numbers that stand in schemas/thresholds.py and nowhere else, however they are written.
+# Numbers that only schemas/thresholds.py may contain, in any notation.
 SHARED_NUMBER = re.compile(
     r"(?<![\w.])(9\.81|9\.80665|1\.64\d+|6_?378_?137(\.0)?|40_?075_?01\d[\d._]*"
     r"|111_?[123]\d\d(\.0)?|10\*\*9|1e9|1_?000_?000_?000"

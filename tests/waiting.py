@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import zenoh
 
-# a condition that holds is seen at once; this is for a machine with much else to do
+# [s] A condition that holds is seen at once. The limit only matters on a busy machine.
 PATIENCE_S = 100.0
 
 
@@ -30,5 +30,5 @@ def matched(asker: zenoh.Publisher | zenoh.Querier) -> None:
     """Wait until a publisher has a subscriber, or until a querier has a queryable (handler of its
     queries).
     """
-    # the stubs declare it as a bool
+    # The stubs declare `matching` as a bool.
     until(lambda: asker.matching_status.matching)  # type: ignore[attr-defined]

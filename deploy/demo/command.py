@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """
     try:
         from deploy.demo import processes, story
-        from fleet_service.page import server  # noqa: F401 the page's process needs it
+        from fleet_service.page import server  # noqa: F401 the page's process needs this package
     except ImportError as error:
         raise InputError(
             "demo", f"the package {error.name} is missing", install_command("demo,page")

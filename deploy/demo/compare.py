@@ -28,15 +28,18 @@ from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 from schemas.wire import Alert, Kind
 
 PASSES: Final = "demo.passes"
-ENOUGH: Final = 20  # passes that make a share worth reading
+ENOUGH: Final = 20  # least number of passes for a meaningful share
 DELAY: Final = "demo.alert.delay_passes"
 WALL: Final = "demo.wall_s"
 COVERAGE: Final = "demo.map.coverage90"
-WIDEST: Final = 0.99  # coverage of a map that is not too shy
-PASS_GAP_NS: Final = 10_000_000_000  # visits of a vehicle that are further apart are of two passes
+WIDEST: Final = 0.99  # target: highest coverage of the map's intervals; above it they are too wide
+# [ns] a longer time between two visits of a vehicle begins a new pass.
+PASS_GAP_NS: Final = 10_000_000_000
 NEVER: Final = int(np.iinfo(np.int64).max)
-BORDER_MU: Final = 0.1  # visits to one cell differ by less where a surface ends in it
-LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
+# Drop of mu in a cell that counts as new ice. Visits differ by less where a surface ends in the
+# cell.
+BORDER_MU: Final = 0.1
+LOST: Final = 0.98  # share of the available grip at which a wheel counts as sliding
 
 
 def demo_works(found: Sequence[Figure]) -> bool:
@@ -258,11 +261,12 @@ class LostGrip:
         number of passes.
         """
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
+        # Without passes there is no share.
         shares = [
             Figure(f"demo.lost_grip.{name}", _mean_or_nan(self.lost[rows]), "of passes")
             for name, rows in kinds
             if rows.any()
-        ]  # of no pass there is no share
+        ]
         counts = [int(rows.sum()) for _, rows in kinds]
         return shares + [
             Figure(f"{PASSES}.{name}", count, "over new ice", ENOUGH, "more")

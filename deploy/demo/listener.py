@@ -41,9 +41,8 @@ class Listener:
     def _on_alert(self, sample: zenoh.Sample) -> None:
         alert = wire.decode_alert(sample.payload.to_bytes())
         with self._lock:
-            if all(
-                alert != known for _, known in self.alerts
-            ):  # one that stands is put again and again
+            # The service publishes an active alert repeatedly.
+            if all(alert != known for _, known in self.alerts):
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:

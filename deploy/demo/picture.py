@@ -55,9 +55,8 @@ def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
     """Draw a mark for each pass over the new ice: a circle if the driver was warned, else a square;
     black if grip was lost, else white.
     """
-    shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[
-        len(drawn) :
-    ]  # in the axes of what is drawn
+    # Shapes of the passes, in the coordinates of the picture.
+    shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]
     x, y = shapes.mean(axis=1).T
     side = np.ptp(shapes[0, :, 0])
     for warned, name, mark, beside in (

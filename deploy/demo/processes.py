@@ -14,13 +14,14 @@ from pathlib import Path
 from deploy.demo import town
 from edge_agent.lab.simulation.scenarios import scenario_named
 
-START_S = 300.0  # the first start after a change compiles the kernels, on a busy machine
+START_S = 300.0  # time for the first start after a change, which compiles the kernels
 STOP_S = 10.0
 SCENARIO = "frost"
+# Settings for the page: a historical map after minutes, and the service's metrics.
 SHOWN = {
     "snapshot_s": 10.0,
     "metrics_port": 0,
-}  # for the page: a past within minutes, and what the service says
+}
 
 
 class DemoError(RuntimeError):
@@ -165,8 +166,9 @@ def start_fleet(
     options = {
         "--vehicles": vehicles,
         "--scenario": SCENARIO,
-        "--rough": 0.5,  # half of them as real cars are
-        # half of them, half of the rough ones too, with controllers and tyres that matter in winter
+        "--rough": 0.5,  # half of the vehicles have sensors and drivers like real cars
+        # Half of the vehicles, also half of the rough ones, have slip controllers and tyres for
+        # winter.
         "--winter": 0.5,
         "--warned": warned,
         "--duration": duration_s,

@@ -11,7 +11,7 @@ from schemas.runtime.installing import install_command
 
 SIZE: Final = {"width": 1280, "height": 800}
 WAIT_MS: Final = 20_000
-SETTLED_MS: Final = 2_000  # for what is still on its way after the first picture
+SETTLED_MS: Final = 2_000  # wait after the first picture for data that are still in transit
 
 
 def take_screenshot(address: str, path: Path) -> None:

@@ -80,7 +80,8 @@ def report_figures(
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
     image = ""
-    if find_spec("matplotlib") is not None:  # a picture beside the page, where it can be drawn
+    # A picture in addition to the page, if matplotlib is installed.
+    if find_spec("matplotlib") is not None:
         from deploy.demo import picture
 
         picture.draw_maps(comparison, folder / "map.png", grip)

@@ -28,8 +28,9 @@ from schemas.numeric import FloatArray
 NAME: Final = "Frostberg"
 ATTRIBUTION: Final = "Frostberg, a simulated town"
 ZOOMS: Final = range(11, 17)
-AROUND_M: Final = 900.0  # of the town's middle that the map covers
-BUFFER: Final = 256  # units beyond a tile's edge, so that no line ends at it
+AROUND_M: Final = 900.0  # [m] distance from the town's centre that the map covers
+# Tile units that lines continue beyond a tile's edge, so that none ends at the edge.
+BUFFER: Final = 256
 STREETS: Final = (
     "Kyrkogatan",
     "Brogatan",
@@ -40,9 +41,9 @@ STREETS: Final = (
     "Södra Ringvägen",
     "Västra Ringvägen",
 )
-CLEAR_M: Final = 9.0  # between a street's centre and a house
+CLEAR_M: Final = 9.0  # [m] distance from the centre of a street to a house
 HOUSES: Final = 420
-LAKE: Final = (-330.0, -330.0, 150.0, 105.0)  # x, y, radii [m]
+LAKE: Final = (-330.0, -330.0, 150.0, 105.0)  # x, y and two radii [m]
 PARKS: Final = ((-95.0, 70.0, 62.0, 36.0), (88.0, -72.0, 48.0, 40.0), (300.0, 190.0, 120.0, 80.0))
 _PER_TILE: Final = EXTENT
 

@@ -40,11 +40,11 @@ source_suffix = {".md": "markdown"}
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-suppress_warnings = [
-    "myst.xref_missing"
-]  # links to source files lead out of the site; a test checks that they exist
+# Links to source files lead out of the site; a test checks that the files exist.
+suppress_warnings = ["myst.xref_missing"]
 
-napoleon_use_ivar = True  # attributes that a docstring explains are fields already
+# Avoids duplicates: attributes in a docstring are also documented as fields.
+napoleon_use_ivar = True
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 

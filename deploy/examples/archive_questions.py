@@ -22,7 +22,7 @@ def main(archive: Path, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = f"{archive}/observations/*/*/*.parquet"
-    # A row whose `value` is false says only that mu is at least mu_utilised: it is left out.
+    # If `value` is false, mu is only known to be at least mu_utilised. Such rows are left out.
     sql = f"select cell, sector, median(mu) as mu from '{files}' where value group by all"
     by_duckdb = (
         duckdb.sql(sql)  # type: ignore[union-attr]

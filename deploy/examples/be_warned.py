@@ -14,7 +14,7 @@ import zenoh
 
 import edge_agent
 
-SPEED = 14.0  # [m/s]
+SPEED = 14.0  # [m/s] speed of the car
 
 
 def main(
@@ -37,9 +37,8 @@ def main(
         warned = ""
         until = time.monotonic() + within_s
         while not warned and time.monotonic() < until:
-            lookout.see(
-                [edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())]
-            )  # where the car is now
+            # Report the car's current position.
+            lookout.see([edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())])
             try:
                 warned = warnings.get(timeout=0.1)
             except queue.Empty:

@@ -18,9 +18,8 @@ def main(folder: Path) -> None:
     """Simulate a drive, estimate friction with two estimators, and plot the result."""
     folder.mkdir(parents=True, exist_ok=True)
     truth, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
-    pq.write_table(
-        truth, folder / "drive.parquet"
-    )  # your own log has the same columns, in SI units
+    # Your own log has the same columns, in SI units.
+    pq.write_table(truth, folder / "drive.parquet")
     log = edge_agent.read_log(folder / "drive.parquet")
     found = {name: edge_agent.estimate(log, vehicle, name) for name in ("ckf", "sr-ukf")}
     frame = found["ckf"].to_pandas()

@@ -23,8 +23,9 @@ from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-PRIOR = (0.11, 0.63, 1.14)  # 5 %, 50 %, 95 % of what is believed before anything is known
-PRIOR_SLIPPERY = 0.3  # P(mu < 0.4) by the same prior
+# 5 %, 50 % and 95 % quantiles of the friction before anything is measured.
+PRIOR = (0.11, 0.63, 1.14)
+PRIOR_SLIPPERY = 0.3  # P(mu < 0.4) of the same prior
 
 
 class AtLeast:
@@ -49,7 +50,7 @@ class AtLeast:
         """Return estimates for samples of N vehicles: times t (T, N) [s], and signals (T, N, 18) in
         the order of schemas.signals.CHANNELS, with NaN where a sensor value is missing.
         """
-        del closes, threads  # no visits, one thread
+        del closes, threads  # this estimator ignores the ends of visits and uses one thread
         values = np.zeros((*t.shape, ONE_FRICTION))
         pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY
         used = np.maximum.accumulate(np.concatenate([self._used[None], pull]), axis=0)[1:]

@@ -17,9 +17,8 @@ def main(endpoint: str) -> int:
     number.
     """
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
-    measured = cells[
-        cells["basis"] == "measured"
-    ]  # of the others only lower bounds are known: their mu is null
+    # For the other cells only a lower bound is known, and their mu is null.
+    measured = cells[cells["basis"] == "measured"]
     columns = [
         "latitude",
         "longitude",

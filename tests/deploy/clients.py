@@ -28,10 +28,10 @@ from tests.structure import ROOT
 
 SOURCES: Final = ROOT / "deploy" / "examples" / "clients"
 PROTO: Final = ROOT / "schemas" / "proto" / "gripmap.proto"
-PLACES: Final = {"c": (57.7, 11.97), "typescript": (57.8, 12.1)}  # of ice, one for each client
+PLACES: Final = {"c": (57.7, 11.97), "typescript": (57.8, 12.1)}  # place of the ice for each client
 PATIENCE_S: Final = 60
 SECOND: Final = 10**9
-# library for pkg-config, and the options that it needs
+# Library for pkg-config, and the compiler options that it needs.
 LIBRARIES: Final = {"zenohpico": ["-DZENOH_LINUX"], "zenohc": ["-DUSE_ZENOH_C"]}
 
 

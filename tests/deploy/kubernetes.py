@@ -43,9 +43,9 @@ from tests.waiting import until
 
 FOLDER: Final = ROOT / "deploy" / "kubernetes"
 OVERLAYS: Final = ("one-node", "secure", "three-regions")
-VERSION: Final = "1.32"  # of the schemas
+VERSION: Final = "1.32"  # Kubernetes version of the schemas
 BUCKET: Final = "gripmap-archive"
-START_S: Final = 300.0  # kernels may have to be compiled, on a machine that is busy
+START_S: Final = 300.0  # time for a start on a busy machine, which may have to compile kernels
 Manifest = dict[str, Any]
 
 
@@ -86,9 +86,8 @@ class Pod:
     template: Manifest
     claims: list[str]
     root: Path
-    ports: dict[int, int] = field(
-        default_factory=dict
-    )  # of its containers, by those that it has here
+    # Port on this machine for each port of the containers.
+    ports: dict[int, int] = field(default_factory=dict)
 
     @property
     def containers(self) -> list[Manifest]:
@@ -176,7 +175,7 @@ class Cluster:
                 }
             return json.dumps(fleet)
         for pod in self.pods:
-            if name in (f"{pod.name}.json", "router.json5"):  # its own settings
+            if name in (f"{pod.name}.json", "router.json5"):  # settings of this pod itself
                 for number, port in pod.ports.items():
                     text = text.replace(f'"metrics_port": {number}', f'"metrics_port": {port}')
                     text = text.replace(f"tcp/0.0.0.0:{number}", f"tcp/127.0.0.1:{port}")
@@ -255,7 +254,7 @@ class Cluster:
         kept = cache_root()
         image = self.root / "image-cache"
         image.mkdir()
-        if kept is not None:  # what an image has compiled
+        if kept is not None:  # an image contains compiled kernels
             (image / "gripmap").symlink_to(kept)
         secrets = {"bucket": _bucket_environment(bucket)} if bucket else {}
         started: list[tuple[Pod, Manifest, subprocess.Popen[bytes]]] = []
@@ -330,7 +329,8 @@ class Cluster:
         try:
             with urllib.request.urlopen(address, timeout=5.0) as page:
                 return str(page.read().decode())
-        except (OSError, http.client.HTTPException):  # refused, cut off, or late
+        except (OSError, http.client.HTTPException):
+            # Connection refused or closed, or no answer in time.
             return ""
 
 

@@ -21,21 +21,21 @@ from websockets.sync.server import ServerConnection, serve
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 
-HAS_SEQUENCE: Final = 0x80  # bit of the first byte: the number of a request follows
-# kinds of messages from the client
+HAS_SEQUENCE: Final = 0x80  # bit in the first byte: the number of a request follows
+# Types of messages from the client.
 DECLARE_SUBSCRIBER: Final = 2
 UNDECLARE_SUBSCRIBER: Final = 3
 PUT: Final = 14
 GET: Final = 18
 PING: Final = 25
-# kinds of messages to the client
+# Types of messages to the client.
 PONG: Final = 0
 OK: Final = 1
 SAMPLE: Final = 5
 REPLY: Final = 7
 LAST_REPLY: Final = 8
 ENCODINGS: Final = {0: "zenoh/bytes", 5: "application/json", 13: "application/protobuf"}
-PRIORITIES: Final = (  # from number 1
+PRIORITIES: Final = (  # priorities in the order of their numbers, from 1
     zenoh.Priority.REAL_TIME,
     zenoh.Priority.INTERACTIVE_HIGH,
     zenoh.Priority.INTERACTIVE_LOW,
@@ -44,7 +44,7 @@ PRIORITIES: Final = (  # from number 1
     zenoh.Priority.DATA_LOW,
     zenoh.Priority.BACKGROUND,
 )
-CUSTOM: Final = 0xFFFF  # encoding whose whole name is its schema
+CUSTOM: Final = 0xFFFF  # encoding of which the schema gives the whole name
 
 
 class SerializedReader:

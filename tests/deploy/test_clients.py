@@ -11,7 +11,7 @@ import pytest
 
 from tests.deploy.clients import PLACES, build_client, missing_tool, run_client, served_map
 
-# a service whose kernels are not compiled yet takes minutes to begin
+# A service that must compile its kernels takes minutes to start.
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(400)]
 
 

@@ -86,13 +86,13 @@ def test_a_cell_without_a_truth_is_left_out() -> None:
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
     road = make_visits(
         ("z", 1, 7, 0.9, 0.9),
-        ("z", 2, 8, 0.9, 0.9),  # it was dry
+        ("z", 2, 8, 0.9, 0.9),  # this road was not slippery
         ("a", 11, 7, 0.2, 0.9),
-        ("a", 12, 8, 0.2, 0.9),  # one pass of a over two cells
+        ("a", 12, 8, 0.2, 0.9),  # one pass of vehicle a over two cells
         ("b", 20, 7, 0.2, 0.9),
-        ("c", 21, 7, 0.2, 0.1),  # c rolled over it
+        ("c", 21, 7, 0.2, 0.1),  # vehicle c only rolled over it
         ("a", 40, 7, 0.2, 0.9),
-        ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
+        ("d", 60, 7, 0.2, 0.9),  # vehicle d comes after the alert
     )
     patch = compare.newly_slippery(road, 10 * S) & (road["mu"].to_numpy() < 0.4)
     assert compare.delay_passes(road, patch, [(50 * S, make_alert(7))], 10 * S) == 3.0

@@ -40,8 +40,8 @@ INSTANCES = {
     "gripmap-service": [""],
     "gripmap-agent@": ["car-001"],
 }
-MOST_EXPOSED = 3.0  # of systemd's ten
-START_S = 300.0  # the first start compiles the kernels, on a busy machine
+MOST_EXPOSED = 3.0  # highest accepted exposure level of systemd, whose scale ends at 10
+START_S = 300.0  # time for the first start on a busy machine, which compiles the kernels
 
 
 class Site:
@@ -57,7 +57,7 @@ class Site:
         for file in (DEPLOY / "secure").glob("*.json"):
             (root / "etc" / file.name).write_text(self.localize_paths(file.read_text()))
         alone = {"service": {"public_vehicles": 1}, "agent": {"trip_end_m": 0.0, "trip_end_s": 0.0}}
-        for name, changed in alone.items():  # one car, which would stay private for ever
+        for name, changed in alone.items():  # a single car would stay private for ever
             path = root / "etc" / f"{name}.json"
             path.write_text(json.dumps(json.loads(path.read_text()) | changed))
 
@@ -71,9 +71,8 @@ class Site:
         )
         for port, other in zip(PORTS, self._ports, strict=True):
             text = text.replace(port, other)
-        text = text.replace("${SOURCE}", "simulated").replace(
-            "$MORE", ""
-        )  # as EnvironmentFile would have it
+        # Values that EnvironmentFile would set.
+        text = text.replace("${SOURCE}", "simulated").replace("$MORE", "")
         return text.replace("/opt/gripmap/bin", str(BIN))
 
     def read_unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
@@ -329,7 +328,8 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
         json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()
     ]
     assert said[0]["event"] == "ready"
-    # on a busy machine the last of it may be cut off; then it says so
+    # On a busy machine the service may reach its time limit before the last step. Then it reports
+    # that.
     assert said[-1]["event"] in ("status", "shutdown incomplete")
     assert said[-1]["service"] == "shard-0"
 

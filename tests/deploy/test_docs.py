@@ -52,7 +52,8 @@ def test_every_page_stands_in_the_contents_of_the_site() -> None:
     listed = [(DOCS / f"{entry}.md").resolve() for entry in entries]
     generated = DOCS / "reference" / "generated"
     assert not [path for path in listed if not path.exists() and path.parent != generated]
-    decisions = set((DOCS / "decisions").glob("0*.md"))  # by a pattern in their own index
+    # The index of the decisions lists these by a pattern.
+    decisions = set((DOCS / "decisions").glob("0*.md"))
     written = {
         page for page in results.list_pages() if page.name == "README.md" or DOCS in page.parents
     }

@@ -109,7 +109,7 @@ def test_a_notebook_runs_from_its_first_cell_to_its_last(path: Path) -> None:
     assert len(cells) >= 4
     space: dict[str, Any] = {}
     for cell in cells:
-        exec(compile(cell, str(path), "exec"), space)  # as a kernel would
+        exec(compile(cell, str(path), "exec"), space)  # runs the cell as a Jupyter kernel does
     shown = [cell["execution_count"] for cell in notebook["cells"] if cell.get("outputs")]
     assert shown == sorted(shown), "outputs are of one run, from the first cell to the last"
 

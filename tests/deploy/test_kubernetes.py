@@ -26,7 +26,7 @@ from tests.waiting import until
 pytestmark = pytest.mark.skipif(
     shutil.which("kubectl") is None, reason="kubectl, which builds the manifests, is not here"
 )
-SECRETS = {  # the documented ones, by overlay
+SECRETS = {  # documented secrets of each overlay
     "one-node": set(),
     "secure": {"router-certs", "service-certs"},
     "three-regions": {"router-certs", "north-certs", "middle-certs", "south-certs", "bucket"},
@@ -141,11 +141,12 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
 ) -> None:
     made = Cluster(overlay, tmp_path)
     listed = load(tmp_path / "fleet.json", Enrolment) if overlay != "one-node" else None
+    # Configuration files as they are shipped.
     configs = {
         name: text
         for one in of_kind(made.objects, "ConfigMap")
         for name, text in one["data"].items()
-    }  # as they are shipped
+    }
     regions: dict[str, list[str]] = {}
     for pod in made.pods:
         component = pod.template["metadata"]["labels"]["app.kubernetes.io/component"]

@@ -16,6 +16,7 @@ from schemas import grid, wire
 from schemas.wire import Alert, Batch, Kind, StreamAck
 
 DATA = Path(__file__).parent / "data"
+# Columns that are newer than the stored bytes.
 LATER = (
     "used_longitudinal",
     "used_lateral",
@@ -23,7 +24,7 @@ LATER = (
     "tcs_active",
     "wiper",
     "p_slippery",
-)  # columns that came after the kept bytes
+)
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:
@@ -90,9 +91,8 @@ MESSAGES: dict[str, Callable[[], bytes]] = {
     "alert": lambda: wire.encode_alert(make_alert()),
 }
 
-if (
-    __name__ == "__main__"
-):  # only ever run to add a message: the kept bytes of a version do not change
+# Run this only to add a message. The stored bytes of a version never change.
+if __name__ == "__main__":
     for name, make in MESSAGES.items():
         path = DATA / f"{name}.v1.bin"
         if not path.exists():

@@ -58,7 +58,7 @@ def test_no_health_flag_stands_that_does_not_exist(text: str) -> None:
     assert named == {flag.name for flag in Health if flag}
 
 
-# Each as it must stand in both texts; the code's own number is in it.
+# Statements that both texts must contain. The numbers come from the code.
 SHARED = (
     f"{mugrid.BINS} equal bins on [{mugrid.LOWER}, {mugrid.UPPER:.2f}]",
     f"1/{mugrid.STEPS_PER_NAT} nat below the maximum",

@@ -18,9 +18,8 @@ longitudes = st.floats(-180.0, 180.0, exclude_max=True)
 @given(latitudes, longitudes)
 def test_a_position_lies_in_its_cell(latitude: float, longitude: float) -> None:
     west, south, east, north = (float(v) for v in grid.bounds(grid.cell_of(latitude, longitude)))
-    assert (
-        longitude - west + 1e-9
-    ) % 360.0 <= east - west + 2e-9  # a hair below 180° rounds to -180°
+    # A longitude just below 180° is rounded to -180°.
+    assert (longitude - west + 1e-9) % 360.0 <= east - west + 2e-9
     assert south - 1e-9 <= latitude <= north + 1e-9
 
 
@@ -52,7 +51,7 @@ def test_interleaving_is_undone() -> None:
 
 
 def test_quadkeys_are_those_of_the_published_example() -> None:
-    # tile (3, 5) at zoom 3 is "213": Bing Maps Tile System
+    # Example of Bing Maps Tile System: tile (3, 5) at zoom 3 is "213".
     assert grid.quadkey(int(grid.interleave(np.array(3), np.array(5))), 3) == "213"
 
 

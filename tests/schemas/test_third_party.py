@@ -14,9 +14,8 @@ import pytest
 
 from deploy.router import open_router
 
-pytestmark = pytest.mark.timeout(
-    400
-)  # a service whose kernels are not compiled yet takes minutes to begin
+# A service that must compile its kernels takes minutes to start.
+pytestmark = pytest.mark.timeout(400)
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +119,8 @@ def test_three_forms_of_an_answer_say_the_same(found: dict[str, Any]) -> None:
     (feature,) = found["geojson"]["features"]
     for other in (same, feature["properties"]):
         assert (other["cell"], other["observations"]) == (cell["cell"], cell["observations"])
-        assert other["mu"] == pytest.approx(
-            cell["mu"], abs=1e-3
-        )  # answers fade from one read to the next
+        # The stored knowledge fades slightly between two queries.
+        assert other["mu"] == pytest.approx(cell["mu"], abs=1e-3)
 
 
 def test_a_question_that_cannot_be_read_is_answered_with_the_fix(found: dict[str, Any]) -> None:

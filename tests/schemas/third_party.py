@@ -139,7 +139,7 @@ class Heard:
                 self.tiles.append((encoding, decode_tile(payload).num_rows))
             elif topic == "obs":
                 self.batches.append(wire.decode(payload, encoding, Kind.OBSERVATION))
-        # Zenoh would swallow it: it is what the test looks for
+        # Zenoh would swallow the exception, but the test must find it.
         except Exception as error:  # noqa: BLE001
             self.errors.append(f"{key}: {error!r}")
 

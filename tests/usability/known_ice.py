@@ -52,14 +52,14 @@ from tests.fleet_service.page.conftest import page_of
 from tests.structure import ROOT
 from tests.waiting import until
 
-# All roads freeze in the first night; the map is that of 04:00.
+# All roads freeze in the first night. The map is that of 04:00.
 WORLD: Final = synthetic.SyntheticFleet(
     rows=24_000, days=1, vehicles=40, roads=16, length=60, icy=1
 )
 NOW: Final = synthetic.START_NS + 4 * 3600 * NS
 KNOWN: Final = 0.5
-UNKNOWN_KIND: Final = 6  # classes of the page from here on are drawn as unknown
-Places: TypeAlias = Set[tuple[int, int]]  # cell and heading
+UNKNOWN_KIND: Final = 6  # the page draws classes from this number on as unknown
+Places: TypeAlias = Set[tuple[int, int]]  # cell and heading sector
 
 
 class KnownIce:
@@ -205,7 +205,7 @@ def _hidden_by_style(ice: KnownIce) -> Places:
         f"({rule.get('filter')})" for rule in root.iter("rule") if rule.get("key") != "unknown"
     ]
     rows = _exported_rows(ice, "map --snapshot", "geojson")
-    exported = pa.Table.from_pylist(rows)  # noqa: F841 duckdb reads it
+    exported = pa.Table.from_pylist(rows)  # noqa: F841 duckdb reads this variable
     filtered: Any = duckdb.sql(f"select cell, sector from exported where {' or '.join(coloured)}")
     shown = filtered.fetchall()
     return ice.places - {(int(cell), int(sector)) for cell, sector in shown}
@@ -242,7 +242,7 @@ def _hidden_on_picture(ice: KnownIce) -> Places:
     return ice.places - drawn
 
 
-def _first_corner(shape: Any) -> bytes:  # noqa: ANN401 any form of an array
+def _first_corner(shape: Any) -> bytes:  # noqa: ANN401 any kind of array
     return bytes(np.asarray(shape, np.float64)[0])
 
 
@@ -302,8 +302,8 @@ def _hidden_on_page(ice: KnownIce) -> dict[str, Places]:
     return found
 
 
-# The class in which each place (tile, cell within it, heading) is drawn; -1 if it is not drawn.
-# The cells are the script's own, because the page changes those of its state while it is open.
+# Class in which each place (tile, cell within it, heading) is drawn; -1 if it is not drawn. The
+# script uses cells of its own, because the open page changes those of its state.
 _KINDS: Final = """async ([places, least]) => {
   const { Cells } = await import("/static/cells.js"), found = {};
   const { setColours } = await import("/static/colours.js");

@@ -162,7 +162,7 @@ def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
                 code = main(words)
         except SystemExit as left:
             code = left.code if isinstance(left.code, int) else 1
-        except BaseException as error:  # noqa: BLE001 whatever it is, a user would see it
+        except BaseException as error:  # noqa: BLE001 a user would see any exception
             bad.append(f"{line}: {type(error).__name__}: {error}")
             continue
         if code == 0 or "Traceback" in said.getvalue():

@@ -42,22 +42,23 @@ LASTING: Final = (
     "fleet-service page",
 )
 LEFT_OUT: Final = ("pip install",)
-READY: Final = {"fleet-service run": "ready: "}  # output for which a user waits
+READY: Final = {"fleet-service run": "ready: "}  # output that a user waits for
 SETTLE_S: Final = 2.0  # wait for programs that print nothing when they are ready
 LONGEST_S: Final = 300.0
 
 
 README: Final = ROOT / "README.md"
-DEMO: Final = "make demo ARGS=--stay"  # of the README; `make` only installs and calls `gripmap`
+# Command in the README; `make` only installs the package and calls `gripmap`.
+DEMO: Final = "make demo ARGS=--stay"
 LIVE_PAGE: Final = "http://127.0.0.1:8080/"
-# the maps that a reader looks at after the last command of a page
+# Maps that a reader looks at after the last command of a page.
 MAPS: Final[dict[str, dict[str, str]]] = {
     "first-map.md": {"page after the first map": LIVE_PAGE},
     "first-drive.md": {"page after the first drive": LIVE_PAGE},
     "first-analysis.md": {"page at the end": LIVE_PAGE, "map of the analysis": "try/grip.html"},
 }
 LEAST_CELLS: Final = 100
-LEAST_PX: Final = 200  # extent of what is drawn on the first picture, in one direction
+LEAST_PX: Final = 200  # [px] least extent of the drawn map in one direction in the first picture
 
 
 def list_blocks(text: str) -> list[tuple[str, str]]:
@@ -109,7 +110,7 @@ def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
             if command is None:
                 continue
             if command.startswith(LASTING):
-                if "certs/" in command:  # the second router wants the port of the first
+                if "certs/" in command:  # the second router needs the port of the first
                     for words, process in staying:
                         _end_process(words, process, failed)
                     staying.clear()
@@ -165,7 +166,7 @@ def look_at_map(place: str | Path) -> str:
         return "; ".join(seen.errors)
 
 
-# Width and height of the part of the map that has colours of classes or hatching.
+# Width and height of the part of the map that has class colours or hatching.
 _EXTENT: Final = """() => {
   const map = document.querySelector("canvas"), ratio = map.width / map.clientWidth;
   const { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
@@ -216,7 +217,7 @@ def _run_to_end(line: list[str], folder: Path, log: Path, environment: dict[str,
                 timeout=LONGEST_S,
                 env=environment,
             )
-        except subprocess.TimeoutExpired:  # the others are tried all the same
+        except subprocess.TimeoutExpired:  # the remaining commands are tried all the same
             return f"did not end within {LONGEST_S:g} s"
     return done.returncode
 

@@ -33,7 +33,7 @@ COMMANDS: Final = (
     ["fleet-service", "analyze", "worst", "--archive", "{a}", "--out", "{d}/w.html"],
     ["fleet-service", "export", "map", "--archive", "{a}", "--out", "{d}/m.parquet"],
 )
-# commands that run until a signal, and the output that ends the measured wait
+# Commands that run until a signal, and the output that ends the measured wait.
 LASTING: Final = (
     (
         ["fleet-service", "run", "--config", "{d}/lasting.json", "--archive", "{d}/lasting"],
@@ -66,7 +66,7 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
             waiting, _, _ = select.select([here], [], [], 0.1)
             try:
                 heard = os.read(here, 65536) if waiting else b""
-            except OSError:  # it has left
+            except OSError:  # the program has ended
                 break
             if heard:
                 worst = max(worst, time.monotonic() - last)
@@ -76,9 +76,8 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
                 process.send_signal(signal.SIGINT)
                 break
         whole = max(worst, time.monotonic() - last)
-        while (
-            ready is not None and process.poll() is None
-        ):  # what it says in leaving is taken, that it may leave
+        # Read the remaining output, because a full pipe would prevent the program from ending.
+        while ready is not None and process.poll() is None:
             if select.select([here], [], [], 0.1)[0]:
                 with suppress(OSError):
                     os.read(here, 65536)

@@ -18,7 +18,7 @@ from schemas.signals import CHANNELS
 from tests.benchmarks.inputs.planted import PLANTED, Recorded, drives
 
 TONNES: Final = "mass in tonnes"
-WRONG: Final = (  # faults that once gave false ice or a wrong place unnoticed, and three more
+WRONG: Final = (  # faults that once caused undetected false ice or wrong positions, and three more
     "steering in deg",
     "steering wheel",
     "both in g",

@@ -38,9 +38,9 @@ def run_outer(folder: Path, factor: str, before: str = "") -> str:
         (folder / "schemas").symlink_to(source, target_is_directory=True)
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(folder)}
-    environment |= {
-        "PYTHONDONTWRITEBYTECODE": "1"
-    }  # Python's own cache takes two texts of one second and length for one
+    # Python's own cache cannot distinguish two sources of the same length that were written in the
+    # same second.
+    environment |= {"PYTHONDONTWRITEBYTECODE": "1"}
     words = [sys.executable, "-c", f"{before}from kernels.outer import outer; print(outer(1.0))"]
     return subprocess.run(
         words, env=environment, cwd=folder, capture_output=True, text=True, check=True

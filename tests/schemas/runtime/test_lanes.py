@@ -29,7 +29,8 @@ from schemas.runtime.lanes import (
 from schemas.runtime.records import LANES, LaneArray, records
 
 ROWS = 500
-EXACT = 5e-16  # relative error of exponential, inverse and root, and error of logarithm
+# Largest relative error of exponential, inverse and root, and largest error of the logarithm.
+EXACT = 5e-16
 
 
 class LaneRecord:

@@ -49,7 +49,8 @@ def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFi
         of_router = {metric.name: metric.values for metric in router_metrics(router)}
         assert of_router["router_sessions"] == {"client": 1.0, "router": 0.0, "peer": 0.0}
         assert of_router["router_links"]["tcp"] == 1.0
-        until(lambda: len(_link_messages(caplog)) >= 3)  # logged after the state has changed
+        # The message is logged after the state has changed.
+        until(lambda: len(_link_messages(caplog)) >= 3)
         watch.close()
     router.close()
     assert changes[-2:] == [False, True]

@@ -38,7 +38,7 @@ def test_progress_is_shown_while_the_drawing_library_still_loads(
             progress_messages.set_status("compiling step")
             until(lambda: "compiling step … 0 s\r" in terminal.getvalue())
             loaded.set()
-            until(lambda: "0:00:00" in terminal.getvalue())  # the line that turns
+            until(lambda: "0:00:00" in terminal.getvalue())  # now the animated line is shown
     finally:
         loaded.set()
         progress_messages.enable_messages(quiet=True)

@@ -48,7 +48,8 @@ def test_waiting_for_a_router_is_reported_once_without_build_paths(
         return configured(settings, name)
 
     monkeypatch.setattr(zenoh_session, "configuration", count_tries)
-    with socket.create_server(("127.0.0.1", 0)) as taken:  # a port at which nobody listens any more
+    # A port on which nothing listens after this block.
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     with caplog.at_level(logging.WARNING):
         assert zenoh_session.open_session(ZenohSettings(connect=[endpoint]), stop) is None
