@@ -18,7 +18,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import SURFACES
 
-PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
+PRIOR_WIDTH: Final = 0.9 * 1.15  # width of the 90 % interval of the uniform prior
 
 
 class EstimatorBar(NamedTuple):

@@ -19,9 +19,11 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
-# accelerometers are fixed to the body, and feel gravity when it rolls and pitches
+# Sensors of ordinary drives. Their accelerometers are fixed to the body and measure a part of
+# gravity when the body rolls and pitches.
 USUAL = "mems-leak"
-# steering is held over a sample of the simulator; a slow sensor must not see it as steps
+# [Hz] The simulator holds the steering constant during a sample. At this rate, a slow sensor does
+# not record steps.
 FINE_HZ = 500.0
 
 

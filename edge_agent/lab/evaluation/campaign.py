@@ -28,9 +28,12 @@ from schemas.numeric import FloatArray
 
 DEFAULT = "aco-fckf"
 QUICK_ESTIMATORS = (DEFAULT, "paper-aco-fckf")
-HARD = ("split", "abs", "spin")  # unlike roads and wheels past the peak have bars of their own
+# Drives with separate targets, because the friction differs between wheels or wheels exceed the
+# slip of the largest force.
+HARD = ("split", "abs", "spin")
 QUICK_SCENARIOS = ("004.dlc", "003.split", "default.jump.accel")
-# drives per manoeuvre under each sensor fault: three manoeuvres, thirteen faults, all estimators
+# Drives per manoeuvre and sensor fault. There are three manoeuvres and thirteen faults, and all
+# estimators are evaluated.
 FAULTY_SEEDS = 4
 
 
@@ -53,26 +56,21 @@ class Results:
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
-    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(
-        default_factory=dict
-    )  # paper 004's experiments
-    foreign: dict[str, FloatArray] = field(
-        default_factory=dict
-    )  # coverage of the default, by kind of tyre
-    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(
-        default_factory=dict
-    )  # by (fault, estimator)
-    world: dict[str, dict[str, float]] = field(
-        default_factory=dict
-    )  # the rough one: by estimator and "baseline"
-    oracle: dict[str, FloatArray] = field(
-        default_factory=dict
-    )  # errors that an oracle makes, by figure
-    worth: worth.Scores = field(default_factory=dict)  # of fuzzy inference and the ants
-    rough: RealWorldResults | None = None  # its first town, kept for plots
-    ranks: dict[str, list[FloatArray]] = field(
-        default_factory=dict
-    )  # of the truth in the posterior, by estimator
+    # experiments of paper 004
+    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
+    # coverage of the default estimator, by kind of tyre
+    foreign: dict[str, FloatArray] = field(default_factory=dict)
+    # by (fault, estimator)
+    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
+    # rough world (inaccurate cars): by estimator and "baseline"
+    world: dict[str, dict[str, float]] = field(default_factory=dict)
+    # errors of an oracle (ideal observer), by figure
+    oracle: dict[str, FloatArray] = field(default_factory=dict)
+    # benefit of fuzzy inference and the ant colony
+    worth: worth.Scores = field(default_factory=dict)
+    rough: RealWorldResults | None = None  # first town of the rough world, kept for plots
+    # ranks of the true friction in the posterior, by estimator
+    ranks: dict[str, list[FloatArray]] = field(default_factory=dict)
     seeds: int = 0
     drives: dict[tuple[str, str], PlottedDrive] = field(default_factory=dict)
 

@@ -52,11 +52,11 @@ from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU, SURFACE
 
 SLIDING: Final = 2.6
 SLIDE_S: Final = 0.1
-BRIDGED_S: Final = 0.1  # gaps in a slide that do not end it: anti-lock control makes them
+BRIDGED_S: Final = 0.1  # [s] shorter gaps, which anti-lock control causes, do not end a slide
 TOLD_SLIDE_S: Final = 0.2
 TOLD_MU: Final = 0.36
 TOLD_AFTER_S: Final = 0.1
-AFTER_SLIDE_S: Final = 0.5  # a contradiction so soon after a slide is one of the slide
+AFTER_SLIDE_S: Final = 0.5  # [s] a contradiction this soon after a slide belongs to the slide
 VALUE_NATS: Final = 1.0
 FAVOURED_NATS: Final = 3.0
 MOVES: Final = 0.1
@@ -301,8 +301,8 @@ def _judge_contradictions(
     low = drive.mu[:, n] <= SNOW_MU
     flagged = (drive.health[:, n] & int(Health.CONTRADICTION)) > 0
     onset = np.flatnonzero(flagged[1:] & ~flagged[:-1]) + 1
-    # a slide may end on dry road: what counts is that it was on slippery road within the last
-    # moment
+    # A slide may end on dry road. It counts as one on slippery road if the friction was low within
+    # the last AFTER_SLIDE_S.
     was_low = recent_maximum(low[:, None], AFTER_SLIDE_S)[:, 0].astype(bool)
     in_slide = extended[onset]
     tally.add("contradictions.slide", np.array([float((in_slide & was_low[onset]).sum())]))

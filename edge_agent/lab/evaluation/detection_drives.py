@@ -29,9 +29,9 @@ from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
 CHUNK_S: Final = 20.0
-BELIEF_SAMPLES: Final = 5  # between two looks at the posterior
+BELIEF_SAMPLES: Final = 5  # samples between two readings of the posterior
 STANDING_M_S: Final = 1.0
-APPEARED: Final = 0.1  # least fall of the mean friction when a patch appears
+APPEARED: Final = 0.1  # least decrease of the mean friction when a patch appears
 
 BankMaker: TypeAlias = Callable[[list[Vehicle]], EstimatorBank]
 Samples: TypeAlias = NDArray[np.float32]

@@ -15,14 +15,17 @@ from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import DriveSet
 from schemas.numeric import BoolArray, FloatArray
 
-LAST_S = 1.0  # "the last second"
-NEAR = 0.1  # of friction: arrived, or wrong
-HOLD_S = 0.2  # a wrong interval that lasts so long is a false change
+LAST_S = 1.0  # [s] length of "the last second"
+# Difference in friction. A smaller error counts as converged; the bounds of an interval that misses
+# the truth by more are wrong.
+NEAR = 0.1
+HOLD_S = 0.2  # [s] a wrong interval that lasts this long is a false change
 SLOWEST_M_S = 1.0
+# Number of independent squares in each measure. Every estimator uses at least three measurements.
 COMPONENTS = {
     "nees": 2,
     "nis": 3,
-}  # independent squares in each; no estimator measures fewer than three rows
+}
 
 
 def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:

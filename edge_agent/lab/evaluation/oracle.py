@@ -43,14 +43,14 @@ from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
 
 STRETCH_S: Final = 0.5
-ROLL_LEAK_STD: Final = 0.012  # of .07: the suspensions of a fleet differ by 17 %
-PITCH_LEAK_STD: Final = 0.005  # of .03
-ROLL_LAG_STD: Final = 0.03  # [s] of .1
-START_STD: Final = 0.05  # [m/s] of the speed at the start, as the wheels know it
-LIKELY: Final = np.linspace(0.62, UPPER, 59)  # frictions that are weighed; .6 g leaves none below
-SHAPES: Final = tuple(
-    product(np.linspace(1.38, 1.62, 5), np.linspace(-0.5, 0.1, 5))
-)  # as `one_of_a_fleet` draws them
+ROLL_LEAK_STD: Final = 0.012  # mean 0.07; the suspensions of a fleet differ by 17 %
+PITCH_LEAK_STD: Final = 0.005  # mean 0.03
+ROLL_LAG_STD: Final = 0.03  # [s] mean 0.1 s
+START_STD: Final = 0.05  # [m/s] uncertainty of the initial speed from the wheels
+# frictions considered; a drive at 0.6 g excludes lower ones
+LIKELY: Final = np.linspace(0.62, UPPER, 59)
+# Shape and curvature of the tyre curves as drawn by `one_of_a_fleet`.
+SHAPES: Final = tuple(product(np.linspace(1.38, 1.62, 5), np.linspace(-0.5, 0.1, 5)))
 THETA: Final = np.linspace(0.0, 4.0, 2001)
 LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
@@ -63,7 +63,7 @@ class OracleSignals(NamedTuple):
     batch: DriveSet
     rolled: FloatArray
     pitched: FloatArray
-    felt: FloatArray  # (T, 2), by accelerometers without any other error
+    felt: FloatArray  # (T, 2), from accelerometers without other errors
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:

@@ -27,7 +27,7 @@ from edge_agent.lab.simulation import PRESETS
 from edge_agent.lab.simulation.white import add_white, scheduled_variance
 from schemas.numeric import FloatArray
 
-CONSTANT = 0.05  # variance of all three noises [SI]
+CONSTANT = 0.05  # variance of the noise of each of the three measurements [SI]
 EXPERIMENTS = {
     "constant": MATCHED,
     "variable": MATCHED,
@@ -36,7 +36,7 @@ EXPERIMENTS = {
     "van": PRESETS["van"],
     "van.variable": PRESETS["van"],
 }
-STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
+STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R unchanged
 
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 SCENARIOS: Final = {**PAPERS, **OTHERS, **VEHICLES}
-DPI: Final = 110  # of PNG: 1 000 points wide; SVG and PDF are for print
-NEARLY_ALIKE: Final = 0.02  # of mu: one road
+DPI: Final = 110  # resolution of PNG files: 1000 points wide; SVG and PDF are for print
+NEARLY_ALIKE: Final = 0.02  # a smaller range of friction is shown as one value
 FORMS: Final = ("png", "svg", "pdf")
 
 

@@ -15,8 +15,10 @@ class Printed(NamedTuple):
     paper: str
     what: str
     value: str
-    same: str  # with the paper's conditions
-    real: str  # with ordinary sensors and a vehicle known to a few per cent; "ESTIMATOR" is put in
+    same: str  # name of the result with the paper's conditions
+    # Name of the result with ordinary sensors and a vehicle file with errors of a few per cent. The
+    # estimator replaces "ESTIMATOR" in the name.
+    real: str
 
 
 SPEEDS: Final = (("v_x [m/s]", "vx"), ("v_y [m/s]", "vy"))
@@ -27,7 +29,7 @@ PRINTED_004: Final = {
     ("variable", "MAE"): (".044", ".0171", ".0018", ".010"),
     ("variable", "RMSE"): (".0500", ".0277", ".0028", ".0240"),
 }
-# the same paper's filter before the ant colony, constant and variable noise
+# Mean absolute errors of the same filter before its tuning by the ant colony, by kind of noise.
 UNTUNED_004: Final = {
     "constant": (".1286", ".0684", ".0081", ".0188"),
     "variable": (".1321", ".0514", ".0094", ".0141"),

@@ -44,14 +44,14 @@ from schemas.thresholds import CALLED_SHARE, GRAVITY
 from schemas.vehicle import Vehicle, load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
-BEGIN_S: Final = 3.0  # of a log that are left out
+BEGIN_S: Final = 3.0  # [s] beginning of a log that is not evaluated
 MOVING_M_S: Final = 1.5
-FAST_M_S: Final = 3.0  # from which on sideslip is judged
+FAST_M_S: Final = 3.0  # [m/s] least speed at which sideslip is evaluated
 INFORMATIVE: Final = 0.6
-GRIPS: Final = 0.6  # friction from which on a road is not slippery
-CERTAIN: Final = 0.9  # share of `mu_known` that a surface had at least
-MARGIN: Final = 0.03  # noise of the grip in use
-USED_SHARE: Final = 99.5  # percentile of the grip in use that a surface surely had
+GRIPS: Final = 0.6  # least friction of a road that is not slippery
+CERTAIN: Final = 0.9  # share of `mu_known` that the surface had at least
+MARGIN: Final = 0.03  # tolerance for the noise of the grip in use
+USED_SHARE: Final = 99.5  # percentile of the grip in use that the surface certainly had
 SMOOTH_S: Final = 0.25
 TRUTH: Final = ("vx", "vy", "mu")
 HEAD: Final = (

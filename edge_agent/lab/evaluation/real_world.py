@@ -52,9 +52,10 @@ from schemas.thresholds import (
 
 LOST_M_S: Final = 1.0
 FALSE_GRIP: Final = 0.05
-MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
-PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))  # 90 % of it
-NOISE: Final = 0.03  # of the grip in use, which is smoothed over SMOOTH_S
+MISS: Final = 20.0  # 2/α in the interval score of Gneiting and Raftery (2007) for 90 % intervals
+# 90 % interval of the uniform prior
+PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))
+NOISE: Final = 0.03  # noise of the grip in use, which is smoothed over SMOOTH_S
 SURE_GRIP: Final = 0.6
 SETTLED_S: Final = 3.0
 SMOOTH_S: Final = 0.2

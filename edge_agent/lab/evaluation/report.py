@@ -87,11 +87,12 @@ are in `edge_agent/lab/evaluation/detection.py`. ± is the standard error over t
 ordinary ABS and ESC logic on the same signals (`slip_flag.py`). `oracle`: an observer that knows
 motion and forces (`slide_oracle.py`). `roc`: the estimator's belief at other thresholds. If ice
 appears under a car that stands, it is counted as `stood` and nowhere else."""
+# Estimators of the papers that estimate friction.
 FRICTION: Final = (
     "paper-aco-fckf",
     "federated-ckf",
     "sr-ukf",
-)  # papers' estimators that estimate friction
+)
 SHOWN_LEVELS: Final = LEVELS[::2]
 
 

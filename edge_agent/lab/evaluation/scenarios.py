@@ -17,7 +17,7 @@ from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched
 
 SLOPES: Final = ("longitudinal_stiffness", "cornering_stiffness")
 SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
-# papers 000 and 001, table 2
+# Papers 000 and 001, table 2.
 LIGHT: Final = TrueVehicle(
     car(
         "light",
@@ -29,7 +29,7 @@ LIGHT: Final = TrueVehicle(
     ),
     power=60e3,
 )
-# paper 002, table 1; the height of the centre of gravity is not given
+# Paper 002, table 1. The paper does not give the height of the centre of gravity.
 SMALL: Final = TrueVehicle(
     car(
         "in-wheel",
@@ -41,12 +41,11 @@ SMALL: Final = TrueVehicle(
     ),
     power=60e3,
 )
-STRONG: Final = replace(SEDAN, power=400e3)  # .6 g at 25 m/s
-LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control: wheels spin
+STRONG: Final = replace(SEDAN, power=400e3)  # reaches 0.6 g at 25 m/s
+LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control, so that wheels spin
 
-MATCHED: Final = matched_to_papers(
-    SEDAN
-)  # the vehicle of 004, whose tyres are not given, as its model has it
+# Vehicle of paper 004 with the vehicle model of its filter. The paper does not give its tyres.
+MATCHED: Final = matched_to_papers(SEDAN)
 
 
 def steered_behind(speed: float) -> TrueVehicle:
@@ -64,7 +63,7 @@ def steered_behind(speed: float) -> TrueVehicle:
     return replace(LIGHT, rear_steer=(pull * a - b) / (pull * b + a))
 
 
-# as other cars are: another drive, softer tyres, another load
+# Vehicles that differ from the sedan: other driven axle, softer tyres, other load.
 HATCHBACK: Final = PRESETS["small"]
 VAN: Final = replace(
     PRESETS["van"],
@@ -160,7 +159,7 @@ OTHERS: Final = {
     "default.spin": DriveSpec("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),
 }
 
-# the default on other vehicles: shown, without bars
+# Drives of the default estimator on other vehicles; they are reported without targets.
 VEHICLES: Final = {
     f"default.{name}.{drive}": DriveSpec(manoeuvre, vehicle, friction, about=f"{about}, {name}")
     for name, vehicle in (("hatchback", HATCHBACK), ("van", VAN), ("loaded", LOADED))
@@ -174,8 +173,8 @@ VEHICLES: Final = {
     )
 }
 
-# tyres that are not of the estimators' family or shape; "all scenarios" are driven with each in
-# turn
+# Tyres whose model or shape differs from the estimators' tyre model. All scenarios are driven
+# with each of them.
 FOREIGN: Final = {
     "brush": {"curve": "brush"},
     "sharp": {"shape": 1.65, "curvature": -0.6},

@@ -29,17 +29,19 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 FORCE_STD: Final = 0.02
-SPEED_STD: Final = 0.03  # [m/s] of a wheel, as a filter takes it: noise, steps and unlike radii
-# stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
+# [m/s] standard deviation of a wheel's speed as assumed by a filter: noise, resolution and unequal
+# radii.
+SPEED_STD: Final = 0.03
+# Stiffness per load of an ordinary tyre; it converts noise of the wheel speeds to noise of q.
 STIFF: Final = 20.0
 SLOWEST: Final = 0.5  # [m/s]
 EACH: Final = 4
 TYRES: Final = 128
 LEAST_SLOPE: Final = 0.1
-LEAST_NATS: Final = 100.0  # what is less likely than that is as good as excluded
-SHAPE: Final = (1.5, 0.1)  # mean and spread of c, as `one_of_a_fleet` draws it
+LEAST_NATS: Final = 100.0  # largest difference of log-likelihood that is distinguished
+SHAPE: Final = (1.5, 0.1)  # mean and standard deviation of c, as drawn by `one_of_a_fleet`
 CURVATURE: Final = (-0.2, 0.25)
-STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
+STIFFNESS_STD: Final = 0.12  # standard deviation of ln k, the same as that of the vehicle file
 
 
 def tyres_drawn() -> FloatArray:

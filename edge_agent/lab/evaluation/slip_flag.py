@@ -29,19 +29,20 @@ from schemas.vehicle import Vehicle
 SLIP_FRONT: Final = 0.08
 SLIP_REAR: Final = 0.048
 SLIP_S: Final = 0.12
-GAP_S: Final = 0.10  # ABS makes gaps in a slip; shorter ones do not end it
+GAP_S: Final = 0.10  # [s] shorter gaps, which anti-lock control causes, do not end a flag
 YAW_OFF: Final = 0.1  # [rad/s]
 YAW_SHARE: Final = 0.12
 YAW_S: Final = 0.15
 FREE: Final = 1.0  # [m/s^2]
 AGREE: Final = 0.04
 AGREE_S: Final = 0.3
-# share of the speed beyond which wheels that agree are not believed: all of them may slide
+# Relative difference from the reference speed beyond which equal wheel speeds are ignored, because
+# all wheels may slide.
 FAR: Final = 0.15
 SLOWEST: Final = 1.5  # [m/s]
 SMOOTH_S: Final = 0.1
 BRAKING: Final = 0.6  # [m/s^2]
-FLAGGED_MU: Final = 0.35  # below it the flag calls the road slippery
+FLAGGED_MU: Final = 0.35  # a lower flagged friction reports the road as slippery
 
 
 def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:

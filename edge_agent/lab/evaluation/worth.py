@@ -48,7 +48,8 @@ TOWN_S = 60.0
 DRIVE_S = 8.0
 SEEDS = 15
 RATE_HZ: Final = 100.0
-SETTLED_S: Final = 1.0  # before, the score is that of the prior
+# [s] evaluation begins after this time; before, the prior dominates the score
+SETTLED_S: Final = 1.0
 RATIOS: Final = {
     "fuzzy.worth": ("fuzzy", "sets_off"),
     "fuzzy.worth.all_rules": ("fuzzy", "none"),
@@ -67,7 +68,8 @@ MANOEUVRES: Final = (
     "j-turn",
 )
 
-Scores = dict[str, dict[str, FloatArray]]  # by way, then by surface and "all": one number per seed
+# by filter variant, then by surface and "all": one number per seed
+Scores = dict[str, dict[str, FloatArray]]
 
 
 def campaign(

@@ -11,7 +11,7 @@ from edge_agent.inputs.block import Block, to_utc_ns
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
 
-BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
+BLOCK_S = 0.1  # [s] duration of a block: short compared with the second that a batch waits
 
 
 def blocks(
@@ -24,7 +24,8 @@ def blocks(
     start_ns = 0
     while True:
         t, signals = fleet.step(steps)
-        start_ns = start_ns or time.time_ns()  # after the first step, which may have to compile
+        # Take the time after the first step, which may have to compile its code.
+        start_ns = start_ns or time.time_ns()
         block = Block(t, to_utc_ns(t, start_ns), signals)
         if recorder is not None:
             truth = fleet.truth

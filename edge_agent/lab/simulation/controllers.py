@@ -26,35 +26,39 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-# slip control lets go of the rear wheels at this share of the limit, so that they still guide
+# Slip limit of the rear wheels as a share of that of the front wheels. It is smaller, so that the
+# rear wheels keep their lateral force.
 REAR_LIMIT: Final = 0.5
-# a controller counts as active so long after it acted: its lamp blinks no faster
-SHOWN_S: Final = 0.25
-ABS_SLOWEST: Final = 1.5  # [m/s] below it brakes may lock the wheels
-DUMP: Final = 22.0  # [1/s] rates of ln of the brake torque, at USUAL_HZ
+SHOWN_S: Final = 0.25  # [s] time for which a controller counts as active after it acted
+ABS_SLOWEST: Final = 1.5  # [m/s] at lower speeds brakes may lock the wheels
+# Rates of ln(brake torque) [1/s] at USUAL_HZ: reduction, fast increase, slow increase.
+DUMP: Final = 22.0
 BUILD_FAST: Final = 35.0
 BUILD: Final = 2.8
 NEARLY: Final = 0.88
 USUAL_HZ: Final = 8.0
-LEAST_SHARE: Final = 0.02  # of the brake torque that was asked for
-TCS_SLOWEST: Final = 2.5  # [m/s] slip of slower cars is taken of this speed
-# [1/s] of the share of the engine's torque that is taken away, and given back
+LEAST_SHARE: Final = 0.02  # least brake torque under ABS, as a share of the demanded torque
+TCS_SLOWEST: Final = 2.5  # [m/s] least speed in the denominator of the drive slip
+# Rates [1/s] at which the share of engine torque that is cut grows and decreases.
 CUT_RATE: Final = 5.0
 GIVE_RATE: Final = 0.8
 MOST_CUT: Final = 0.95
-MUCH: Final = 2.0  # times the limit of traction control: the brake helps
-TCS_BRAKE: Final = 0.12  # most brake torque of traction control, over weight times radius
-ESC_SLOWEST: Final = 4.0  # [m/s]
-ESC_S: Final = 0.06  # so long the yaw rate must be off
-YAW_OFF: Final = 0.10  # [rad/s]
-FOLLOWS_S: Final = 0.12  # in which a car follows its steering
+MUCH: Final = 2.0  # multiple of the slip limit of traction control at which it also brakes
+# Largest brake torque of traction control, divided by weight times wheel radius.
+TCS_BRAKE: Final = 0.12
+ESC_SLOWEST: Final = 4.0  # [m/s] ESC does not act at lower speeds
+ESC_S: Final = 0.06  # [s] time for which the yaw rate must differ before ESC acts
+YAW_OFF: Final = 0.10  # [rad/s] tolerated difference of the yaw rate
+FOLLOWS_S: Final = 0.12  # [s] time constant with which a car follows its steering
 YAW_SHARE: Final = 0.12
-CHARACTERISTIC: Final = 45.0  # [m/s] speed at which steering has half of its effect
-MOST_LATERAL: Final = 9.0  # [m/s^2] that steering may ask for
+CHARACTERISTIC: Final = 45.0  # [m/s] speed at which understeer halves the effect of steering
+MOST_LATERAL: Final = 9.0  # [m/s^2] largest lateral acceleration expected from steering
 ESC_GAIN: Final = 3.0  # brake torque of ESC over weight times radius, per rad/s
-ESC_BRAKE: Final = 0.15  # its largest value
-ESC_REAR: Final = 0.04  # of a rear wheel: more would take what guides the car
-HELD_RATE: Final = 2.0  # of these, per second
+ESC_BRAKE: Final = 0.15  # largest brake torque of ESC over weight times radius, front wheel
+# The same for a rear wheel. A larger torque would reduce the lateral force that stabilises the car.
+ESC_REAR: Final = 0.04
+# Rate of change of the brake torques of traction control and ESC, over weight times radius [1/s].
+HELD_RATE: Final = 2.0
 
 
 @compiled

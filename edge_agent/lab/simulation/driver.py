@@ -37,68 +37,74 @@ KeyArray: TypeAlias = NDArray[np.uint64]
 class Driver(IntEnum):
     """Index of a state variable of one simulated driver (an array of float64)."""
 
-    STEER = 0  # [rad] mean road-wheel angle, as the arms have followed so far
-    FORCE = 1  # [N] longitudinal, as the foot has followed so far
-    BELIEF = 2  # grip he believes in
-    STYLE = 3  # share of it that he uses
-    COMFORT = 4  # [m/s^2] most that he cares for
-    CRUISE = 5  # [m/s] on a dry open road
-    WOBBLE = 6  # [m] amplitude of his wandering in the lane
-    SHORT = 7  # [m] left to the next point of the lane
-    STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
-    # rise of the road to his left [1], as it has turned over so far from one bend into the next
+    STEER = 0  # [rad] mean road-wheel angle, delayed by the driver's arms
+    FORCE = 1  # [N] longitudinal force, delayed by the driver's foot
+    BELIEF = 2  # grip that the driver believes in
+    STYLE = 3  # share of this grip that the driver uses
+    COMFORT = 4  # [m/s^2] largest acceleration that the driver accepts
+    CRUISE = 5  # [m/s] speed on a dry open road
+    WOBBLE = 6  # [m] amplitude of the lateral movement in the lane
+    SHORT = 7  # [m] distance to the next point of the lane
+    STOPS = 8  # share of the windows ALERT_S in which the driver stops and waits
+    # rise of the road to the left [1]; it changes gradually from one bend to the next
     CROSS_SLOPE = 9
-    WARNED_IN = 10  # [s] until he acts on the warning that he was given
-    WARNED_START = 11  # [m] to the slippery stretch that he was warned of,
-    WARNED_END = 12  # [m] and to its end; 0 or less: he knows of none
-    WARNED_SPEED = 13  # [m/s] that he wants to have on it
-    WARNED_MU = 14  # grip that he expects there
+    WARNED_IN = 10  # [s] remaining time until the driver reacts to a warning
+    WARNED_START = 11  # [m] distance to the start of the stretch with a warning
+    WARNED_END = 12  # [m] distance to its end; 0 or less: no warning
+    WARNED_SPEED = 13  # [m/s] advised speed on this stretch
+    WARNED_MU = 14  # expected grip on this stretch
 
 
 class Route(IntEnum):
     """Index of a variable of one driver's position on the route (int64)."""
 
     LANE = 0
-    POINT = 1  # the next point of the lane
-    WAY = 2  # which way he will go at its end
-    TURNS = 3  # how many lanes he has finished
+    POINT = 1  # next point of the lane
+    WAY = 2  # index of the lane that follows this one
+    TURNS = 3  # number of completed lanes
 
 
-ARMS_S: Final = 0.12  # lag of the steering
-FOOT_S: Final = 0.2  # lag of the pedals
-LOOKING_S: Final = 0.6  # how far ahead he judges the look of the road
-WORSE_S: Final = 0.5  # how fast he takes in that the road ahead looks worse, and better
+ARMS_S: Final = 0.12  # [s] lag of the steering
+FOOT_S: Final = 0.2  # [s] lag of the pedals
+LOOKING_S: Final = 0.6  # [s] travel time to the place whose appearance the driver judges
+# Time constants of the believed grip if the road ahead looks worse, or better.
+WORSE_S: Final = 0.5
 BETTER_S: Final = 2.5
-ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
-SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
+ALARM_S: Final = 0.7  # [s] time constant with which the believed grip falls while wheels slide
+SLIDING: Final = 3.5  # normalised slip, well beyond the peak, that a driver notices
 LEAST_BELIEF: Final = 0.12
-PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
-# [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
+# [s] travel time before the stretch at which a warned driver assumes its grip: three times WORSE_S.
+PREPARED_S: Final = 1.5
+# [m/s^2] deceleration towards such a stretch: only engine braking, because the stretch may begin
+# earlier.
 WARNED_BRAKES: Final = 1.0
-# Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the
-# pedals alone. An axle that brakes alone, or its share of the brakes, meets its limit at half of
-# what the road bears.
+# Factor for the driver's share of the grip on such a stretch, where the driver hardly uses the
+# pedals. Braking on one axle, or an unequal distribution of braking, reaches the limit at half of
+# the available grip.
 CAREFUL: Final = 0.5
-SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
+SLOWEST: Final = 3.0  # [m/s] least target speed, unless the driver stops
 LARGEST_STEER: Final = 0.55  # [rad]
-LARGEST_SLIP_ANGLE: Final = 0.09  # [rad] of the front wheels; more steering than that only scrubs
-ALERT_S: Final = 7.0  # once in this time somebody ahead may make him brake,
-ALERT_SHARE: Final = 0.45  # with this probability,
-ALERT_LENGTH_S: Final = 1.5  # for this long
-STOP_LENGTH_S: Final = 5.0  # braking and waiting, within an ALERT_S
-STOPPING: Final = 0.6  # share of his budget that he stops with
-RESTING: Final = 0.3  # [m/s] slower than this he stands on the brake, whatever the slope
-LEAST_BRAKING: Final = 0.35  # share of the budget that is left for the brakes in the tightest bend
-# [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
+# [rad] largest slip angle of the front wheels; more steering gives no more lateral force.
+LARGEST_SLIP_ANGLE: Final = 0.09
+# Traffic ahead makes the driver brake at the beginning of a window of ALERT_S, with the probability
+# ALERT_SHARE, for ALERT_LENGTH_S.
+ALERT_S: Final = 7.0
+ALERT_SHARE: Final = 0.45
+ALERT_LENGTH_S: Final = 1.5
+STOP_LENGTH_S: Final = 5.0  # [s] duration of braking and waiting, within a window of ALERT_S
+STOPPING: Final = 0.6  # share of the budget with which the driver brakes to a stop
+RESTING: Final = 0.3  # [m/s] below this speed, the driver holds the car by the brake on any slope
+LEAST_BRAKING: Final = 0.35  # share of the budget that remains for braking in the tightest bend
+# [m/s^2] least braking demand of a driver who is much too fast, on any road
 FRIGHT: Final = 2.5
-TOO_FAST: Final = 1.4  # this many times the square of the speed he aims at
-PULL: Final = 0.85  # share of the grip of the driven wheels that he dares to use for driving
+TOO_FAST: Final = 1.4  # squared speed over squared target speed from which FRIGHT applies
+PULL: Final = 0.85  # share of the driven wheels' grip that the driver uses for driving
 WOBBLE_HZ: Final = 0.11
 ROUTE_STREAM: Final = 10
 ALERT_STREAM: Final = 11
-STOP_DRAW: Final = (
-    1 << 32
-)  # counters from here on, in the stream of alerts, say in which ALERT_S he stops
+# First counter, in the random stream of alerts, of the numbers that decide in which windows the
+# driver stops.
+STOP_DRAW: Final = 1 << 32
 
 
 @compiled
@@ -297,8 +303,8 @@ def wished_acceleration(
         )
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
-    longitudinal = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
-    # share of the pull on an axle that carries half the vehicle
+    longitudinal = math.sqrt(1.0 - across * across)  # share of the budget left by cornering
+    # Share of the driving force on the axle that drives more. It carries half of the weight.
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     gas = min(
         PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
@@ -349,7 +355,8 @@ def wished_steer(
     s = math.sin(x[Motion.YAW])
     forward = c * dx + s * dy + p[Parameter.TO_REAR]
     left = c * dy - s * dx
-    if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
+    # After a spin, turn the car around. Otherwise the point would stay straight behind it.
+    if forward < 0.0:
         return math.copysign(LARGEST_STEER, left)
     steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
     drift = math.atan2(x[Motion.VY] + p[Parameter.TO_FRONT] * x[Motion.YAW_RATE], vx)

@@ -43,7 +43,7 @@ class Fault:
     @property
     def indices(self) -> list[int]:
         """Return the indices of the channels that the fault affects."""
-        if self.channel in CHANNELS:  # "yaw" is a channel of its own, and not the yaw rate
+        if self.channel in CHANNELS:  # for example "yaw", which is not a prefix of other channels
             return [CHANNELS.index(self.channel)]
         return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]
 
@@ -86,7 +86,7 @@ def add_bias(values: FloatArray, when: BoolArray, size: float) -> None:
 
 FAULTS: Final[dict[str, Effect]] = {
     "dropout": drop_readings,
-    "missing": drop_readings,  # for a whole drive: the vehicle does not have the channel
+    "missing": drop_readings,  # during the whole drive: the vehicle does not have the channel
     "stuck": hold_reading,
     "spike": add_spikes,
     "bias": add_bias,

@@ -49,16 +49,17 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 
-ORDINARY = "mems-patchy"  # sensors of vehicles that are not rough, a key of SENSORS
-TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
+ORDINARY = "mems-patchy"  # sensors of accurate vehicles, a key of SENSORS
+TURN_OVER_M = 6.0  # [m] length over which the crossfall of a road changes its sign
 VEHICLE_STREAM = 0
 WINTER_STREAM = 4
-# share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
+# Share of the windows of 7 s in which the driver of a rough (inaccurate) vehicle stops: two or
+# three stops per minute.
 STOPS = 0.3
-# from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5
-# s)
+# [s] time from a warning to the begin of braking (Green, Transportation Human Factors 2, 2000: 1.2
+# to 1.5 s).
 TOLD_S = 1.5
-# multiples of it, modulo 1, are spread evenly however many there are
+# Multiples of this number, modulo 1, are evenly distributed for any number of vehicles.
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -218,7 +219,8 @@ class SimulatedFleet:
         self._states = _start_states(self.scenario.network, self._parameters, rngs)
         self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
         self._states[1][:, Driver.CROSS_SLOPE] = self.scenario.relief.crossfall
-        self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
+        # Earlier records, which sensors with late clocks still report.
+        self._before = np.empty((0, vehicles, RECORD))
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table
         self._next = 0

@@ -18,8 +18,8 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-# what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of
-# the usual ranges
+# Friction of the surfaces in the scenarios: peak adhesion of a passenger car's tyre, middle of the
+# usual ranges.
 DRY = 0.90
 WET = 0.60
 SNOW = 0.35

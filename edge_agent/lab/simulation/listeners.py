@@ -18,9 +18,10 @@ from schemas.numeric import BoolArray
 from schemas.wire.ahead import GripWarning
 
 ROUTE_M: Final = 600.0
-# in which a driver stays careful: alerts are of single cells, and ice seldom ends with them
+# [m] distance before and after the stretch in which a driver is also careful. An alert concerns one
+# cell, but ice often extends beyond it.
 AROUND_M: Final = 25.0
-EVERY: Final = 10  # blocks between two looks at the route
+EVERY: Final = 10  # blocks between two updates of the route
 
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
@@ -92,7 +93,7 @@ class WarnedDrivers:
         """Pass the stored warnings to the simulated drivers who receive them."""
         while not self._warnings.empty():
             k, warning = self._warnings.get()
-            if warning.state != "ended":  # one that is passed he leaves behind by himself
+            if warning.state != "ended":  # the driver knows without a message that a stretch ended
                 start = warning.distance_m - AROUND_M
                 end = warning.distance_m + warning.length_m + AROUND_M
                 self._fleet.warn(k, (start, end), warning.safe_speed, warning.mu_lower)

@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 from edge_agent.lab.simulation.motor import Pmsm, speed_demand
 from schemas.thresholds import GRAVITY
 
-WHEELBASE: Final = 2.7  # [m] every driver knows his own near enough
-SPEED_GAIN: Final = 1.5  # [1/s] how fast a driver takes back an error of speed
-LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
+WHEELBASE: Final = 2.7  # [m] value that every simulated driver assumes
+SPEED_GAIN: Final = 1.5  # [1/s] demanded acceleration per error of speed
+LARGEST_STEER: Final = 0.5  # [rad] at the road wheel
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Manoeuvre:
     """
 
     control: Control
-    speed: float  # [m/s] at the start, and to be held unless the control does otherwise
+    speed: float  # [m/s] initial speed; it is held unless `control` changes it
     duration: float  # [s]
     friction: Friction
     about: str

@@ -11,7 +11,7 @@ Legend
              error that depends on the angle
     ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
     Δω       step width of wheel speeds; a wheel that stands reads zero, because teeth are counted
-    τ delay of a device: it reports the state of τ ago
+        τ        delay of a device: it reports the state at a time τ earlier
 
 The sizes are those found in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y
 .07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at speed and 5 to 15
@@ -35,8 +35,9 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-WIDE: Final = 0.4  # [rad] of a wheel turned far in, where the steering's map is most wrong
-KMH: Final = 1.0 / 3.6 / 0.33  # [rad/s] that a wheel of .33 m turns faster at one km/h more
+# [rad] steering angle of a wheel near its end stop, where the steering ratio is most wrong
+WIDE: Final = 0.4
+KMH: Final = 1.0 / 3.6 / 0.33  # [rad/s] wheel speed of a wheel with 0.33 m radius at one km/h
 MOUNT_STREAM: Final = 4
 
 DEVICES: Final = 5  # inertial unit, steering, wheels, torque, receiver
@@ -49,11 +50,11 @@ class Misalignment:
     where its comment says so.
     """
 
-    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad] θ, φ, ψ
-    steering: tuple[float, float, float] = (0.0, 0.0, 0.0)  # δ_0 [rad], γ, β
-    radius: float = 0.0  # ε
-    step: float = 0.0  # [rad/s] largest Δω, drawn evenly
-    lag_s: float = 0.0  # [s] largest τ, drawn evenly
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # standard deviations of θ, φ, ψ [rad]
+    steering: tuple[float, float, float] = (0.0, 0.0, 0.0)  # standard deviations of δ_0 [rad], γ, β
+    radius: float = 0.0  # standard deviation of ε
+    step: float = 0.0  # largest Δω [rad/s]; uniformly distributed
+    lag_s: float = 0.0  # largest τ [s]; uniformly distributed
     torqueless: float = 0.0  # share of the vehicles without wheel torque
 
 
@@ -71,16 +72,16 @@ MISALIGNED: Final = {
 class Misaligned(IntEnum):
     """Index of a column in a vehicle's row of sensor errors."""
 
-    ROUGH = 0  # whether there is any
-    AX = 1  # [m/s^2] g θ
+    ROUGH = 0  # 1 if the vehicle has any of these errors
+    AX = 1  # g θ [m/s^2]
     AY = 2
-    TURN = 3  # [rad] ψ
-    ZERO = 4  # [rad] δ_0
+    TURN = 3  # ψ [rad]
+    ZERO = 4  # δ_0 [rad]
     GAIN = 5  # γ
     BEND = 6  # β
-    RADIUS = 7  # ε of four wheels
-    STEP = 11  # [rad/s] Δω
-    LAG = 12  # [s] τ of the DEVICES
+    RADIUS = 7  # ε of the four wheels
+    STEP = 11  # Δω [rad/s]
+    LAG = 12  # τ [s] of the DEVICES
     TORQUELESS = 17
 
 

@@ -29,8 +29,10 @@ import numpy as np
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-STEP_S: Final = 1e-4  # of the motor's equations; its electrical time constant is L/R = 3 ms
-# columns of a motor's state: currents [A], integrals of their errors [A s]
+# [s] longest integration step of the motor's equations; their electrical time constant is L/R = 3
+# ms.
+STEP_S: Final = 1e-4
+# Columns of a motor's state: currents [A], and integrals of their errors [A s].
 D = 0
 Q = 1
 D_SUM = 2
@@ -46,11 +48,11 @@ class Pmsm(NamedTuple):
     flux: float = 0.12  # psi [Wb]
     pole_pairs: float = 8.0  # p
     gear: float = 4.0  # G
-    voltage: float = 600.0  # most that the inverter gives [V]
-    bandwidth: float = 600.0  # of the current control [rad/s]
-    proportional: float = 1.5  # of the speed control: [1/s] of an error of speed
-    integral: float = 0.3  # [1/s^2]
-    derivative: float = 0.05  # [1] of the acceleration
+    voltage: float = 600.0  # [V] largest voltage of the inverter
+    bandwidth: float = 600.0  # [rad/s] of the current control
+    proportional: float = 1.5  # [1/s] gain of the speed control for the error of speed
+    integral: float = 0.3  # [1/s^2] gain for the integral of this error
+    derivative: float = 0.05  # [1] gain for the acceleration
 
 
 def speed_demand(motor: Pmsm, error: float, summed: float, acceleration: float) -> float:
@@ -91,7 +93,8 @@ def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: 
         voltage_q = motor.bandwidth * motor.inductance_q * error_q + control * state[Q_SUM] + back_q
         size = math.hypot(voltage_d, voltage_q)
         share = min(1.0, motor.voltage / size) if size > 0.0 else 1.0
-        if share == 1.0:  # an integral that grows while the voltage is at its limit would overshoot
+        # Stop the integrals while the voltage is at its limit, because they would then overshoot.
+        if share == 1.0:
             state[D_SUM] += step * error_d
             state[Q_SUM] += step * error_q
         state[D] += (

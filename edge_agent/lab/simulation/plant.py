@@ -55,19 +55,23 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
-# stiffness never degrades below this share of proportional, however overloaded the wheel
+# [s] longest integration step; lateral dynamics at 1 m/s have poles near 150/s.
+LONGEST_SUBSTEP: Final = 1e-3
+# Least ratio of the stiffness to one proportional to the load, even at high overload.
 SOFTEST: Final = 0.3
-FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
-STANDING: Final = 1.0  # [rad/s] below it rolling resistance fades
-DIRECT: Final = 0.2  # share of the slip that a relaxing tyre takes at once
+FIRM: Final = 1.0  # friction at which a tyre with softening has its full stiffness
+STANDING: Final = 1.0  # [rad/s] wheel speed below which rolling resistance decreases to zero
+DIRECT: Final = 0.2  # share of the slip that acts without the delay by relaxation
+# [m/s] Speed of the driven wheels above that of the car at which the engine begins to give less,
+# and at which it gives nothing.
 FREE_SPIN: Final = (
     6.0,
     12.0,
-)  # [m/s] that driven wheels may be faster than the car: from there the engine gives less
-# [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
+)
+# [rad/s] wheel speed below which the brake torque decreases, so that a brake holds a wheel and does
+# not turn it backwards.
 BRAKED: Final = 0.1
-# [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
+# [m/s, rad/s] speeds and yaw rate below which the brakes hold the vehicle in place.
 STILL: Final = 0.02
 
 

@@ -36,27 +36,29 @@ class TrueVehicle:
     lag: float = 0.1
     roll_leak: float = 0.07  # 4 degrees of roll per g
     pitch_leak: float = 0.03
-    drag: float = 0.4  # half of 1.2 kg/m^3 x .3 x 2.2 m^2
+    drag: float = 0.4  # [kg/m] half of 1.2 kg/m^3 · 0.3 · 2.2 m^2
     rolling: float = 0.008
     slip_limit: float = 0.08
     brake_front: float = 0.70
     power: float = 90e3
     curve: str = "magic-formula"  # a key of CURVES
-    softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
-    # or "proportional-to-friction", as papers 000, 003 and 004 print it: power 1
+    # power of friction with which the stiffness decreases; 0 to 0.3 for real tyres
+    softening: float = 0.0
+    # "similarity", or "proportional-to-friction" (power 1) as printed in papers 000, 003 and 004
     stiffness: str = "similarity"
-    # cornering stiffness per load of the rear tyres over that of the front ones
+    # cornering stiffness per load of the rear tyres over that of the front tyres
     rear_slope: float = 1.0
-    # wheel-hub motors that follow the torque asked for; None: a lag of the pedal
+    # wheel-hub motors that follow the demanded torque; None: a pedal with a lag
     motors: Pmsm | None = None
     # angle of the rear wheels over that of the front wheels; negative at low speed
     rear_steer: float = 0.0
-    relaxation: float = 0.0  # [m] in which the tyres build up slip
+    relaxation: float = 0.0  # [m] relaxation length of the tyres
     # cycles per second of anti-lock control; 0: smooth slip control that is not reported
     abs_hz: float = 0.0
-    tcs: float = 0.0  # 1: traction control, of vehicles with abs_hz
-    esc: float = 0.0  # 1: stability control, likewise
-    regeneration: float = 0.0  # [m/s^2] of braking by engine or generator, at the driven wheels
+    tcs: float = 0.0  # 1: traction control, for vehicles with abs_hz
+    esc: float = 0.0  # 1: stability control, for vehicles with abs_hz
+    # [m/s^2] braking by engine or generator at the driven wheels
+    regeneration: float = 0.0
 
     def __post_init__(self) -> None:
         for field, known in (("curve", CURVES), ("stiffness", ("similarity", *STIFFNESSES))):
@@ -144,7 +146,8 @@ def car(
 
 
 PRESETS: Final = {
-    "small": TrueVehicle(  # a front-driven hatchback
+    # Hatchback with front-wheel drive.
+    "small": TrueVehicle(
         car(
             "small",
             (1180.0, 1420.0, 0.52),
@@ -156,7 +159,7 @@ PRESETS: Final = {
         shape=1.45,
         power=65e3,
     ),
-    # paper 004, table 1; stiffnesses and wheel inertia are not given there; four driven wheels
+    # Paper 004, table 1, which does not give stiffnesses and wheel inertia. All wheels are driven.
     "sedan": TrueVehicle(
         car(
             "sedan",
@@ -169,7 +172,8 @@ PRESETS: Final = {
         shape=1.55,
         power=120e3,
     ),
-    "van": TrueVehicle(  # a rear-driven, half-laden delivery van
+    # Delivery van with rear-wheel drive and half of its load.
+    "van": TrueVehicle(
         car(
             "van",
             (2350.0, 4600.0, 0.74),
@@ -186,7 +190,7 @@ PRESETS: Final = {
     ),
 }
 
-# how well a vehicle file knows its vehicle: relative standard deviations
+# Relative standard deviations of the errors in a vehicle file.
 KNOWN: Final = {
     "mass": 0.03,
     "yaw_inertia": 0.05,

@@ -19,12 +19,13 @@ from schemas.thresholds import GRAVITY
 class RecordColumn(IntEnum):
     """Index of a quantity in the record that contains all true values of one simulated sample."""
 
-    AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
+    # [m/s^2] reading of an accelerometer at the centre of gravity, in the plane of the road
+    AX = 0
     AY = 1
-    AX_FELT = 2  # [m/s^2] by an accelerometer fixed to the rolling and pitching body
+    AX_FELT = 2  # [m/s^2] reading if it is fixed to the rolling and pitching body
     AY_FELT = 3
     YAW_RATE = 4
-    DELTA = 5  # four wheels each, from here on
+    DELTA = 5  # this and the next two quantities have four columns, one per wheel
     OMEGA = 9
     TORQUE = 13
     X = 17
@@ -35,9 +36,9 @@ class RecordColumn(IntEnum):
     MU = 22
     UTILISATION = 26  # |F| / (μ F_z)
     SLOPE = 30  # rise of the road per metre ahead
-    BANK = 31  # and to the left
+    BANK = 31  # rise of the road per metre to the left
     THETA = 32  # four wheels: normalised slip; beyond about 2.6 a wheel slides
-    ABS = 36  # 1 while the controller works
+    ABS = 36  # 1 while the controller is active
     TCS = 37
     ESC = 38
 

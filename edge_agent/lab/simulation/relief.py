@@ -29,7 +29,7 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-STEEPEST: Final = 0.08  # public roads are hardly ever steeper
+STEEPEST: Final = 0.08  # public roads are rarely steeper
 RELIEF_STREAM: Final = 20
 
 
@@ -40,10 +40,10 @@ class Wave:
     """
 
     peak: float
-    length: float = math.inf  # [m]; infinite: one slope everywhere
+    length: float = math.inf  # [m] wavelength; infinite for a constant slope
     towards: float = 0.0
     phase: float = 0.0  # [rad]
-    stepped: bool = False  # it jumps between the two instead
+    stepped: bool = False  # True: the slope jumps between the two values
 
     def __post_init__(self) -> None:
         if not (abs(self.peak) <= STEEPEST and self.length > 0.0):

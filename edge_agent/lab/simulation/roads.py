@@ -22,13 +22,18 @@ from schemas.numeric import FloatArray, IntArray
 
 SPACING_M: Final = 1.0
 LANE_OFFSET_M: Final = 2.0  # lanes of opposite directions are 4 m apart
-# where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
+# [m] distance from a junction at which its lanes end; the connectors then have a radius of 8 to 14
+# m.
 SETBACK_M: Final = 12.0
-SMOOTHING_M: Final = 5.0  # a driver opens his path where arcs meet straights
-BRAKING: Final = 0.8  # share of the budget that is used to slow down
-STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] no road is straighter than this to a driver's speed
-YIELD_M: Final = 16.0  # v²/q within a junction, where one looks left and right: 6 to 9 m/s
-HANDLE: Final = 0.39  # of the chord: a cubic Bezier curve of 90 degrees is then nearly a circle
+# [m] length over which a driver smooths the path where arcs meet straights
+SMOOTHING_M: Final = 5.0
+BRAKING: Final = 0.8  # share of the budget that is used for slowing down
+STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] least curvature for the choice of speed, also on straights
+# [m] v²/q within a junction, where drivers look left and right: speeds of 6 to 9 m/s.
+YIELD_M: Final = 16.0
+# Length of a Bezier handle over the chord. A cubic Bezier curve of 90 degrees is then nearly a
+# circle.
+HANDLE: Final = 0.39
 
 
 class LanePoint(IntEnum):
@@ -38,10 +43,11 @@ class LanePoint(IntEnum):
 
     X = 0  # [m]
     Y = 1
-    COS = 2  # of the heading
+    COS = 2  # cosine of the heading
     SIN = 3
     CURVATURE = 4  # [1/m], positive to the left
-    PROFILE = 5  # [m] for each way to go on, as many columns as MOST_WAYS
+    # [m] squared speed over budget, v²/q, for each continuation; MOST_WAYS columns
+    PROFILE = 5
 
 
 MOST_WAYS: Final = 3
@@ -92,7 +98,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
             or too many.
     """
     lanes: list[FloatArray] = []
-    leaves: list[tuple[str, int]] = []  # junction where the lane begins, and its road
+    # Junction at which each lane begins, and number of its road.
+    leaves: list[tuple[str, int]] = []
     arrives: list[str] = []
     for number, road in enumerate(roads):
         for name in (road.start, road.end):

@@ -28,11 +28,11 @@ from edge_agent.lab.simulation.roads import LanePoint, Network, Road, build_netw
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-DRAWN: Final = "hills-"  # names of drawn scenarios: this and the seed
-WINTER: Final = "winter-"  # the same with winter on its roads
+DRAWN: Final = "hills-"  # prefix of the names of random scenarios; the seed follows
+WINTER: Final = "winter-"  # the same for scenarios with winter roads
 WINTER_STREAM: Final = 22
-# what lies on a lane of a winter town, in an order that is drawn; where there is nothing the road
-# is as it was
+# Kinds of patches on the lanes of a winter town, which are assigned in random order. On a lane with
+# the empty name, the road does not change.
 ON_LANES: Final = (
     *("braking",) * 3,
     *("bend",) * 3,
@@ -41,7 +41,7 @@ ON_LANES: Final = (
     *("ruts",) * 3,
     *("",) * 3,
 )
-TRACK_M: Final = 1.5  # between the ruts
+TRACK_M: Final = 1.5  # [m] distance between the ruts
 DRAWN_STREAM: Final = 21
 
 
@@ -59,7 +59,7 @@ class Scenario:
     patches: tuple[Patch, ...]
     relief: Relief = LEVEL
     origin: Origin = field(default=GOTHENBURG)
-    air_temperature: float = 1.0  # outside [degrees Celsius]
+    air_temperature: float = 1.0  # outside temperature [degrees Celsius]
 
     @cached_property
     def network(self) -> Network:
@@ -86,8 +86,8 @@ class Scenario:
         """Return the friction μ at the times t [s] and points (x, y) [m], in the arrays' common
         shape.
         """
-        # copies: numpy warns who looks whether a broadcast view may be written, and the compiler
-        # does at a first call
+        # Copy the arrays. At its first call, the compiler checks whether they may be written, and
+        # numpy warns if a broadcast view is checked.
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
         return look_up_many(
             self.table, int(PatchColumn.MU), t.ravel(), x.ravel(), y.ravel()

@@ -48,18 +48,22 @@ class Sensors:
     """
 
     acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white, offset
-    yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s]
-    steering: tuple[float, float] = (0.0, 0.0)  # [rad]
+    yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s] white, offset
+    steering: tuple[float, float] = (0.0, 0.0)  # [rad] white, offset
     wheel_speed: float = 0.0  # [rad/s] white
+    # [N·m] white; relative error of the gain, which is common to all wheels
     torque: tuple[float, float] = (
         0.0,
         0.0,
-    )  # [N·m] white; relative error of the gain, one for all wheels
-    position: tuple[float, float] = (0.0, 0.0)  # [m] white, wandering, north and east each
-    yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white, wandering
-    leak: bool = False  # accelerometers fixed to the rolling body
-    dropouts: float = 0.0  # share of the half seconds in which one group of channels is silent
-    mounted: Misalignment = ALIGNED  # how the devices sit in the car, and what their clocks say
+    )
+    # [m] white and slowly varying error, each to the north and to the east
+    position: tuple[float, float] = (0.0, 0.0)
+    yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white and slowly varying error
+    # True for accelerometers fixed to the rolling body, which measure a part of gravity
+    leak: bool = False
+    # Probability that a group of channels is silent in a given half second.
+    dropouts: float = 0.0
+    mounted: Misalignment = ALIGNED  # errors of the mounting of the devices, and of their clocks
 
 
 ORDINARY: Final = {
@@ -99,23 +103,25 @@ SENSORS: Final = ORDINARY | {
     name: replace(ORDINARY["mems-leak"], yaw_rate=(0.002, 0.003), mounted=mounted)
     for name, mounted in MISALIGNED.items()
 }
-# of a live fleet: torque is recorded by half of the cars, and now and then a channel is silent
+# Sensors of inaccurate vehicles in a live fleet. Half of the cars record torque, and channels are
+# sometimes silent.
 ROUGH_FLEET: Final = replace(
     SENSORS["rough"], dropouts=0.002, mounted=replace(SENSORS["rough"].mounted, torqueless=0.5)
 )
 
-FIX_S: Final = 0.1  # a receiver gives ten positions a second; the samples between have none
-WANDER_S: Final = 60.0  # correlation time of its slow error
-SILENCE_S: Final = 0.5  # length of one dropout
+FIX_S: Final = 0.1  # [s] period of positions; the samples in between have none
+WANDER_S: Final = 60.0  # [s] correlation time of the slowly varying error of a receiver
+SILENCE_S: Final = 0.5  # [s] length of one dropout
 
-# counters of the random streams within one sample; below len(CHANNELS): white noise of the channel
+# Number of counters per sample in a random stream. Those below len(CHANNELS) are for the white
+# noise of the channels.
 DRAWS: Final = 32
-WANDER_DRAW: Final = 24  # three of them
+WANDER_DRAW: Final = 24  # first of three counters for the slowly varying errors
 OFFSET_STREAM: Final = 1
 WHITE_STREAM: Final = 2
 SILENCE_STREAM: Final = 3
 
-# channels that fall silent together: inertial unit, steering, each wheel's speed, torques, receiver
+# Groups of channels that fall silent together.
 GROUPS: Final = (
     "inertial",
     "steering",
@@ -137,10 +143,11 @@ class ErrorColumn(IntEnum):
     WHITE = 0
     OFFSET = len(CHANNELS)
     GAIN = 2 * len(CHANNELS)
-    WANDER = 3 * len(CHANNELS)  # std of the three wandering errors: latitude, longitude, yaw
+    # standard deviations of the three slowly varying errors: latitude, longitude, yaw
+    WANDER = 3 * len(CHANNELS)
     LEAK = 3 * len(CHANNELS) + 3
     DROPOUTS = 3 * len(CHANNELS) + 4
-    MOUNTED = 3 * len(CHANNELS) + 5  # from here on, columns of `misaligned.Misaligned`
+    MOUNTED = 3 * len(CHANNELS) + 5  # first of the columns of `misaligned.Misaligned`
 
 
 ERRORS: Final = int(ErrorColumn.MOUNTED) + COLUMNS
@@ -183,7 +190,7 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
     gain = np.ones(len(CHANNELS))
     gain[S.TORQUE : S.TORQUE + 4] += rng.normal(0.0, sensors.torque[1])
     offset *= rng.standard_normal(len(CHANNELS))
-    offset[S.DELTA : S.DELTA + 4] = offset[S.DELTA]  # one steering sensor feeds the four angles
+    offset[S.DELTA : S.DELTA + 4] = offset[S.DELTA]  # one steering sensor gives all four angles
     wander = (sensors.position[1] * north, sensors.position[1] * east, sensors.yaw[1])
     mounted = misalignment_row(sensors.mounted, seed, index)
     return np.array(

@@ -74,7 +74,7 @@ TRUTH: Final = (
     ("true_tcs_active", RecordColumn.TCS),
     ("true_esc_active", RecordColumn.ESC),
 )
-STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
+STEERING_LAG_S: Final = 0.1  # [s] from the driver's demand to the road wheel
 PEDAL_LAG_S: Final = 0.15
 
 
@@ -220,9 +220,8 @@ def _drive_manoeuvre(
         wish, acceleration = manoeuvre.control(now)
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
-            force = (
-                float(p[Parameter.MASS]) * acceleration
-            )  # who stands has had his foot down before
+            # In a standing car, the driver has pressed the pedal before the drive begins.
+            force = float(p[Parameter.MASS]) * acceleration
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
         wanted = float(p[Parameter.MASS]) * acceleration
         force += (wanted - force) * (1.0 if truth.motors else -math.expm1(-dt / PEDAL_LAG_S))

@@ -13,8 +13,8 @@ import numpy as np
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
-SCHEDULE: Final = (0.04, 0.01, 0.05)  # variances of its table 2 [SI], in turn,
-SCHEDULE_S: Final = 2.0  # each for two seconds: a period of six
+SCHEDULE: Final = (0.04, 0.01, 0.05)  # successive variances in table 2 of paper 004 [SI]
+SCHEDULE_S: Final = 2.0  # [s] duration of each; the period is six seconds
 
 
 def scheduled_variance(t: FloatArray) -> FloatArray:

@@ -33,7 +33,8 @@ from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Resul
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
-# deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
+# Upper limit of pheromone: the deposits of an iteration sum to ρ per vertex, so pheromone converges
+# to at most 1.
 HIGHEST = 1.0
 
 
@@ -48,11 +49,11 @@ class Habits:
 
     alpha: float = 1.0  # weight of pheromone, α
     theta: float = 1.0  # weight of visibility, θ₀
-    evaporation: float = 0.716  # ρ = 1 − the paper's residual .284
-    elite: float = 0.25  # share of the ants of an iteration that deposit
+    evaporation: float = 0.716  # ρ; the paper's residual of pheromone is 1 − ρ = 0.284
+    elite: float = 0.25  # share of the ants of an iteration that deposit pheromone
     memory: float = 0.4  # share of the deposit that the best path so far receives
-    retrace: float = 0.3  # chance that an ant of a converged colony walks the best path again
-    # called with the pheromone (V, K) after each iteration
+    retrace: float = 0.3  # probability that an ant of a converged colony repeats the best path
+    # function that is called with the pheromone (V, K) after each iteration
     trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:

@@ -25,9 +25,10 @@ from edge_agent.lab.tuning.search import Iteration, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-# of the range of a variable: an archive of equal vectors would draw itself for ever
+# Least spread of the draws, as a share of a variable's range. An archive of equal vectors would
+# otherwise produce only itself.
 LEAST_SPREAD: Final = 1e-3
-REDRAWS: Final = 32  # of a vector that is not admissible
+REDRAWS: Final = 32  # number of attempts to draw an admissible vector
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,9 @@ class ArchiveHabits:
         InputError: a constant is out of range.
     """
 
-    archive: int = 10  # k
-    greed: float = 0.3  # q
-    spread: float = 0.85  # xi
+    archive: int = 10  # number of stored vectors, k
+    greed: float = 0.3  # preference for the best vectors, q; smaller is greedier
+    spread: float = 0.85  # width of the draws, ξ
 
     def __post_init__(self) -> None:
         if self.archive < 2:

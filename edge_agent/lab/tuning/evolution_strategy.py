@@ -12,8 +12,8 @@ from edge_agent.lab.tuning.continuous_colony import REDRAWS, SearchTally
 from edge_agent.lab.tuning.search import Problem, Progress, Result
 from schemas.numeric import FloatArray
 
-FIRST_STEP: Final = 0.2  # standard deviation over the range of a variable
-GROWTH: Final = 1.5  # of the step after a success; its fourth root is what a failure takes back
+FIRST_STEP: Final = 0.2  # initial standard deviation, as a share of a variable's range
+GROWTH: Final = 1.5  # factor on the step after a success; after a failure 1 / GROWTH^(1/4)
 
 
 def optimise(

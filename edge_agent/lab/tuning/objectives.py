@@ -42,16 +42,19 @@ from schemas.thresholds import SLIPPERY_MU, SURFACES
 from schemas.vehicle import Vehicle
 
 RATE_HZ: Final = 100.0
-SETTLED_S: Final = 1.0  # scored from here on; before, the score is that of the initial covariance
-WORST: Final = (
-    -1e3
-)  # [nat] of an update whose log-likelihood is lower or no number: one broken one is not the score
-# [nat/s] per squared ln of NIS over its expectation: 24 for a variance wrong by two
+# [s] scores begin at this time; before, they depend on the initial covariance
+SETTLED_S: Final = 1.0
+# [nat] lower limit of the log-likelihood of one update, also used for NaN, so that one bad update
+# does not determine the score.
+WORST: Final = -1e3
+# [nat/s] cost per squared logarithm of NIS over its expected value: 24 nat/s for a variance that is
+# wrong by a factor of two.
 CALIBRATION: Final = 50.0
 LEAST_NIS: Final = 1e-3
-MISS: Final = 20.0  # 2/alpha of a 90 % interval
+MISS: Final = 20.0  # 2/α of a 90 % interval
 
-WARM_S: Final = 15.0  # of a town before the recording begins: its cars set out at walking pace
+# [s] time in a town before the recording begins, because its cars start at walking pace
+WARM_S: Final = 15.0
 
 
 @dataclass(frozen=True)
@@ -88,17 +91,20 @@ HELD_OUT: Final = (
     TuningDrive("j-turn", "sedan", 0.90, 910, "hilly"),
     TuningDrive("pulses", "van", 0.50, 911, "rolling"),
 )
+# Seeds of the towns, and number of cars in each.
 TOWNS: Final = {
     "train": ((61, 62), 8),
     "held_out": ((901, 902), 8),
-}  # seeds of towns, and cars in each
-ROUGH_SHARE: Final = 0.5  # of these cars
-# share of the samples on wet and dry road up to which false ice costs nothing more
+}
+ROUGH_SHARE: Final = 0.5  # share of inaccurate cars in a town
+# Share of the samples on wet and dry road that may be false ice at no cost.
 MOST_FALSE_ICE: Final = 0.0012
-FALSE_ICE_PRICE: Final = 60.0  # of interval score, for each share of 1 beyond it
-MISSED_ICE_PRICE: Final = 0.5  # of interval score, for a share of 1
-SURE_MARGIN: Final = 0.04  # below SLIPPERY_MU: closer to it slippery cannot be told from not
-FELT_SHARE: Final = 0.9  # of the friction in use, from which a slippery road is felt
+FALSE_ICE_PRICE: Final = 60.0  # interval score per share of false ice beyond this limit
+MISSED_ICE_PRICE: Final = 0.5  # interval score per share of missed ice
+# Distance of friction below SLIPPERY_MU within which slippery and other roads cannot be
+# distinguished.
+SURE_MARGIN: Final = 0.04
+FELT_SHARE: Final = 0.9  # used share of the friction from which a slippery road can be noticed
 
 
 @dataclass(frozen=True)
@@ -124,15 +130,12 @@ class TuningScores:
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
     log_likelihood: float  # more is better [nat/s]
     nis_ratio: float  # near 1 where the stated covariance is right [1]
-    surface_score: float = (
-        math.nan
-    )  # interval score, mean over the kinds of surface; less is better [1]
-    false_ice: float = (
-        math.nan
-    )  # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
-    missed_ice: float = (
-        math.nan
-    )  # share of the samples on felt ice and snow whose interval does not [1]
+    # interval score, mean over the kinds of surface; less is better [1]
+    surface_score: float = math.nan
+    # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
+    false_ice: float = math.nan
+    # share of the samples on noticeable ice and snow whose interval does not lie below it [1]
+    missed_ice: float = math.nan
 
 
 def detection_cost(scores: TuningScores) -> float:
@@ -143,7 +146,7 @@ def detection_cost(scores: TuningScores) -> float:
     return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
 
 
-# objective by name -> the number to maximise
+# Objectives by name; each returns the number to maximise.
 OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
     "interval": lambda scores: -detection_cost(scores),
     "innovation": lambda scores: scores.log_likelihood,

@@ -16,9 +16,9 @@ from edge_agent.lab.tuning.objectives import TuningSet
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 
-MOST_PARTS: Final = 24  # as many drives as the simulated ones
+MOST_PARTS: Final = 24  # the same number of drives as in the simulated set
 FEWEST_PARTS: Final = 3
-HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
+HELD_OUT: Final = 3  # the last third of the parts is held out
 
 
 def own_drives(

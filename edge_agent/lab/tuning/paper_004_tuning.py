@@ -31,14 +31,15 @@ from edge_agent.lab.tuning.colony import Habits, optimise
 from edge_agent.lab.tuning.search import Problem, Result
 from schemas.numeric import FloatArray
 
-LEVELS: Final = (0.1, 0.05, 0.01)  # variances of noise and R
-POSITIONS: Final = np.array(
-    [0.3, 0.55, 0.8, 1.0, 1.25, 1.5, 1.8]
-)  # of a lower vertex; 1 is the neighbour's peak
-PREFERENCE: Final = 0.6  # spread of the visibility about the untuned position
-CHUNK: Final = 25  # samples after which windows of variances are read: .5 s
-WORST: Final = -1e3  # [nat] of a sample whose log-likelihood is lower or no number
-SCALES: Final = {"vx": 0.0813, "vy": 0.0212, "yaw_rate": 0.0063, "mu": 0.0259}  # printed RMSE
+LEVELS: Final = (0.1, 0.05, 0.01)  # variances of the noise, and of R
+# Positions of a lower vertex; 1 is the peak of the neighbouring set.
+POSITIONS: Final = np.array([0.3, 0.55, 0.8, 1.0, 1.25, 1.5, 1.8])
+PREFERENCE: Final = 0.6  # spread of the visibility around the untuned position
+CHUNK: Final = 25  # samples between two readings of the variance windows: 0.5 s
+# [nat] lower limit of the log-likelihood of one sample, also used for NaN
+WORST: Final = -1e3
+# RMSE printed in the paper
+SCALES: Final = {"vx": 0.0813, "vy": 0.0212, "yaw_rate": 0.0063, "mu": 0.0259}
 
 Sets = Memberships | LowerVertices
 

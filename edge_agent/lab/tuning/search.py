@@ -26,8 +26,8 @@ def is_always_allowed(_vector: FloatArray) -> bool:
     return True
 
 
-# Draws before an ant accepts a path that was already walked; a converged colony would else draw for
-# ever.
+# Number of draws after which an ant accepts a path that was already used. A converged colony would
+# otherwise draw for ever.
 REDRAWS = 32
 
 

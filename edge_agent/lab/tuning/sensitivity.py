@@ -46,7 +46,8 @@ CARS: Final = 6
 TOWN_S: Final = 30.0
 DRIVE_S: Final = 6.0
 FACTORS: Final = (0.7, 1.4)
-SMALL: Final = 1.0  # change in every column below which a number has no effect
+# If all changes are smaller than this, the constant has no effect [%, percentage points].
+SMALL: Final = 1.0
 
 
 class JudgedDrives(NamedTuple):

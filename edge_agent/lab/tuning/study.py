@@ -30,12 +30,13 @@ from schemas.signals import CHANNELS as SIGNALS
 from schemas.vehicle import Vehicle
 
 VERTICES: Final = 2 * SETS
-RATE_HZ: Final = 50.0  # the paper's sampling
-FINE: Final = 10  # the plant's steering is held over a tenth of it
-DURATION_S: Final = 6.0  # the period of the paper's noise schedule
+RATE_HZ: Final = 50.0  # sampling rate of the paper
+FINE: Final = 10  # simulation steps per sample, for the steering
+DURATION_S: Final = 6.0  # period of the paper's noise schedule
 MU: Final = AT_THE_TRUTH.mu
-VARIANCE: Final = AT_THE_TRUTH.noise[0]  # of all three noises [SI]
-WORST: Final = -1e3  # [nat] of a sample whose log-likelihood is lower or no number
+VARIANCE: Final = AT_THE_TRUTH.noise[0]  # variance of the noise of all three measurements [SI]
+# [nat] lower limit of the log-likelihood of one sample, also used for NaN
+WORST: Final = -1e3
 WAYS: Final[dict[str, Callable[..., Result]]] = {
     "random": random_search.optimise,
     "colony": colony.optimise,
@@ -103,8 +104,8 @@ class StudyScores(NamedTuple):
     over the drives.
     """
 
-    log_likelihood: float  # of the innovations, more is better [nat/s]
-    nis: float  # per row; near 1 where the stated covariance is right [1]
+    log_likelihood: float  # log-likelihood of the innovations, more is better [nat/s]
+    nis: float  # NIS per measurement, near 1 if the stated covariance is right [1]
     rmse_vx: float  # [m/s]
     rmse_vy: float  # [m/s]
     rmse_yaw_rate: float  # [rad/s]

@@ -42,10 +42,11 @@ TITLES: Final = {
 }
 
 
+# Memberships without tuning: fixed sets, which leave R unchanged, and the default sets.
 GIVEN: Final = {
     "fixed": Memberships(outputs=(0.0,) * SETS),
     "untuned": Memberships(),
-}  # R as it is; not tuned
+}
 SHOWN: Final = (*GIVEN, *WAYS)
 
 

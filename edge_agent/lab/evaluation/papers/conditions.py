@@ -22,12 +22,13 @@ from edge_agent.lab.simulation.motor import Pmsm
 from edge_agent.lab.simulation.presets import TrueVehicle, as_printed, matched_to_papers
 from schemas.thresholds import GRAVITY
 
-ROLLING: Final = 0.008  # of drives at constant speed
-DRAG: Final = 0.4  # [N s^2/m^2]
-SHAPE_002: Final = 1.4  # c of the Magic Formula that the filter of 002 takes for true; e = 0
-FRONT_SLOPE_002: Final = 60_000.0  # C_f of an axle [N/rad], table 1
-REAR_SLOPE_002: Final = 40_000.0  # C_r
-INERTIA_002: Final = 7.143  # J of wheel and motor [kg m^2]
+ROLLING: Final = 0.008  # rolling resistance over load, in drives at constant speed
+DRAG: Final = 0.4  # [N s^2/m^2] air drag over speed squared, in drives at constant speed
+# Shape c of the Magic Formula that the filter of paper 002 assumes; its curvature e is 0.
+SHAPE_002: Final = 1.4
+FRONT_SLOPE_002: Final = 60_000.0  # cornering stiffness C_f of the front axle [N/rad], table 1
+REAR_SLOPE_002: Final = 40_000.0  # cornering stiffness C_r of the rear axle [N/rad], table 1
+INERTIA_002: Final = 7.143  # inertia J of wheel and motor [kg m^2]
 
 
 def with_losses(vehicle: TrueVehicle) -> TrueVehicle:
@@ -55,8 +56,7 @@ def _in_wheel() -> tuple[TrueVehicle, TyreOption]:
 IN_WHEEL, IN_WHEEL_TYRE = _in_wheel()
 MOTORED: Final = replace(STRONG, motors=Pmsm())
 
-# friction of table 7 of 003
-LOW: Final = (0.2, 0.25, 0.3, 0.35, 0.4, 0.45)
+LOW: Final = (0.2, 0.25, 0.3, 0.35, 0.4, 0.45)  # friction values in table 7 of paper 003
 CONSTANT_003: Final = DriveSpec("straight", SEDAN, None, kmh(40), duration_s=10.0)
 
 MATCHED: Final[dict[str, DriveSpec]] = {
@@ -72,7 +72,7 @@ MATCHED: Final[dict[str, DriveSpec]] = {
         name: replace(PAPERS[name], vehicle=as_printed(PAPERS[name].vehicle))
         for name in ("001.dlc", "001.sine", "001.slalom", "001.gaining.dlc", "001.gaining.slalom")
     },
-    # a rear axle that turns less than (53) says: there v_y is not almost zero
+    # The rear wheels are not steered as in equation (53), so that v_y is not almost zero.
     "001.dlc.front": replace(PAPERS["001.dlc"], vehicle=as_printed(LIGHT)),
     **{
         name: replace(

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 FORMATS: Final = ("png", "svg")
 DPI: Final = 110
 PANEL_INCHES: Final = (5.2, 2.5)
-WIDE_INCHES: Final = 9.0  # of a figure with one column
+WIDE_INCHES: Final = 9.0  # width of a figure with one column
 KINDS: Final = {
     "truth": {"color": TRUTH.colour, "linestyle": "-", "lw": 1.8},
     "improved": {"color": "#0072b2", "linestyle": "-", "lw": 1.1},
     "comparator": {"color": "#d55e00", "linestyle": "--", "lw": 1.0},
 }
-DASHES: Final = ("-", "--", "-.", ":")  # curves that coincide stay visible
+# different line styles, so that coinciding curves remain visible
+DASHES: Final = ("-", "--", "-.", ":")
 OTHERS: Final = [style.colour for style in ESTIMATORS.values() if style.colour != "#f0e442"]
 
 

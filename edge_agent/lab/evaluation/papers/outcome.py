@@ -11,7 +11,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 
 COLUMNS: Final = ("printed", "matched", "own plant", "realistic sensors", "default estimator")
-NONE: Final = math.nan  # a cell that does not exist
+NONE: Final = math.nan  # value of a cell that does not exist
 Values = dict[str, float]  # measure -> value
 Table = dict[str, Values]  # column -> measures
 
@@ -81,7 +81,7 @@ class Curve(NamedTuple):
     name: str
     x: FloatArray
     y: FloatArray
-    kind: str = ""  # "truth", "improved", "comparator" or "": its colour
+    kind: str = ""  # "truth", "improved", "comparator" or "": determines the colour
 
 
 class PlotPanel(NamedTuple):
@@ -91,8 +91,8 @@ class PlotPanel(NamedTuple):
     x: str
     y: str
     curves: tuple[Curve, ...]
-    limits: tuple[float, float] | None = None  # of y
-    log: bool = False  # logarithmic y
+    limits: tuple[float, float] | None = None  # range of the y axis
+    log: bool = False  # True for a logarithmic y axis
 
 
 class Heat(NamedTuple):
@@ -102,7 +102,7 @@ class Heat(NamedTuple):
     x: str
     y: str
     values: FloatArray  # (rows, columns)
-    ticks: tuple[str, ...]  # of the rows
+    ticks: tuple[str, ...]  # labels of the rows
     label: str
 
 
@@ -133,7 +133,8 @@ class Reproduction:
     title: str
     elements: tuple[Element, ...]
     tables: list[PaperTable] = field(default_factory=list)
-    figures: list[Figure] = field(default_factory=list)  # in addition to those of the tables
+    # figures in addition to those of the tables
+    figures: list[Figure] = field(default_factory=list)
     plots: list[PaperPlot] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

@@ -43,7 +43,8 @@ DRIVES: Final = {
     "001.gaining.dlc": "Figure 10: lane changes while gaining speed, μ .9",
     "001.gaining.slalom": "Figure 11: slalom while gaining speed, μ .9",
 }
-QUADRATIC: Final = 0.15  # e of the stiffness polynomial (14), as degressive as ordinary tyres
+# Coefficient e of the stiffness polynomial (14): as degressive as ordinary tyres.
+QUADRATIC: Final = 0.15
 
 
 @dataclass(frozen=True)

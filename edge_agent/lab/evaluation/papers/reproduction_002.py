@@ -34,7 +34,8 @@ from schemas.signals import S, per_wheel
 
 ESTIMATOR: Final = "compensated-wckf"
 FORCES: Final = tuple(f"F_x{wheel + 1}" for wheel in range(4))
-# tables 2 to 5: (WCKF-A, TFC or WCKF-B) by drive, measure and quantity; beta is printed of B alone
+# Tables 2 to 5, by drive, measure and quantity: the values of WCKF-A, then those of TFC (forces) or
+# WCKF-B (motion). For β the paper prints only the value of WCKF-B.
 PRINTED: Final[dict[str, dict[str, dict[str, tuple[float, float]]]]] = {
     "sine": {
         "pre": {
@@ -89,8 +90,8 @@ class ForceRun:
 
     batch: DriveSet
     truth: dict[str, FloatArray]
-    first: dict[str, FloatArray]  # WCKF-A
-    second: dict[str, FloatArray]  # forces compensated (TFC), motion of WCKF-B
+    first: dict[str, FloatArray]  # results of WCKF-A
+    second: dict[str, FloatArray]  # results of TFC (compensated forces) and WCKF-B (motion)
 
     def erms(self, stage: str) -> Values:
         """Return the root mean square error of each quantity (equation 38), for stage "A" (wheel

@@ -38,9 +38,9 @@ from schemas.runtime.figures import Figure
 from schemas.signals import S, per_wheel
 
 ESTIMATOR: Final = "sr-ukf"
-NEAR: Final = 0.02  # of friction: arrived
+NEAR: Final = 0.02  # a smaller error of friction counts as converged
 WHEEL_RADIUS_ERROR: Final = 1e-4
-WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s]
+WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s] standard deviation
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class FrictionCase:
     ukf: float
     seconds: float
     figure: str
-    realistic: str  # scenario with ordinary sensors
+    realistic: str  # name of the scenario with ordinary sensors
 
 
 CASES: Final = (

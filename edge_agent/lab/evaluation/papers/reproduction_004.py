@@ -37,16 +37,18 @@ SCENARIO: Final = "004.dlc"
 VARIANCE: Final = 0.05
 NOISES: Final = ("constant", "variable")
 STATES: Final = {"vx": "v_x [m/s]", "vy": "v_y [m/s]", "yaw_rate": "yaw rate [rad/s]", "mu": "μ"}
-# tables 3 and 4: by noise and measure, FCKF and ACOFCKF of v_x, v_y, yaw rate, mu
+# Tables 3 and 4, by noise and measure: the errors of FCKF, then those of ACOFCKF, each for v_x,
+# v_y, yaw rate and μ.
 PRINTED: Final = {
     ("constant", "mae"): ((0.1286, 0.0684, 0.0081, 0.0188), (0.072, 0.0131, 0.0040, 0.0095)),
     ("constant", "rmse"): ((0.1449, 0.1108, 0.0127, 0.0373), (0.0813, 0.0212, 0.0063, 0.0259)),
     ("variable", "mae"): ((0.1321, 0.0514, 0.0094, 0.0141), (0.0440, 0.0171, 0.0018, 0.010)),
     ("variable", "rmse"): ((0.1502, 0.0832, 0.0149, 0.0309), (0.0500, 0.0277, 0.0028, 0.0240)),
 }
-PEAKS: Final = {"vx": 0.0493, "vy": 0.0622, "yaw_rate": 0.0341, "mu": 0.0068}  # IV.B, as shares
+# peak errors of section IV.B, as shares
+PEAKS: Final = {"vx": 0.0493, "vy": 0.0622, "yaw_rate": 0.0341, "mu": 0.0068}
 SHOWN: Final = {("constant", "mae", "mu"): ".0095 (printed .095)"}
-STILL: Final = Memberships(outputs=(0.0,) * SETS)  # R constant
+STILL: Final = Memberships(outputs=(0.0,) * SETS)  # fuzzy sets that leave R constant
 TUNING_SEEDS: Final = (31, 32, 33)
 ANTS: Final = 10
 ITERATIONS: Final = 12

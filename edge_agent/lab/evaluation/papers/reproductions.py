@@ -29,7 +29,7 @@ REPRODUCTIONS: Final[dict[str, Callable[[Sequence[int]], Reproduction]]] = {
     "003": reproduction_003.reproduce,
     "004": reproduction_004.reproduce,
 }
-LONGEST_S: Final = 90.0  # of one paper on two cores
+LONGEST_S: Final = 90.0  # [s] limit for the reproduction of one paper on two cores
 
 
 def write_paper(
