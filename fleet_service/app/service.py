@@ -38,8 +38,8 @@ from schemas.runtime.metrics import serve_metrics
 from schemas.wire import Alert
 
 IDLE_S: Final = 0.05  # [s] longest wait for a message: segments and tiles are late by at most this
-# [s] Period in which active alerts are published again. A client that reconnects gets them within 5
-# s.
+# [s] Period in which active alerts are published again. A client that reconnects gets them
+# within 5 s.
 REPEAT_S: Final = 2.0
 REPEATED: Final = 1000  # alerts per period (150 kB); further alerts follow in the next periods
 # [s] Longest time for one segment or one tile of an answer. Then systemd restarts the service.

@@ -91,7 +91,7 @@ class SegmentLog(Generic[Batch]):
         self._writer = Writer(root, shard, epoch)
         self._upload = upload
         self._next: _Load[Batch] = _Load()
-        self._load: _Load[Batch] = _Load()  # rows that are being written
+        self._load: _Load[Batch] = _Load()  # rows and batches that are being written
         self._written: Future[None] | None = None
         self._began = 0.0
         self.begun_s = -math.inf
@@ -189,7 +189,7 @@ class SegmentLog(Generic[Batch]):
             OSError: the disk is full or broken; rows that are not durable wait for the next write.
         """
         durable = self.end()
-        # they are returned with the other batches, whose write may fail
+        # Return these batches with those of the next write, because that write may fail.
         self._next.batches[:0] = durable
         self.begin()
         return self.end()

@@ -26,8 +26,10 @@ from typing import Any, Final
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 
-QUESTION_BYTES: Final = 1024  # limit of payload and attachment; queries have neither
-# limit for a picture of the map ahead, or for the signals: ten times the largest measured
+# Largest size [bytes] of payload and attachment of a query; valid queries have neither.
+QUESTION_BYTES: Final = 1024
+# Largest size [bytes] of a picture of the map ahead, or of the signals: ten times the largest
+# measured.
 PRIVATE_BYTES: Final = 256 * 1024
 PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
 WEATHER: Final = f"{keys.ROOT}/weather/**"
@@ -45,10 +47,10 @@ MESSAGES: Final = (
     "declare_liveliness_subscriber",
 )
 MAX_SESSIONS: Final = 5000  # one per vehicle; Zenoh's own limit is 1000
-# A whole tile as GeoJSON is about 50 MB. Without this limit Zenoh would join fragments up to a
-# gigabyte before it checks the size.
+# [bytes] A whole tile as GeoJSON is about 50 MB. Without this limit, Zenoh would join fragments up
+# to a gigabyte before it checks the size.
 MAX_MESSAGE: Final = 64 * 1024 * 1024
-LEASE_MS: Final = 3000  # time after which a silent peer counts as disconnected
+LEASE_MS: Final = 3000  # [ms] time after which a silent peer counts as disconnected
 
 Section = dict[str, Any]
 
@@ -66,7 +68,8 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
         "connect": {"endpoints": [fleet.routers[other].router_endpoint for other in before]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
         "transport": {
-            "shared_memory": {"enabled": False},  # drops samples silently when a receiver stalls
+            # If a receiver stalls, shared memory drops samples without an error.
+            "shared_memory": {"enabled": False},
             "unicast": {"max_sessions": MAX_SESSIONS},
             "link": {
                 "protocols": router.protocols,
@@ -132,8 +135,8 @@ def access_control(fleet: Enrolment) -> Section:
         | {"permission": "deny"},
         _allow_rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _allow_rule("told", ("egress",), ("put", "reply"), PUBLIC),
-        # Declared publishers and queriers send nothing, without an error, until they are told that
-        # a subscriber exists.
+        # Until Zenoh tells a declared publisher or querier that a subscriber exists, it sends
+        # nothing and reports no error.
         _allow_rule(
             "listened",
             ("egress",),
@@ -200,7 +203,7 @@ def _own_rules(name: str) -> list[Section]:
             ("put",),
             [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), *keys.private_keys(name)],
         ),
-        # a declared publisher sends nothing until it is told that its owner has subscribed
+        # A declared publisher sends nothing until Zenoh tells it that the vehicle has subscribed.
         _allow_rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
         *_subscriber_rules(name, keys.private_keys(name)),
         _allow_rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),

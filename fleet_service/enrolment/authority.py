@@ -25,7 +25,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably
 
-SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the authority's
+SKEW: Final = timedelta(minutes=10)  # how far a vehicle's clock may be behind the authority's
 Key = ec.EllipticCurvePrivateKey
 
 
@@ -165,11 +165,8 @@ def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> 
     """Return True if the certificate authority issued the certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
-    except (
-        InvalidSignature,
-        ValueError,
-        TypeError,
-    ):  # signed by another key, issued by another name, or another kind of key
+    # In this order: signed by another key, issued by another name, or another type of key.
+    except (InvalidSignature, ValueError, TypeError):
         return False
     return True
 

@@ -20,7 +20,7 @@ from fleet_service.enrolment.access import router_configuration
 from fleet_service.enrolment.fleet import Enrolment, Step
 from schemas.errors import InputError
 
-PRIVATE: Final = 0o700  # mode of the authority's folder
+PRIVATE: Final = 0o700  # file mode of the authority's folder
 
 
 @dataclass(frozen=True)
@@ -204,11 +204,8 @@ class Registry:
         `revoked/`.
         """
         for name in gone:
-            for ending in (
-                ".key",
-                ".json5",
-                ".pem",
-            ):  # the certificate is moved last, so that an interrupted step is repeated
+            # Move the certificate last, so that an interrupted call is repeated.
+            for ending in (".key", ".json5", ".pem"):
                 path = self._folder / f"{name}{ending}"
                 if path.exists():
                     path.rename(self._revoked / path.name)

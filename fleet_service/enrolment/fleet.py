@@ -14,9 +14,8 @@ from pydantic import AfterValidator, Field, model_validator
 from schemas.config import Settings, VehicleName
 
 _LABEL = r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"  # RFC 1123, section 2.1
-_HOST = re.compile(
-    rf"(?:{_LABEL}\.)*{_LABEL}\.?"
-)  # each character matches in one way only, so a wrong name is rejected without backtracking
+# Each character can match in only one way, so a wrong name is rejected without backtracking.
+_HOST = re.compile(rf"(?:{_LABEL}\.)*{_LABEL}\.?")
 
 
 def _checked_host(host: str) -> str:
@@ -28,7 +27,7 @@ def _checked_host(host: str) -> str:
     return host
 
 
-Step = Literal["next", "switch", "drop"]  # steps of the change to another authority
+Step = Literal["next", "switch", "drop"]  # steps of a change of the certificate authority
 Host = Annotated[str, AfterValidator(_checked_host)]
 
 

@@ -16,7 +16,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.image import LAYOUT, fusion_of, image_of
 from schemas.errors import InputError
 
-# tables of another version are not used; the archive is replayed instead
+# Version of the tables. If a checkpoint has another one, the service replays the archive instead.
 VERSION: Final = f"5-{LAYOUT}"
 _KEY: Final = b"gripmap.checkpoint"
 
@@ -44,9 +44,8 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
     """Return the values of a list column as a NumPy array. Numbers are a view of the same memory.
     Arrow's own conversion is not used, because it would import another library.
     """
-    whole = (
-        column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
-    )  # copies the chunks into one piece
+    # `combine_chunks` copies the chunks into one piece of memory.
+    whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
     values = cast("pa.LargeListArray[Any]", whole).flatten()
     if pa.types.is_boolean(values.type):
         return np.asarray(values)

@@ -30,8 +30,10 @@ from fleet_service.archive.format.version import KEY, VERSION
 from schemas.errors import InputError
 from schemas.runtime.durable import open_durably, sync_directory
 
-KEPT: Final = 2  # the newest, and the one before it if the newest is damaged
-# after so many failed starts, a service starts from the archived rows, without the checkpoint
+# Number of checkpoints that are kept: the newest, and the one before it in case the newest is
+# damaged.
+KEPT: Final = 2
+# After this number of failed starts from a checkpoint, a service starts from the archived rows.
 TRIES: Final = 4
 _DRAFT: Final = ".draft"
 _MANIFEST: Final = "manifest.json"
@@ -124,7 +126,7 @@ def mark_begun(path: Path) -> None:
     """Record that a service is starting from a checkpoint (saved state); `mark_survived` removes
     the record.
     """
-    with suppress(OSError):  # a full disk must not prevent the start
+    with suppress(OSError):  # a service must start even if the disk is full
         (path / _TRIED).write_text(str(_count_tries(path) + 1))
 
 

@@ -35,6 +35,7 @@ from schemas.tables import US_STEP
 from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
+# columns that the fusion needs
 COLUMNS: Final = [
     *(
         "leave_time",
@@ -49,16 +50,18 @@ COLUMNS: Final = [
     ),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
     *("used_longitudinal", "used_lateral", "late_by", *FLAGS),
-]  # columns that the fusion needs
-FILTERED: Final = ("longitude", "received_at")  # additional columns, if only some rows are selected
+]
+# columns that are read in addition if only some rows are selected
+FILTERED: Final = ("longitude", "received_at")
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
-# rows of a day in memory at once: 200 MB, doubled while the next part is read
+# Largest number of rows of a day in memory at once: 200 MB, and as much for the next part, which is
+# read meanwhile.
 PART_ROWS: Final = 4_000_000
-# rows that are fused at once: intermediate results take four times their memory
+# Number of rows that are fused at once. Intermediate results take four times their memory.
 CHUNK_ROWS: Final = 100_000
 _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
-SEGMENT_ROW_BYTES: Final = 60  # minimum size of a row in the inbox
-# margin around a box: over 100 m, more than the position error of a visit
+SEGMENT_ROW_BYTES: Final = 60  # smallest size of a row in the inbox
+# [deg] Margin around a box: over 100 m, which is more than the position error of a visit.
 MARGIN_DEG: Final = 0.002
 
 
@@ -74,7 +77,7 @@ class Begin(NamedTuple):
 
     day: int | None = None
     after: layout.Cut | None = None
-    until: layout.Cut | None = None  # position in the sequence of segments
+    until: layout.Cut | None = None
 
 
 def restore_streams(
@@ -219,7 +222,7 @@ def past_fusion(
     wanted = Since(begin, until=until, box=box, most=most)
     heard = ignore_observations if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
-        pass  # past alerts are not needed
+        pass  # a past map has no alerts
     return fusion
 
 
@@ -264,9 +267,8 @@ def replay(
     wanted = reading.Wanted(
         columns, where, days, since.begin.after, since.begin.until, since.near()
     )
-    waiting: list[
-        tuple[Observations, RecordedResult]
-    ] = []  # late rows that were fused after the end of their table
+    # late rows that were fused after the end of their table, with the recorded result
+    waiting: list[tuple[Observations, RecordedResult]] = []
     known = vehicle_ids.read_numbers(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
         rows = segments.rows_of(table)
@@ -356,7 +358,7 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
         else _prefetch_parts(_split_parts(listing, most))
     ):
         yield from held.chunks()
-        pa.default_memory_pool().release_unused()  # before the next part is read
+        pa.default_memory_pool().release_unused()  # so that the next part can use this memory
         trim_memory()
 
 
@@ -428,7 +430,8 @@ class _Held:
         self._name = name
         self._borders = borders
         self._kept: list[list[pa.Buffer]] = [[] for _ in borders[1:]]
-        self._taken: list[tuple[int, int, pa.Buffer]] = []  # chunk number and rows
+        # parts that are not confirmed yet: chunk number, number of rows, compressed rows
+        self._taken: list[tuple[int, int, pa.Buffer]] = []
         self.rows = 0
 
     def take(self, table: pa.Table) -> None:

@@ -21,7 +21,7 @@ from schemas.numeric import IntArray
 from schemas.wire import Alert
 
 log = logging.getLogger(__name__)
-# Tables of a checkpoint in addition to those of the fusion.
+# names of the tables of a checkpoint that do not belong to the fusion
 ALERTS: Final = "alerts"
 STREAMS: Final = "streams"
 ABOVE: Final = "streams_above"
@@ -75,7 +75,7 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
                 for n, t in extra.items()
             }
             fusion = fusion_from(tables, lateness_s)
-        except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
+        except Exception as error:  # noqa: BLE001 for any problem: the archive has all rows
             log.warning("checkpoint %s is not used: %s", path.name, error)
             refused += 1
             continue

@@ -22,7 +22,7 @@ from schemas.runtime.installing import install_command
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
-# a folder on this machine is not a second place; it is for trials
+# A local folder is no second place, so `file://` is only for trials.
 SCHEMES: Final = re.compile(r"(s3|gs|az|abfss?)://[^/]+|file:///.")
 CONNECT_S: Final = 2.0
 _ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
@@ -79,10 +79,8 @@ class ObjectBucket:
         )
         plain = next((place for place in places if place), "").startswith("http://")
         seconds = {"timeout": f"{timeout_s:g}s", "connect_timeout": f"{CONNECT_S:g}s"}
-        client: Any = {
-            **seconds,
-            **({"allow_http": True} if plain else {}),
-        }  # otherwise the environment decides
+        # Without "allow_http", the environment decides.
+        client: Any = {**seconds, **({"allow_http": True} if plain else {})}
         retry: Any = {"max_retries": retries, "retry_timeout": timedelta(seconds=timeout_s)}
         given: Any = dict(options)
         try:
@@ -137,7 +135,7 @@ class ObjectBucket:
             try:
                 self._do.put(self._store, name, content, mode="create")
             except self._known:
-                return self.get(name) == content  # an upload that timed out had succeeded
+                return self.get(name) == content  # True after an upload that seemed to time out
         return True
 
     def list_names(self, folder: str) -> list[str]:
@@ -205,7 +203,7 @@ class ObjectBucket:
             raise
         except FileNotFoundError as error:
             if error.filename is not None:
-                raise  # the file to upload does not exist
+                raise  # the local file to upload does not exist
             raise CopyError(f"{name}: {error_summary(error)}") from None
         except self._failed as error:
             raise CopyError(f"{name}: {error_summary(error)}") from None

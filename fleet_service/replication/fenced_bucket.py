@@ -70,7 +70,7 @@ class FencedBucket:
         self._put_fence(term, fence)
         self.require_lease()
         for name in self.objects.list_sizes():
-            if not fence.counts_object(name):  # no service writes this name again
+            if not fence.counts_object(name):  # no later service writes an object of this name
                 self.objects.delete(name)
 
     def admit_objects(self, names: Iterable[str]) -> None:

@@ -49,7 +49,7 @@ class FileTransfer:
         elif is_new and name.endswith(".key"):
             self._bucket.create_key(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
-            # the file of vehicle identities grows meanwhile, and is then uploaded again
+            # The file of vehicle identities may grow during the upload. It is then uploaded again.
             bucket.put(name, path.read_bytes())
         else:
             bucket.put(name, path)
@@ -88,7 +88,8 @@ class FileTransfer:
         list(self._pool.map(self._download_file, wanted))
         paths = [self._files.path_of(name) for name in wanted]
         sync_tree(self._files.root, {path.parent for path in paths})
-        # only now; otherwise, after a power loss, the files would look deleted
+        # Record the files only now. After a power loss, recorded but missing files would count as
+        # deleted.
         for name, path in zip(wanted, paths, strict=True):
             self._journal.add(name, stamp_of(path))
             self._files.set_aside_path(name).unlink(missing_ok=True)

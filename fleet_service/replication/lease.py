@@ -73,17 +73,18 @@ from schemas.runtime.durable import open_durably
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
-# file in the archive with the identity of its folder, kept over restarts
+# File in the archive with the identity of this folder. It stays the same over restarts.
 HOLDER: Final = "holder.json"
-TURNS: Final = 6  # renewals per lease time
+TURNS: Final = 6  # number of renewals per lease time
 # Share of `lease_s` after which a holder without a token may be replaced. It is more than one half,
 # because a holder acknowledges for `lease_s / 2` after its last renewal.
 HINT: Final = 0.6
-# period of a standby's downloads, so that little remains to be downloaded at a take-over
+# [s] Period in which a standby downloads new objects, so that little is left to download at a
+# take-over.
 AHEAD_S: Final = 10.0
 _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
-UNKNOWN: Final = "unknown"  # the service of a damaged lease object
-LOOK_S: Final = 0.25  # period of the checks while waiting
+UNKNOWN: Final = "unknown"  # holder's name if the lease object is damaged
+LOOK_S: Final = 0.25  # [s] period of the checks while waiting
 
 
 class LeaseRecord(NamedTuple):
@@ -136,10 +137,10 @@ class Standby(NamedTuple):
         get_ahead: downloads new objects from the bucket in advance.
     """
 
-    may: Callable[[], bool]  # True if the standby reaches a router
-    stands: Callable[[str], bool]  # True if the named service has a token
-    alive: Callable[[], None]  # called at each check
-    get_ahead: Callable[[], None]  # downloads new objects from the bucket
+    may: Callable[[], bool]
+    stands: Callable[[str], bool]
+    alive: Callable[[], None]
+    get_ahead: Callable[[], None]
 
 
 class Lease:
@@ -391,7 +392,8 @@ class Lease:
         self._renewed = began
         self.succeeds = found is not None and found.holder != self._holder
         if found is not None and self._bucket.get(found.name) != found.content:
-            # the lease was renewed in between, and its holder may acknowledge for half of `lease_s`
+            # The previous holder renewed the lease meanwhile, so it may acknowledge for half of
+            # `lease_s`.
             stop.wait(self._lease_s)
         return True
 

@@ -22,8 +22,8 @@ from fleet_service.replication.replica_files import FOLDERS
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
-AGAIN_S: Final = 1.0  # pause between attempts to reach the bucket
-REQUESTS: Final = 4  # requests that fit into one lease time
+AGAIN_S: Final = 1.0  # [s] pause between attempts to reach the bucket
+REQUESTS: Final = 4  # number of requests that fit into one lease time
 
 
 class Ownership:
@@ -118,9 +118,8 @@ def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
         raise
 
 
-Signs = tuple[
-    Callable[[], bool], Callable[[str], bool], Callable[[], None]
-]  # as returned by `serving.standby_signs`
+# result of `serving.standby_signs`
+Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]
 
 
 def acquire_archive(

@@ -30,11 +30,12 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 
 OWNER: Final = "service.json"
-# time limit of a request on which an acknowledgement depends; the worker may wait as long
+# [s] Time limit of a request on which an acknowledgement depends. The worker may wait as long.
 QUICK_S: Final = 5.0
-SLOW_S: Final = 300.0  # time limit of other requests: a compacted file has tens of megabytes
-TURN_S: Final = 20.0  # time of one call of `upload_segments`, after which it reports its progress
-_AT_ONCE: Final = 8  # concurrent requests
+SLOW_S: Final = 300.0  # [s] limit of other requests: compacted files have tens of megabytes
+# [s] Longest time of one call of `upload_segments`, so that it can report its progress.
+TURN_S: Final = 20.0
+_AT_ONCE: Final = 8  # number of concurrent requests
 
 
 class BucketReplica:
@@ -194,7 +195,7 @@ class BucketReplica:
                     self._upload_quickly(some[0])
                 else:
                     list(self._pool.map(self._upload_quickly, some))
-            # compacted meanwhile; its rows are in files that are uploaded later
+            # Compaction has moved the rows of a segment into files that are uploaded later.
             except FileNotFoundError:
                 self._upload_changes(with_log=True)
                 return
@@ -208,7 +209,8 @@ class BucketReplica:
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being uploaded")
         try:
-            # listed before the files, so that a new file does not count as deleted
+            # Copy the journal before the files are listed, so that a new file does not count as
+            # deleted.
             known = self._journal.copy_stamps()
             local = self._files.list_files()
             new = [
@@ -226,8 +228,7 @@ class BucketReplica:
             removed.sort(key=lambda name: not name.endswith(MANIFEST))
             self.bucket.admit_objects(new)
             if removed:
-                # the next owner then finds everything that was uploaded until now, and nothing that
-                # it needs is deleted
+                # Without the lease, this could delete objects that the next owner needs.
                 self.bucket.require_lease()
             for name in removed:
                 self._slow.delete(name)

@@ -13,9 +13,8 @@ from fleet_service.replication.upload_journal import Stamp, stamp_of
 
 LOG: Final = "inbox/"
 KEYS: Final = "keys/"
-# Order in which folders are listed: compaction adds to the later ones before it deletes from the
-# inbox, and retention computes roll-ups before it deletes observations. So a row that has been
-# moved is found in a later folder.
+# Order in which folders are listed. Compaction adds to later folders before it deletes from the
+# inbox. Retention computes roll-ups before it deletes observations. So a moved row is always found.
 FOLDERS: Final = (
     "inbox",
     "observations",
@@ -27,7 +26,7 @@ FOLDERS: Final = (
     "keys",
 )
 MANIFEST: Final = "manifest.json"  # file that makes a folder a valid checkpoint
-_PRIVATE: Final = ("tried",)  # notes that concern only this disk
+_PRIVATE: Final = ("tried",)  # files that concern only this disk and are not uploaded
 
 
 class ReplicaFiles:

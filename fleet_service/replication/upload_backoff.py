@@ -9,7 +9,7 @@ from typing import Final
 
 from fleet_service.replication.bucket import CopyError
 
-BACK_OFF_S: Final = 0.5  # pause after the first failure; doubled after each further one
+BACK_OFF_S: Final = 0.5  # [s] pause after the first failure; each further failure doubles it
 MOST_BACK_OFF_S: Final = 8.0
 
 

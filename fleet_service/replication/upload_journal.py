@@ -58,7 +58,7 @@ class UploadJournal:
         self._stamps: dict[str, Stamp] = {}
         lines = path.read_text(errors="replace").splitlines() if path.exists() else []
         for line in lines[1:] if lines[:1] == [head] else []:
-            with suppress(ValueError, TypeError, KeyError):  # incomplete line after a power loss
+            with suppress(ValueError, TypeError, KeyError):  # a power loss cut off the line
                 name, *stamp = json.loads(line)
                 self._stamps.pop(name, None)
                 if stamp:

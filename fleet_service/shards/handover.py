@@ -25,7 +25,7 @@ from schemas.errors import InputError
 from schemas.runtime import presence
 
 ANSWER_S: Final = 10.0
-MOVED_S: Final = 300.0  # long enough for a running compaction to end
+MOVED_S: Final = 300.0  # [s] long enough for a running compaction to end
 LOOK_S: Final = 0.05
 FIX: Final = "start it with --standby, the same settings and a name of its own"
 

@@ -18,10 +18,11 @@ from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import presence, zenoh_session
 
-# time after which the token of a frozen or lost service disappears: its lease is 3 s
+# [s] Time after which the token of a frozen or lost service has disappeared. Its Zenoh lease is
+# 3 s.
 GONE_S: Final = 5.0
 LOOK_S: Final = 0.1
-_TRIES: Final = 5  # attempts if several services start at the same moment
+_TRIES: Final = 5  # number of attempts if several services start at the same moment
 
 
 @contextmanager
@@ -116,7 +117,7 @@ def _claim_regions(
         held = _declare_tokens(session, mine, CLAIMS)
         if not others_there():
             return held
-        for token in held:  # both began at once; the first that tries again takes the region
+        for token in held:  # another service began at the same time; the first to retry succeeds
             token.undeclare()
         stop.wait(secrets.randbelow(1000) * 1e-3)
     raise InputError(

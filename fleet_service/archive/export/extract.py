@@ -28,7 +28,7 @@ from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
-# columns of the roll-up about mu
+# columns of the roll-up that describe measured friction
 _OF_MU: Final = ("mu_sum", "mu_sum_squares", "mu_min", "mu_max", "value_sum")
 Box = tuple[float, float, float, float]
 
@@ -93,9 +93,8 @@ def map_then(root: Path, part: Extract) -> pa.Table:
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
-    table = mask_unmeasured(
-        table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound"
-    )  # files before 1.2 state a value here
+    # Files before format 1.2 have a number in `mu` even if only a lower bound is known.
+    table = mask_unmeasured(table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound")
     return geo.with_cells(_cells_in_box(table, part.bbox))
 
 
@@ -123,7 +122,7 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
     found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
-    measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
+    measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before format 1.2
     table = mask_unmeasured(table, _OF_MU, measured)
     return geo.with_cells(
         _cells_in_box(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")])
@@ -188,7 +187,7 @@ def _write_geojson(table: pa.Table, path: Path) -> None:
         for place, feature in enumerate(geojson_features(table)):
             file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
-        file.detach()  # flushes it; `open_durably` closes it
+        file.detach()  # flushes the text; `open_durably` closes the file
 
 
 def iso_text(us: int) -> str:

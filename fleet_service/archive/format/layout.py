@@ -30,19 +30,15 @@ from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
-TIME: Final = {
-    Kind.OBSERVATION: "leave_time",
-    Kind.STATE: "time",
-}  # time of the measurement, which decides how long rows are kept
-FIRST_TIME: Final = {
-    Kind.OBSERVATION: "enter_time",
-    Kind.STATE: "time",
-}  # time that decides whether a batch is too old, and its month
-CHECKPOINTS: Final = "checkpoints"  # a folder
-EPOCH_FILE: Final = "term"  # file that contains the epoch of the service that owns the folder
+# column with the time of the measurement, which decides how long rows are kept
+TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
+# column with the time that decides the month of a batch, and whether it is too old
+FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}
+CHECKPOINTS: Final = "checkpoints"  # name of the folder
+EPOCH_FILE: Final = "term"  # file with the epoch of the service that owns the folder
 DAY_NS: Final = 86_400_000_000_000
-# Days of observations that affect the map, and of batches that may be sent again
-# (ServiceConfig.oldest_s is 30 days).
+# Number of days whose observations affect the map. Batches may be sent again for 30 days
+# (ServiceConfig.oldest_s).
 MAP_DAYS: Final = 31
 _EPOCH: Final = date(1970, 1, 1)
 _TERM: Final = re.compile(r"\.\d{10}$")
@@ -52,9 +48,8 @@ _OF_A_TERM: Final = {
     "weather": re.compile(r"\.(?P<term>\d{10})-(?P<epoch>\d{20})\.parquet$"),
     "keys": re.compile(r"(?P<epoch>)\.(?P<term>\d{10})\.witnesses$"),
 }
-_DAY: Final = re.compile(
-    r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])"
-)  # the expression does not match copies of folders made by a person
+# The expression does not match copies of folders that a person has made.
+_DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")
 
 
 class Cut(NamedTuple):
@@ -83,7 +78,7 @@ class Partition(NamedTuple):
         return root / table / f"date={date_of(self.day)}" / zone
 
 
-# Files of a started service, and results of compaction: every archive has at least one of them.
+# Folders that a started service or a compaction creates. Every archive has at least one of them.
 MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 

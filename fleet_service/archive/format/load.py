@@ -32,10 +32,9 @@ from schemas.errors import InputError
 
 log = logging.getLogger(__name__)
 BAD: Final = ".bad"
-BATCH_ROWS: Final = (
-    1 << 14
-)  # rows in memory while a file is read in parts; a row group takes ten times as much
-BUFFER_BYTES: Final = 1 << 16  # read buffer per column in this case
+# Rows in memory while a file is read in parts. A whole row group takes ten times as much.
+BATCH_ROWS: Final = 1 << 14
+BUFFER_BYTES: Final = 1 << 16  # [bytes] read buffer per column in this case
 
 # Columns without which a row is not valid in any version.
 NEEDED: Final = frozenset(
@@ -70,7 +69,7 @@ def set_aside(path: Path, problem: str) -> None:
     writes the archive may do this.
     """
     log.warning("%s is damaged and was set aside: %s", path, problem)
-    # another reader in this process found the damage at the same time
+    # Another thread may have renamed the file already.
     with suppress(FileNotFoundError):
         path.rename(path.with_name(path.name + BAD))
 
@@ -122,7 +121,7 @@ def load(
         names = None if whole else [name for name in known.names if name in file.schema_arrow.names]
         if where is not None and file.metadata.num_row_groups > 1:
             return _read_row_groups(file, names, where)
-        return file.read(names)  # half the time of read_table for small files
+        return file.read(names)  # takes half the time of `read_table` for small files
 
     found = _read_verified(path, read_rows, damaged)
     if found is None:
@@ -166,7 +165,7 @@ def load_groups(
                 filter_table(conform_columns(part, known), where)
                 for part in _read_batches(file, group, names)
             ]
-            if parts:  # empty if the file's only vehicle was erased
+            if parts:  # there are none if the data of the file's only vehicle were erased
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
 
@@ -217,14 +216,12 @@ def _read_verified(
             path, page_checksum_verification=True, buffer_size=buffer_bytes
         ) as file:
             entries = entries_of(file.metadata.metadata)
-            if is_newer(
-                entries
-            ):  # checked before reading, because a newer version may store the columns differently
+            # Check this before reading, because a newer version may store the columns differently.
+            if is_newer(entries):
                 check_version(path, file.schema_arrow, entries)
             table = read(file)
-            whole = (
-                table.num_columns == file.metadata.num_columns
-            )  # the schema is then available in a third of the time
+            # The schema of a completely read table is available in a third of the time.
+            whole = table.num_columns == file.metadata.num_columns
             version = check_version(path, table.schema if whole else file.schema_arrow, entries)
         table.validate(full=True)
         return Content(table, version, entries)
@@ -232,7 +229,7 @@ def _read_verified(
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError, DamagedError) as error:
         if isinstance(error, OSError) and error.errno is not None:
-            raise  # an error of the system, not of the file
+            raise  # an error of the operating system, not of the file
         damaged(path, (str(error).splitlines() or [""])[0][:200])
         return None
 
@@ -257,9 +254,8 @@ def _convert_column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[A
                 f"a file has no column {wanted.name}",
                 "read it with the GripMap that wrote it",
             )
-        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(
-            table.column_names
-        ):  # before 1.2
+        # Files before format 1.2 lack this column.
+        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):
             mu, used = (
                 np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised")
             )

@@ -27,10 +27,12 @@ from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
 
-# Key in the footer: the segments that the rows come from, as JSON [[SHARD-EPOCH, first number, last
-# number], …].
+# Key in the footer of a compacted file. Its value lists the segments that the rows come from, as
+# JSON: [[SHARD-EPOCH, first number, last number], …].
 SOURCES: Final = b"gripmap.sources"
-_TURNS: Final = 100  # after so many restarts by compactions there must be another problem
+# Number of attempts to read the inbox while compaction moves files. After these, there is another
+# problem.
+_TURNS: Final = 100
 
 
 class Wanted(NamedTuple):
@@ -186,7 +188,7 @@ def _read_inbox(
                 )
                 for path in paths
             ]
-        except FileNotFoundError:  # compacted meanwhile
+        except FileNotFoundError:  # compaction has moved a file, so list the files again
             continue
         return [(path, table) for path, table in loaded if table is not None]
     raise OSError(f"the inbox of {root} changes faster than it can be read")

@@ -91,7 +91,7 @@ def write_if_outdated(root: Path) -> None:
     """
     path = root / NAME
     page = page_text().encode()
-    # bytes, because a power loss may have left any content
+    # Read bytes and not text, because a power loss may have left invalid content.
     there = path.read_bytes() if path.exists() else b""
     if there != page and (
         not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())

@@ -57,7 +57,7 @@ def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     ]
 
 
-def _may_match(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's has no name
+def _may_match(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow has no type
     if statistics is None or not statistics.has_min_max:
         return True
     least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])

@@ -32,7 +32,8 @@ _FOLDERS: Final = {Kind.OBSERVATION: "inbox", Kind.STATE: "inbox/states"}
 _TIMES: Final = ("enter_time", "leave_time", "time", "received_at")
 _STEPS: Final = {f.name: f.step for f in (*tables.OBSERVATION, *tables.STATE) if f.step}
 
-NEARLY: Final = 1e-6  # far below the columns' steps, so that rounding decides nothing
+# Tolerance far below the columns' steps, so that rounding does not affect comparisons.
+NEARLY: Final = 1e-6
 Rows = dict[str, NDArray[Any]]
 
 
@@ -67,19 +68,15 @@ class Writer:
         folders = [segment_folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
             inbox.mkdir(parents=True, exist_ok=True)
-            for draft in inbox.glob(
-                f"*{ENDING}"
-            ):  # drafts of an interrupted run; their rows were never acknowledged
+            # Drafts of an interrupted run contain no acknowledged rows.
+            for draft in inbox.glob(f"*{ENDING}"):
                 draft.unlink()
-        for parent in {
-            root.parent,
-            root,
-            *folders,
-        }:  # if a power loss removes a folder, its segments are lost too
+        # If a power loss removed one of these folders, its segments would be lost too.
+        for parent in {root.parent, root, *folders}:
             sync_directory(parent)
         self._unsynced: set[Path] = set()
-        # Compacted rows are identified by the names of their segments, so these names must not be
-        # used again either.
+        # Compacted rows are identified by the names of their segments. So names of compacted
+        # segments must not be used again either.
         named = [
             path
             for kind in SCHEMAS

@@ -39,7 +39,7 @@ class Version(NamedTuple):
 
 
 VERSION: Final = Version(1, 4)
-OLDEST: Final = Version(1, 0)  # version of files that state none
+OLDEST: Final = Version(1, 0)  # version of files that state no version
 PREFIX: Final = "gripmap."
 KEY: Final = PREFIX + "version"
 DIGEST: Final = PREFIX + "digest"

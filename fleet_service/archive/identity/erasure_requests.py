@@ -25,7 +25,7 @@ from schemas.runtime.durable import open_durably
 FOLDER: Final = "requests"
 _ANSWER: Final = ".answer.json"
 _SECRET: Final = 0o600  # the file contains a vehicle's name until the request is answered
-_KEPT_S: Final = 86_400.0  # time for which an answer that nobody collects is kept
+_KEPT_S: Final = 86_400.0  # [s] time for which an answer is kept if no process reads it
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,10 @@ def write_request(root: Path, wanted: Erasure) -> Path:
     path = folder / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
     with open_durably(path, _SECRET) as file:
         file.write(json.dumps(asdict(wanted)).encode())
+    # If root makes the request, the files must belong to the service's user.
     owner = root.stat()
     for place in (folder, path):
-        with suppress(PermissionError):  # an administrator makes the request for the service's user
+        with suppress(PermissionError):
             os.chown(place, owner.st_uid, owner.st_gid)
     return path
 

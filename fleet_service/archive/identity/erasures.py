@@ -75,8 +75,8 @@ def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None 
     if pseudonym is not None:
         (folder / f"{month}.{pseudonym}.{max(until, 0)}.erased").touch(0o600)
     else:
-        # The erasure of a month replaces the records of its vehicles. A vehicle's erasure may
-        # extend beyond the newest remaining row.
+        # The erasure of a month replaces the records of single vehicles. Such a record may extend
+        # beyond the newest remaining row.
         names = [
             name
             for path in folder.glob(f"{month}.*.erased")

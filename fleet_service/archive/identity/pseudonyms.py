@@ -103,9 +103,9 @@ def load_or_create_key(path: Path) -> bytes:
         with open_durably(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
             file.write(key + _key_digest(key))
-        sync_directory(
-            path.parent.parent
-        )  # otherwise a power loss could remove the key, and with it acknowledged batches
+        # Without this, a power loss could remove the key, and acknowledged batches would be lost
+        # with it.
+        sync_directory(path.parent.parent)
     return _read_key(path)
 
 

@@ -33,7 +33,7 @@ from schemas.runtime.durable import open_durably, sync_directory
 
 ENDING: Final = ".witnesses"
 _KEY: Final = "witness.key"
-_LINE: Final = 24  # bytes: pseudonym, number, check
+_LINE: Final = 24  # bytes per line: pseudonym, number, checksum
 _SECRET: Final = 0o600
 _MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
@@ -67,9 +67,8 @@ class VehicleIds:
             path.touch(_SECRET)
             self._unsynced.add(path)
             with path.open("r+b", buffering=0) as file:
-                file.seek(
-                    file.seek(0, os.SEEK_END) // _LINE * _LINE
-                )  # overwrite an incomplete line that a full disk has left
+                # Overwrite an incomplete line that a full disk has left.
+                file.seek(file.seek(0, os.SEEK_END) // _LINE * _LINE)
                 if file.write(_encode_line(pseudonym, number)) != _LINE:
                     raise OSError(errno.ENOSPC, "no space for another line", str(path))
             self._known.add(pseudonym)
@@ -95,7 +94,7 @@ class VehicleIds:
             OSError: the disk is full or broken; the next call tries again.
         """
         for path in sorted(self._unsynced):
-            if path.exists():  # otherwise the month was erased meanwhile
+            if path.exists():  # unless the month has been erased
                 with path.open("rb") as file:
                     os.fsync(file.fileno())
                 sync_directory(self._folder)

@@ -30,7 +30,8 @@ from fleet_service.archive.format.version import KEY, VERSION
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
-# Maximum rows of one round: half a gigabyte of memory, and files of several row groups.
+# Largest number of rows of a round: it needs half a gigabyte of memory, and its files have several
+# row groups.
 ROUND_ROWS: Final = 1_000_000
 
 
@@ -70,7 +71,7 @@ def hold_compaction_lock(root: Path) -> Iterator[None]:
     with lock_compacted(root):
         drafts = root / "drafts"
         drafts.mkdir(exist_ok=True)
-        for draft in drafts.iterdir():  # drafts of an interrupted run
+        for draft in drafts.iterdir():  # left by an interrupted run
             draft.unlink()
         yield
 
@@ -99,8 +100,8 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
                 layout.compacted_files(root, kind), {path.name for path in waiting}
             )
             # An interrupted run, or one with a full disk, may have placed files whose names are not
-            # synced yet. Their segments must not be deleted before a power loss can no longer
-            # remove these names.
+            # synced yet. A power loss could still remove these names. So sync them before their
+            # segments are deleted.
             sync_tree(
                 root,
                 {
@@ -216,7 +217,7 @@ def split_by_partition(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Par
     time = segments.to_nanoseconds(table[layout.TIME[kind]])
     cell = table["cell"].to_numpy()
     day, zone = layout.partitions_of(time, cell)
-    order = np.lexsort((time, cell, day))  # the zone is the cell's leading digits
+    order = np.lexsort((time, cell, day))  # also sorts by zone: the leading digits of the cell
     table = table.take(order)
     day = day[order]
     zone = zone[order]

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-SIZE: Final = 64 << 20  # space for a round of compaction and its roll-ups
+SIZE: Final = 64 << 20  # [bytes] space for a round of compaction and its roll-ups
 NAME: Final = "reserve"
 _LEAST_FREE: Final = 4 * SIZE
 

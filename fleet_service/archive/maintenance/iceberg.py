@@ -24,13 +24,13 @@ from schemas.runtime.durable import open_durably
 from schemas.runtime.installing import install_command
 from schemas.wire import Kind
 
-Catalog: TypeAlias = Any  # class of pyiceberg, which is not needed for archives without tables
+Catalog: TypeAlias = Any  # a class of pyiceberg, which is an optional package
 Table: TypeAlias = Any
 
 RECORD: Final = "iceberg.json"  # file in the archive that states where its files are registered
 NAMESPACE: Final = "gripmap"
 PROPERTIES: Final = {
-    # the tables' own files then contain no pseudonym
+    # Without minima and maxima, the metadata of the tables contain no pseudonyms.
     "write.metadata.metrics.column.vehicle": "counts",
     "write.metadata.delete-after-commit.enabled": "true",
     "write.metadata.previous-versions-max": "20",
@@ -75,7 +75,7 @@ def register(root: Path, place: Place) -> RegistrationResult:
         OSError: the archive cannot be read or written.
     """
     total = RegistrationResult(0, 0, 0)
-    with hold_compaction_lock(root):  # no other process removes or rewrites files meanwhile
+    with hold_compaction_lock(root):  # no other process may remove or rewrite files meanwhile
         _record_registration(root, place)
         with _one_line_errors(place):
             catalog = _open_catalog(place)
@@ -134,7 +134,7 @@ def _record_registration(root: Path, place: Place) -> None:
     path = root / RECORD
     try:
         before = place_of(root)
-    except InputError:  # a damaged record is written again
+    except InputError:  # the record is damaged; write it again
         before = None
     if before is not None and before != place:
         problem = (
@@ -159,12 +159,12 @@ def _open_catalog(place: Place) -> Catalog:
     if not place.catalog.startswith(("sqlite://", "postgresql")):
         return load_catalog(place.catalog)
     catalog_properties = {"type": "sql", "uri": place.catalog}
-    # the tables' own files are stored next to the catalogue
+    # The metadata of the tables are stored next to the catalogue's file.
     if place.catalog.startswith("sqlite:///"):
         catalog_properties["warehouse"] = (
             Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
         )
-    # the name under which other programs find the tables
+    # Other programs find the tables under this catalogue name.
     return load_catalog("gripmap", **catalog_properties)
 
 
@@ -180,7 +180,7 @@ def _open_table(catalog: Catalog, place: Place, kind: Kind) -> Table:
         new = catalog.create_table_transaction(
             name, schema=_plain_schema(schema), properties=PROPERTIES
         )
-        with new, new.update_spec() as spec:  # a compacted file contains one date
+        with new, new.update_spec() as spec:  # one partition per date, as in compacted files
             spec.add_field(layout.TIME[kind], DayTransform(), "date")
     table = catalog.load_table(name)
     if set(schema.names) - {field.name for field in table.schema().fields}:
@@ -203,7 +203,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
         for name, file in _files_by_name(table).items()
         if name.startswith(_folder_url(place))
     }
-    # a file that was rewritten elsewhere is recognised by its size
+    # A file that was rewritten under the same name is recognised by its size.
     stale = [
         n
         for n, file in mine.items()
@@ -227,7 +227,7 @@ def _commit_files(table: Table, removed: list[Any], added: list[str]) -> None:
                 for file in removed:
                     without.delete_data_file(file)
         if added:
-            # `_files_by_name` has already checked this
+            # The caller has already excluded duplicates (`_files_by_name`).
             change.add_files(added, check_duplicate_files=False)
 
 
@@ -253,7 +253,7 @@ def _one_line_errors(place: Place) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:  # every catalogue raises errors of its own
+    except Exception as error:  # each catalogue library has exceptions of its own
         fix = "check that the catalog can be reached, then run the command again"
         raise InputError(
             "catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix

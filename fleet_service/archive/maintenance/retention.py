@@ -33,10 +33,10 @@ from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
-# A batch may be sent again for thirty days (ServiceConfig.oldest_s). Its rows are needed to
-# recognise it.
+# Shortest time [days] for which rows are kept. A batch may be sent again for thirty days
+# (ServiceConfig.oldest_s), and its rows are needed to recognise it.
 LEAST_DAYS: Final = 31
-# vehicles of a cell below which a single one could be recognised; the value of the secure settings
+# With fewer vehicles in a cell, a single one could be recognised. Same as in the secure settings.
 ANONYMOUS: Final = 5
 _KEYS: Final = "keys"
 
@@ -152,7 +152,7 @@ class ErasureResult(NamedTuple):
 
     rows: int
     files: tuple[Path, ...]
-    kept: str | None = None  # reason why the archive's copy still contains the rows
+    kept: str | None = None
 
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
@@ -199,8 +199,8 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
     files = [*root.rglob(f"*{BAD}")]
     cells = set[int]()
     with hold_compaction_lock(root):
-        drop_checkpoints(root)  # checkpoints contain the vehicle's reports
-        for damaged in files:  # the content of damaged files is unknown
+        drop_checkpoints(root)  # because they contain the vehicle's reports
+        for damaged in files:  # because it is unknown which reports they contain
             damaged.unlink()
         for kind in Kind:
             theirs = [

@@ -150,7 +150,7 @@ def _cell_statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     }
 
 
-# the values are columns of many types
+# `values` are columns of many types.
 def _make_array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401
     if pa.types.is_list(kind):
         offsets = np.arange(len(values) + 1, dtype=np.int32) * mugrid.BINS
