@@ -19,7 +19,9 @@ from typing import NamedTuple
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-LEAST_FACTOR = 0.8  # R holds model error too, which a calm stretch does not disprove
+# [1] limits of the factor on R. It hardly decreases, because R also covers model errors, which may
+# return after a stretch with small innovations.
+LEAST_FACTOR = 0.8
 LARGEST_FACTOR = 10.0
 
 

@@ -29,7 +29,7 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
 FEET: Final = 2 * (SETS - 1)
-# share of the distance of two peaks by which their sets overlap at least
+# [1] smallest overlap of neighbouring sets over the distance of their peaks
 LEAST_OVERLAP: Final = 0.02
 
 

@@ -35,12 +35,12 @@ import numpy as np
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-SETS = 5
-CHANNELS = 2  # wheel speed against force; axle slip against lateral force
-LARGEST_MISMATCH = 20.0
-LARGEST_STEP = 0.7  # [nat] a step of adaptation at most doubles R
-LARGEST_SCALE = 2.5  # [nat]
-NOISE = 2 * SETS + CHANNELS  # numbers of what concerns R alone
+SETS = 5  # number of fuzzy sets
+CHANNELS = 2  # groups of measurements: wheels (longitudinal), axles (lateral)
+LARGEST_MISMATCH = 20.0  # [1] limit of `inputs`
+LARGEST_STEP = 0.7  # [nat] limit of `outputs`: one adaptation at most doubles R
+LARGEST_SCALE = 2.5  # [nat] limit of `ln_scales` and of `consequents`
+NOISE = 2 * SETS + CHANNELS  # number of parameters that concern R alone
 LENGTHS = {
     "inputs": SETS,
     "outputs": SETS,
@@ -50,14 +50,12 @@ LENGTHS = {
     "shares": 12,
     "strained": 2,
 }
-RETIRED = (
-    "stretched",
-    "lately",
-)  # in files of before: contradiction is a test of likelihoods now, and has no vertices
-RAMPS = ("far",)
-LEAST_SHARE = -8.0  # [nat]
-SHARE_REACH = 1.5  # [nat] to either side, in which an optimiser looks for a share
-CLOSEST = 0.01  # peaks of neighbouring sets stay apart
+# Fields of older files, which are ignored: a likelihood test has replaced these fuzzy sets.
+RETIRED = ("stretched", "lately")
+RAMPS = ("far",)  # fields with a foot and a peak
+LEAST_SHARE = -8.0  # [nat] smallest ln of a share of evidence
+SHARE_REACH = 1.5  # [nat] largest change of `shares` and `strained` by an optimiser
+CLOSEST = 0.01  # [1] smallest distance of neighbouring peaks
 
 
 @dataclass(frozen=True)
@@ -73,10 +71,8 @@ class Memberships:
     outputs: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
-    consequents: tuple[float, ...] = (
-        0.67,
-        0.25,
-    )  # without: in town three times as many contradictions
+    # Without these two rules, contradictions in town were three times as frequent.
+    consequents: tuple[float, ...] = (0.67, 0.25)
     shares: tuple[float, ...] = (
         -5.0,
         -3.1,

@@ -28,14 +28,15 @@ from edge_agent.adaptation.memberships import LEAST_SHARE, Memberships
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-# [1] peaks of the sets of demand, force over load
+# [1] peaks of the sets of demand (force over load)
 LOW = 0.06
 MIDDLE = 0.13
 HIGH = 0.3
-# [1] peaks of the sets of strain, chi-square over degrees of freedom
+# [1] peaks of the sets of strain (chi-square over degrees of freedom)
 CALM = 1.0
 STRAINED = 2.5
-WIDE = (0.1, 0.35)  # [rad] angles between which the maps of real steering leave their gain
+# [rad] foot and peak of the set WIDE: between these angles the gain of real steering changes
+WIDE = (0.1, 0.35)
 
 
 class RuleBase(NamedTuple):
@@ -48,12 +49,12 @@ class RuleBase(NamedTuple):
 
     far: Annotated[FloatArray, 2]
     wide: Annotated[FloatArray, 2]
-    ln_noise: float  # of an axle whose steering is WIDE [nat]
-    pace: float  # of offsets, slope and bank where the wheels are FAR [1/s]
+    ln_noise: float  # [nat] added to ln R of an axle while its steering is WIDE
+    pace: float  # [1/s] return rate of offsets, slope and bank, added while the wheels are FAR
     shares: Annotated[FloatArray, 12]
     strained: Annotated[FloatArray, 2]
-    by_sets: bool  # whether the rules give the share of evidence; else `plain_share`
-    plain: Annotated[FloatArray, 3]  # of `plain_share`: half demand, power, share of steady forces
+    by_sets: bool  # True if the fuzzy rules give the share of evidence, False for `plain_share`
+    plain: Annotated[FloatArray, 3]  # half, power and steady of `plain_share`
 
 
 def rule_base(memberships: Memberships) -> RuleBase:

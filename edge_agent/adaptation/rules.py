@@ -35,8 +35,8 @@ PRINTED: Final = (
     "PB PSM PS PM PM PMB PB",
     "PMB PS PSM PMB PMB PB PVB",
 )
-ALPHA: Final = np.array([-0.8, -0.5, -0.2, 0.0, 0.5, 1.5, 4.0])
-RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s]
+ALPHA: Final = np.array([-0.8, -0.5, -0.2, 0.0, 0.5, 1.5, 4.0])  # [1] peaks of the sets of alpha
+RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s] peaks of the sets of its rate
 
 
 def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:

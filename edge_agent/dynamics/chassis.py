@@ -17,7 +17,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 from schemas.thresholds import GRAVITY
 
-DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
+# Value of `shape` that selects a Dugoff tyre; the shape factor c of the Magic Formula is above 1
+DUGOFF = 0.0
 
 
 @compiled
@@ -119,10 +120,10 @@ class PlanarMotion(NamedTuple):
 class WheelInputs(NamedTuple):
     """Inputs of the four wheels: steering, wheel speed, given longitudinal force, friction."""
 
-    cos: Four  # of the steering
-    sin: Four
-    omega: Four  # NaN rolls freely
-    force_x: Four  # [N] in place of the tyre's longitudinal force where it is not NaN
+    cos: Four  # cosine of the steering angle
+    sin: Four  # sine of the steering angle
+    omega: Four  # [rad/s] NaN for a wheel that rolls freely
+    force_x: Four  # [N] replaces the tyre's longitudinal force where it is not NaN
     mu: Four
 
 

@@ -21,11 +21,11 @@ from typing import NamedTuple
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-ELECTRIC_S = 0.125 / 0.688  # T_e, paper 002, table 1
-# k1, k2; not given
+ELECTRIC_S = 0.125 / 0.688  # [s] T_e from table 1 of paper 002
+# k1 [N/s^2] and k2 [1/s] of the sliding mode, which the paper does not give
 SLIDING_GAIN = 2000.0
 SLIDING_RATE = 10.0
-SOFT_N_S = 500.0  # the sign is smoothed over so much
+SOFT_N_S = 500.0  # [N/s] width of the smooth step, tanh(F'/SOFT_N_S), that replaces the sign of F'
 
 
 class WheelState(NamedTuple):
@@ -33,10 +33,10 @@ class WheelState(NamedTuple):
     [N] and its derivative [N/s].
     """
 
-    torque: float  # tau
+    torque: float
     omega: float
-    force: float  # F
-    slope: float  # F'
+    force: float
+    slope: float
 
 
 @compiled

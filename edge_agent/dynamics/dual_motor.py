@@ -19,8 +19,8 @@ from typing import Final
 
 from schemas.runtime.jit import inlined
 
-RATIO: Final = 9.0  # i_t of an ordinary electric car
-EFFICIENCY: Final = 0.95  # eta_t
+RATIO: Final = 9.0  # [1] transmission ratio i_t of an ordinary electric car
+EFFICIENCY: Final = 0.95  # [1] efficiency eta_t of the transmission
 
 
 @inlined

@@ -12,7 +12,7 @@ from edge_agent.dynamics.parameters import Body, Four
 from schemas.runtime.jit import inlined
 from schemas.thresholds import GRAVITY
 
-# of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
+# [1] smallest wheel load over the static one, so that force over load stays finite
 LEAST_LOAD_SHARE = 0.02
 
 
@@ -25,7 +25,7 @@ def wheel_loads(body: Body, ax: float, ay: float) -> Four:
     """
     mass = body.mass
     height = body.cg_height
-    # what does not depend on ax and ay stands in brackets: many states share it
+    # Factors that do not depend on ax and ay are in brackets, so that they are computed only once.
     per_base = 1.0 / (body.to_front + body.to_rear)
     pitch = ax * (mass * height * per_base)
     front = mass * GRAVITY * body.to_rear * per_base - pitch

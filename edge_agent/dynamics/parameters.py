@@ -19,21 +19,21 @@ class Parameter(IntEnum):
 
     MASS = 0  # [kg]
     YAW_INERTIA = 1  # [kg m^2]
-    TO_FRONT = 2  # centre of gravity to front axle [m]
-    TO_REAR = 3  # centre of gravity to rear axle [m]
+    TO_FRONT = 2  # [m] distance from centre of gravity to front axle
+    TO_REAR = 3  # [m] distance from centre of gravity to rear axle
     TRACK_FRONT = 4  # [m]
     TRACK_REAR = 5  # [m]
     CG_HEIGHT = 6  # [m]
-    RADIUS = 7  # wheel radius [m]
+    RADIUS = 7  # [m] wheel radius
     WHEEL_INERTIA = 8  # [kg m^2]
-    SLOPE_X = 9  # longitudinal slip stiffness per wheel load [1]
-    SLOPE_Y = 10  # cornering stiffness per wheel load [1/rad]
-    DRIVE_FRONT = 11  # share of the driving force on the front axle [1]; NaN where unknown
-    # how stiffness depends on load and friction, as papers print it; 0, 0 and 1: not at all
-    PROPORTIONAL = 12  # 1: slip stiffness is proportional to friction (000, 003, 004 as printed)
-    # e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
+    SLOPE_X = 9  # [1] longitudinal slip stiffness per wheel load
+    SLOPE_Y = 10  # [1/rad] cornering stiffness per wheel load
+    DRIVE_FRONT = 11  # [1] share of the driving force on the front axle; NaN if unknown
+    # The next three select the stiffness of printed papers; 0, 0 and 1 have no effect.
+    PROPORTIONAL = 12  # 1 if stiffness is proportional to friction (000, 003, 004 as printed)
+    # [1] e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
     QUADRATIC = 13
-    # cornering stiffness per load of the rear tyres over that of the front ones (002, table 1)
+    # [1] ratio of rear to front cornering stiffness per load (002, table 1)
     REAR_SLOPE = 14
 
 

@@ -13,7 +13,7 @@ from edge_agent.dynamics.parameters import Parameter
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 
-SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip has no meaning
+SLOWEST_M_S = 0.5  # [m/s] smallest denominator of slip, which has no meaning near standstill
 
 
 @compiled
@@ -67,5 +67,5 @@ def wheel_slips(radius: float, omega: float, along: float, across: float) -> tup
 
     Positive slip_x gives a forward force, positive slip_y a force to the left.
     """
-    share = 1.0 / max(abs(along), SLOWEST_M_S)  # one division, which is what a step waits for
+    share = 1.0 / max(abs(along), SLOWEST_M_S)  # divide only once, because a division is slow
     return (radius * omega - along) * share, -across * share

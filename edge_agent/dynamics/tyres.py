@@ -19,7 +19,7 @@ import math
 
 from schemas.runtime.jit import compiled, inlined
 
-TINY = 1e-12  # below it a slip has no direction and no force
+TINY = 1e-12  # a smaller slip counts as zero: it has no direction and no force
 
 
 @compiled

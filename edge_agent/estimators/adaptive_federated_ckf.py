@@ -47,17 +47,18 @@ from schemas.runtime.jit import compiled
 from schemas.runtime.records import records
 from schemas.vehicle import Vehicle
 
-DRY = 0.85  # the friction that is set: the paper's first experiment
-WINDOW_S = 0.5  # of the innovation variances; the paper's M is not given
-ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's .85 to 1
+DRY = 0.85  # [1] friction that is set, as in the paper's first experiment
+WINDOW_S = 0.5  # [s] half-life of the innovation averages; the paper does not give its M
+# [1] c of (32), .85 to 1 in the paper: a larger gamma reduces the share of a sub-filter
+ORDINARY = 1.0
 
 
 class AdaptiveMemory(FederatedMemory):
     """State of paper 001's filter for one vehicle, kept from one sample to the next."""
 
-    actual: Annotated[FloatArray, 2, ROWS]  # windowed squared innovations
-    expected: Annotated[FloatArray, 2, ROWS]  # windowed innovation variances
-    alpha: Annotated[FloatArray, 2]  # mismatch at the sample before
+    actual: Annotated[FloatArray, 2, ROWS]  # averaged squared innovations
+    expected: Annotated[FloatArray, 2, ROWS]  # averaged innovation variances
+    alpha: Annotated[FloatArray, 2]  # mismatch at the previous sample
 
 
 class AdaptiveDesign:
@@ -67,13 +68,13 @@ class AdaptiveDesign:
 
     friction: Annotated[FloatArray, 4]
     adaptive: bool
-    levels: Annotated[FloatArray, 5, 7]  # of the rules
+    levels: Annotated[FloatArray, 5, 7]  # [nat] output of each fuzzy rule
 
 
 class AdaptiveSetting(NamedTuple):
     """Options of paper 001's filter: motion filter and fuzzy rules."""
 
-    adaptive: bool = True  # False: R and shares stay as they are, which is the comparator FKF
+    adaptive: bool = True  # False: R and shares are constant (comparator FKF)
     tyre: TyreOption = TyreOption()
     motion: MotionSetting = MotionSetting()
 
@@ -113,7 +114,7 @@ def make_bank(
 
 
 @compiled
-# `design` is unused: all filters have this signature
+# `design` is unused, because all filters have this signature.
 def _begin_filter(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001
     begin_motion(memory)
     memory.actual[:], memory.expected[:], memory.alpha[:] = 0.0, 0.0, 0.0

@@ -99,9 +99,8 @@ class EstimatorBank:
         if threads == 1:
             self._entered(self._filters, self._contexts, t, signals, results, (0, 0, count))
             if self._entered is self._kernel:
-                self._entered = entry_point(
-                    self._kernel
-                )  # `checked` sees to it that all arguments are of one kind
+                # `check_arrays` ensures that the arguments always have the same types.
+                self._entered = entry_point(self._kernel)
             return _pack_estimates(values, evidence, closes)
         if threads > len(self._contexts):
             self._contexts = np.repeat(self._contexts[:1], threads)

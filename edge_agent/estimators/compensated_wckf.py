@@ -61,17 +61,18 @@ A_XI = cubature_rule(A_STATES).xi
 A_WEIGHT = cubature_rule(A_STATES).w_cov
 B_XI = cubature_rule(B_STATES).xi
 B_WEIGHT = cubature_rule(B_STATES).w_cov
-SHAPE = 1.4  # c of the Magic Formula (12): between the usual lateral 1.3 and longitudinal 1.65
-WINDOW = 25  # samples; the paper's N is not given
-# of the nominal R
+# [1] c of the Magic Formula (12), between the usual 1.3 (lateral) and 1.65 (longitudinal)
+SHAPE = 1.4
+WINDOW = 25  # number of samples in the moving window; the paper does not give its N
+# [1] limits of R over its nominal value
 LEAST = 0.5
 LARGEST = 20.0
-# process standard deviations per s^.5: offsets of the accelerometers, yaw model error, then torque,
-# speed, force
+# Process standard deviations per s^.5, in the order of the states: v_x and v_y (offsets of the
+# accelerometers), yaw rate (model error), torque, wheel speed, force and its derivative
 A_PROCESS = np.array([0.05, 0.05, 0.2, *[20.0] * 4, *[0.5] * 4, *[100.0] * 4, *[2e4] * 4])
-A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of r, tau, omega
-B_PROCESS = np.array([0.1, 0.1, 0.1])
-B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of r, a_x, a_y, with some model error
+A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of measured r, tau and omega
+B_PROCESS = np.array([0.1, 0.1, 0.1])  # process of v_x, v_y and r, in the same units
+B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of measured r, a_x and a_y, with model errors
 
 
 class DriveWheelState(IntEnum):
@@ -95,11 +96,11 @@ class CompensatedMemory(PaperMemory):
 
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]
-    window: Annotated[FloatArray, A_ROWS, WINDOW]  # innovations
+    window: Annotated[FloatArray, A_ROWS, WINDOW]  # latest innovations
     fused: Annotated[FloatArray, B_STATES]
     fused_root: Annotated[FloatArray, B_STATES, B_STATES]
     fused_window: Annotated[FloatArray, B_STATES, WINDOW]
-    compensated: Annotated[FloatArray, 4]  # longitudinal forces (33) at B's motion [N]
+    compensated: Annotated[FloatArray, 4]  # [N] longitudinal forces (33) at the motion of WCKF-B
 
 
 class FrictionSet:
@@ -127,7 +128,7 @@ def make_bank(
 
 
 @compiled
-# `context` is unused: all filters have this signature
+# `context` is unused, because all filters have this signature.
 def _begin_filter(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001
     row = memory.row
     mean = memory.mean
@@ -189,7 +190,7 @@ def _compensated_forces(
     tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, forces)
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
-        # a wheel whose speed is missing has no slip to judge by: its force is the observed one
+        # A wheel without a speed reading has no known slip. Its force is then the observed one.
         share[wheel] = (
             0.0
             if math.isnan(omega[wheel])

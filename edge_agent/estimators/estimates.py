@@ -26,20 +26,20 @@ class Column(IntEnum):
     VY_STD = 5
     YAW_RATE_STD = 6
     SIDESLIP_STD = 7
-    MU = 8  # median [1]
-    MU_LOWER = 9  # 5 %
-    MU_UPPER = 10  # 95 %
-    MU_UTILISED = 11  # largest grip used by any wheel in the last second [1]
-    INNOVATION_NIS = 12  # per row of measurement; 1 is expected
-    ADAPTATION = 13  # largest factor on R
-    INNOVATION_LOG_LIKELIHOOD = 14  # of what was measured at the sample, 0 where nothing was [nat]
+    MU = 8  # [1] median
+    MU_LOWER = 9  # [1] 5 % quantile
+    MU_UPPER = 10  # [1] 95 % quantile
+    MU_UTILISED = 11  # [1] largest grip used by any wheel in the last second
+    INNOVATION_NIS = 12  # mean over the measurements; 1 is expected
+    ADAPTATION = 13  # [1] largest factor on R
+    INNOVATION_LOG_LIKELIHOOD = 14  # [nat] of the sample's measurements, 0 without measurements
     HEALTH = 15  # schemas.signals.Health
     P_SLIPPERY = 16  # P(mu < SLIPPERY_MU)
-    WHEELS = 17  # median, lower, upper of each wheel, where the estimator has them
+    WHEELS = 17  # median, lower and upper end of each wheel, if the estimator has them
 
 
 COLUMNS = tuple(column.name.lower() for column in Column if column < Column.WHEELS)
-# how many numbers an estimator reports
+# Number of columns of an estimator with one friction, and with one per wheel
 ONE_FRICTION = int(Column.WHEELS)
 FOUR_FRICTIONS = int(Column.WHEELS) + 12
 
@@ -58,7 +58,7 @@ class _View:
         return estimates.values[..., self._place]
 
 
-def _view_column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says the type
+def _view_column(place: Column) -> Any:  # noqa: ANN401 each attribute is annotated with its type
     return _View(place)
 
 
@@ -90,10 +90,10 @@ class Estimates:
         self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None
     ) -> None:
         self.values = values  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Column
-        # (T, N, 32) log-likelihood on the friction grid: at closes of the visit's last part, at
-        # jumps of the part that ends there, else NaN
+        # (T, N, 32) log-likelihood on the friction grid, NaN at most samples. At the end of a visit
+        # it is that of the visit's last part, at a friction jump that of the part that ends.
         self.evidence = evidence
-        self.jumps = jumps  # (T, N) where the friction has become another within a visit
+        self.jumps = jumps  # (T, N) True where the friction jumped within a visit
 
     @property
     def health(self) -> FlagArray:

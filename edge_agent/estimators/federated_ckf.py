@@ -74,10 +74,10 @@ ROWS = 3
 RULE = cubature_rule(WHEELS)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
-NOISE_STD = np.array(
-    [0.15, 0.15, 0.004]
-)  # of a_x, a_y, r against the tyre model, for one independent measurement
-AY_SHARE = 0.05  # of a_y that the tyre model may miss
+# [m/s^2, m/s^2, rad/s] errors of a_x, a_y and r according to the tyre model, for one independent
+# measurement
+NOISE_STD = np.array([0.15, 0.15, 0.004])
+AY_SHARE = 0.05  # [1] relative error of a_y according to the tyre model
 
 
 class JointMemory(FederatedMemory):
@@ -85,8 +85,8 @@ class JointMemory(FederatedMemory):
 
     mean: Annotated[FloatArray, WHEELS]  # friction
     root: Annotated[FloatArray, WHEELS, WHEELS]
-    beta: float  # share of friction sub-filter 1
-    yaw_rate: float  # of the master at the sample before
+    beta: float  # [1] information share of friction sub-filter 1
+    yaw_rate: float  # [rad/s] of the master at the previous sample
 
 
 def make_bank(
@@ -103,7 +103,7 @@ def make_bank(
 
 
 @compiled
-# an argument is unused: all filters have this signature
+# An argument is unused, because all filters have this signature.
 def _begin_filter(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
     begin_motion(memory)
     memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5

@@ -55,10 +55,13 @@ from schemas.vehicle import Vehicle
 
 STATES = 6
 ROWS = 3
-STEP_S = 0.02  # the paper's sampling; Q and the fuzzy steps are per so much time
-KNOTS = 48  # of the fuzzy inference as a table: five sets need five, lower vertices more
-WINDOW_S = 0.5  # of the innovation variances
-# of R over its setting: table 2 varies it by 5
+# [s] sampling time of the paper, to which Q and the fuzzy steps refer
+STEP_S = 0.02
+# Number of points in the table of the fuzzy inference. Five sets need five points, and free lower
+# vertices need more.
+KNOTS = 48
+WINDOW_S = 0.5  # [s] half-life of the innovation averages
+# [1] limits of R over its setting; table 2 of the paper varies R by a factor of 5
 LEAST_FACTOR = 0.1
 LARGEST_FACTOR = 20.0
 
@@ -67,24 +70,15 @@ class Setting(NamedTuple):
     """Variances and initial state of the filter of paper 004, and options of its model."""
 
     process: tuple[float, ...] = (1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-5)  # Q per STEP_S (errata)
-    start: tuple[float, ...] = (
-        FIRST_V_STD**2,
-        FIRST_V_STD**2,
-        0.2,
-        0.2,
-        0.01,
-        PRIOR_MU_STD**2,
-    )  # P_0
-    noise: tuple[float, ...] = (
-        0.01,
-        0.01,
-        1e-4,
-    )  # R of ordinary sensors with some model error; the paper's is .05
-    mu: float = PRIOR_MU  # at the start: unknown; the paper begins at the truth
-    # begin without acceleration and yaw rate, as the paper does, not with those measured
+    # P_0, initial variances
+    start: tuple[float, ...] = (FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, PRIOR_MU_STD**2)
+    # R of ordinary sensors with some model error; the paper uses .05
+    noise: tuple[float, ...] = (0.01, 0.01, 1e-4)
+    mu: float = PRIOR_MU  # [1] initial friction; the paper starts at the true friction
+    # True to start with zero acceleration and yaw rate, as in the paper, instead of measured ones
     straight: bool = False
     tyre: TyreOption = TyreOption()
-    # longitudinal forces from one motor per axle, (4) to (6), instead of slip
+    # True to compute longitudinal forces from one motor per axle, (4) to (6), instead of from slip
     dual_motor: bool = False
 
 
@@ -110,9 +104,9 @@ class FuzzyMemory(PaperMemory):
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
-    actual: Annotated[FloatArray, ROWS]  # windowed innovation variances
-    theoretical: Annotated[FloatArray, ROWS]
-    factor: Annotated[FloatArray, ROWS]  # on R
+    actual: Annotated[FloatArray, ROWS]  # averaged squared innovations
+    theoretical: Annotated[FloatArray, ROWS]  # averaged innovation variances
+    factor: Annotated[FloatArray, ROWS]  # [1] R over its setting
 
 
 class FuzzyContext:
@@ -122,14 +116,14 @@ class FuzzyContext:
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
     start: Annotated[FloatArray, STATES]  # standard deviations
-    noise: Annotated[FloatArray, ROWS]  # variances
+    noise: Annotated[FloatArray, ROWS]  # variances of the setting
     fuzzy_inputs: Annotated[FloatArray, KNOTS]
     fuzzy_outputs: Annotated[FloatArray, KNOTS]
     mu: float
     straight: bool
     dual_motor: bool
     points: Annotated[FloatArray, STATES, POINTS]
-    adapted: Annotated[FloatArray, ROWS]  # variances
+    adapted: Annotated[FloatArray, ROWS]  # noise variances of the current sample
     gain: Annotated[FloatArray, STATES]
 
 
@@ -195,7 +189,7 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
     square = 0.0
     determinant = 1.0
     for r in range(ROWS):
-        # the measurement is linear, a state itself
+        # The measurement is linear, because it is one of the states.
         reading = memory.track.now[r]
         if not math.isnan(reading):
             far, expected = carlson_update(

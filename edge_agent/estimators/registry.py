@@ -53,11 +53,10 @@ ESTIMATORS = {
     ),
     "sr-ukf": "paper 003: square-root unscented filter for four-wheel friction with wheel torque",
 }
-# whose memberships come from the ant colony, and the name of the file that `banks.bank_of` takes
-# them from
+# Estimators whose memberships the ant colony tunes -> name of the file with these memberships
 TUNED: Final = {"aco-fckf": "aco-fckf", "paper-aco-fckf": "paper-aco-fckf"}
 
-# the papers' estimators without fuzzy sets that could be tuned
+# Estimators of the papers that have no fuzzy sets to tune
 PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
     "federated-ckf": federated_ckf.make_bank,
     "adaptive-federated-ckf": adaptive_federated_ckf.make_bank,

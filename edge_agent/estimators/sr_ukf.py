@@ -76,28 +76,26 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
-# rows: speed of the wheels, r, a_y, four longitudinal forces
 STATES = 7
-ROWS = 7
+ROWS = 7  # number of measurements: speed of the wheels, r, a_y, four longitudinal forces
 RULE = unscented_rule(STATES, 1.0, 2.0, 0.0)
 XI = RULE.xi
 W_MEAN = RULE.w_mean
 W_COV = RULE.w_cov
-DRIFT = np.array(
-    [0.05, 0.05, 0.1]
-)  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
-FIRST_RATE_STD = 0.1  # [rad/s] of the yaw rate at the first sample
-RATE_STD = 0.003  # [rad/s]
-SLOWEST_SLIP_M_S = 1.0  # noise of the wheel speeds is slip at this speed at least
-# [m/s^2], and of a_y, that the tyre model may miss, per independent measurement
-AY_STD = 0.15
-AY_SHARE = 0.05
-# of the load: rolling resistance; of the force: torque gain and stiffness
-FORCE_STD = 0.01
-FORCE_SHARE = 0.15
-# [1] radius differences, [rad/s] noise: through the slip stiffness
-SLIP_STD = 0.001
-OMEGA_STD = 0.03
+# [m/s, m/s, rad/s per s^.5] process noise: offsets of the accelerometers, error of the yaw model
+DRIFT = np.array([0.05, 0.05, 0.1])
+FIRST_RATE_STD = 0.1  # [rad/s] error of the yaw rate at the first sample
+RATE_STD = 0.003  # [rad/s] error of the measured yaw rate
+SLOWEST_SLIP_M_S = 1.0  # [m/s] smallest speed that converts wheel-speed noise into slip noise
+# Error of a_y according to the tyre model, for one independent measurement
+AY_STD = 0.15  # [m/s^2]
+AY_SHARE = 0.05  # [1] relative
+# Error of the longitudinal force
+FORCE_STD = 0.01  # [1] over load: rolling resistance
+FORCE_SHARE = 0.15  # [1] relative: torque gain and stiffness
+# Error of the slip
+SLIP_STD = 0.001  # [1] differences of the wheel radii
+OMEGA_STD = 0.03  # [rad/s] noise of the wheel speed
 
 
 class WheelFrictionState(IntEnum):
@@ -106,7 +104,7 @@ class WheelFrictionState(IntEnum):
     VX = 0
     VY = 1
     YAW_RATE = 2
-    MU = 3  # of the first wheel
+    MU = 3  # friction of the first wheel; the other wheels follow
 
 
 class UnscentedMemory(PaperMemory):
@@ -114,7 +112,7 @@ class UnscentedMemory(PaperMemory):
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
-    refused: float  # downdates
+    refused: float  # number of refused downdates
 
 
 def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> EstimatorBank:
@@ -128,7 +126,7 @@ def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Es
 
 
 @compiled
-# an argument is unused: all filters have this signature
+# An argument is unused, because all filters have this signature.
 def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
     mean = memory.mean
     root = memory.root

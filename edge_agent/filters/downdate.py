@@ -12,7 +12,9 @@ from edge_agent.filters.householder import LOG_TWO_PI, Measurement, triangulariz
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding decides the sign
+# [1] smallest remaining share of the variance in the direction of the column. Below it, rounding
+# errors decide the sign.
+LEAST_LEFT = 1e-12
 
 
 @compiled
@@ -33,7 +35,7 @@ def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> boo
         square += white[i] * white[i]
     if not 1.0 - square > LEAST_LEFT:
         return False
-    # Givens rotations from the last coordinate to the first turn (white, rest) into (0, 1)
+    # Givens rotations, from the last coordinate to the first, turn (white, rest) into (0, 1).
     rest = math.sqrt(1.0 - square)
     carried = white.copy()
     for i in range(n):

@@ -47,7 +47,7 @@ def fuse_estimates(
         white = other[k] - mean[k]
         for j in range(k):
             white -= work[k, j] * work[j, 2 * n - 1]
-        # right of the diagonal all is zero by now: room for the whitened difference
+        # The part right of the diagonal is zero now, so it can store the whitened difference.
         work[k, 2 * n - 1] = white / work[k, k]
     for i in range(n):
         for k in range(n):

@@ -158,7 +158,7 @@ def update(
         white /= work[row, row]
         log_likelihood -= math.log(work[row, row])
         square += white * white
-        # right of the diagonal all is zero by now: room for it
+        # The part right of the diagonal is zero now, so it can store the whitened innovation.
         work[row, points + used - 1] = white
         for i in range(n):
             mean[i] += work[used + i, row] * white

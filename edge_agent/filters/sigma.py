@@ -19,7 +19,7 @@ import numpy as np
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-EXACTNESS = 1e-9  # moments may miss by this much; alpha = 1e-3 costs six of the sixteen digits
+EXACTNESS = 1e-9  # tolerance of the moments; with alpha = 1e-3 six of sixteen digits are lost
 
 
 @dataclass(frozen=True)

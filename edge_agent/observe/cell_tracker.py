@@ -23,12 +23,13 @@ from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import S
 from schemas.thresholds import METRES_PER_DEGREE
 
-# a 10 Hz receiver that misses ten fixes is lost; at 15 m/s the next cell has been reached
+# [s] time for which a fix is used. A 10 Hz receiver that has missed ten fixes has no reception, and
+# at 15 m/s the vehicle has reached the next cell by then.
 FIX_HELD_S: Final = 1.0
-# of a cell's side, 1 to 2 m: three standard deviations of a receiver's white noise
+# [1] margin around a cell over its side, 1 to 2 m: three standard deviations of receiver noise
 CELL_MARGIN: Final = 0.1
-SECTOR_KEEP: Final = np.radians(5.0)  # beyond the sector's edge
-# a course is taken between fixes this far apart: some 8 degrees of noise
+SECTOR_KEEP: Final = np.radians(5.0)  # [rad] margin beyond the edges of a heading sector
+# [m] distance of the fixes from which a course is computed; the course noise is about 8 degrees
 COURSE_BASE_M: Final = 3.0
 NOWHERE: Final = -1  # cell of a vehicle without position
 
@@ -38,20 +39,20 @@ class CellTrack:
     samples; NaN where nothing has been received yet.
     """
 
-    fix_time: float  # of the last fix [s]
-    latitude: float  # of it [deg]
+    fix_time: float  # [s] time of the last fix
+    latitude: float  # [deg] last fix
     longitude: float
-    yaw_time: float  # of the last yaw [s]
+    yaw_time: float  # [s] time of the last yaw reading
     yaw: float  # [rad]
-    course_latitude: float  # where the course over ground is taken from [deg]
+    course_latitude: float  # [deg] position from which the next course is computed
     course_longitude: float
-    course: float  # over ground [rad from east]
-    west: float  # borders of the visited cell [deg]
+    course: float  # [rad from east] course over ground
+    west: float  # [deg] borders of the visited cell
     south: float
     east: float
     north: float
-    cell: int  # that is visited
-    sector: int
+    cell: int  # visited cell, or NOWHERE
+    sector: int  # heading sector of the visit, or NOWHERE
 
 
 class ReceiverSample:

@@ -26,16 +26,20 @@ from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import FLAGS, S
 
 # Design parameters.
-OFF_S: Final = 1.0
-# locked wheels stand still too, but a controller releases them within a fraction of a second
+OFF_S: Final = 1.0  # [s] time for which a flag must have been off before it is used
+# [s] time at standstill after which an active flag is implausible. Locked wheels stand too, but a
+# controller releases them within a fraction of a second.
 STANDING_S: Final = 5.0
-MOST_ACTIVE: Final = 0.3  # of the time; a long way of ice is less, an average winter drive far less
-LEAST_ACTIVE_S: Final = 30.0  # a braking from 30 m/s to rest on ice of .1 lasts as long
-MEMORY_S: Final = 600.0  # over which the share is taken, with exponential forgetting
-MOST_STEP_S: Final = 0.5  # longer gaps count as this much
-STANDING_RATE: Final = 1.0  # [rad/s] of the fastest wheel: .3 m/s
+# [1] largest plausible share of the time. A long icy road reaches less, an average winter drive far
+# less.
+MOST_ACTIVE: Final = 0.3
+# [s] shortest active time for this test: braking from 30 m/s to rest on ice of friction .1
+LEAST_ACTIVE_S: Final = 30.0
+MEMORY_S: Final = 600.0  # [s] time constant of the exponential forgetting for this share
+MOST_STEP_S: Final = 0.5  # [s] longest step that is counted; longer gaps count as this
+STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (about .3 m/s)
 
-# why a flag is doubted; these add up
+# Reasons why a flag is implausible, as bits that are added
 NEVER_OFF = 1
 STANDING = 2
 TOO_OFTEN = 4
@@ -52,12 +56,12 @@ class FlagRecord:
     is known.
     """
 
-    time: float  # time of the flag's last known sample [s]
-    off: float  # for how long it has been off without a break [s]
-    active: float  # for how long it was on, with exponential forgetting (MEMORY_S) [s]
-    known: float  # for how long it was known, with the same forgetting [s]
-    standing: float  # for how long it was on while the vehicle stood, since it was last off [s]
-    was_off: bool  # True once it was off for OFF_S without a break
+    time: float  # [s] time of the flag's last known sample
+    off: float  # [s] time for which it has been off without interruption
+    active: float  # [s] time for which it was on, with exponential forgetting (MEMORY_S)
+    known: float  # [s] time for which it was known, with the same forgetting
+    standing: float  # [s] time for which it was on at standstill, since it was last off for OFF_S
+    was_off: bool  # True once it was off for OFF_S without interruption
     doubt: int  # sum of the reasons why it is implausible, such as NEVER_OFF; 0 if plausible
 
 

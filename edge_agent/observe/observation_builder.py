@@ -31,22 +31,23 @@ if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
 FLAG_UNKNOWN: Final = -1
-KNOWN_SHARE: Final = 0.5  # of a visit's samples, from which on "not active" can be said of a flag
+# [1] share of a visit's samples in which a flag must be known to be reported as not active
+KNOWN_SHARE: Final = 0.5
 WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
-# No wheel uses more than this over what the vehicle feels: load moves to wheels that then bear
-# more, and the wheels of one driven axle, with half of the load or more, drive all of it. A reading
-# of g is right to FELT_STD.
-WHEEL_SHARE: Final = 1.3
+# Upper limit of the grip that a wheel may have used, computed from the accelerations over g:
+WHEEL_SHARE: Final = 1.3  # [1] factor, because load moves between the wheels
+# [1] further factor on driving acceleration, because one axle, with about half the load or more,
+# may drive the whole car
 DRIVEN_SHARE: Final = 1.5
-FELT_STD: Final = 0.03
-FELT_S: Final = 0.06  # smoothing of the accelerometers: their largest reading would be noise
-# What was felt belongs to the cell so near a fix in it, and once as much of it is behind as a fix
-# may be wrong: of ice that was left or entered by dry road a sixth of the visits told a grip that
-# the dry road had given.
+FELT_STD: Final = 0.03  # [1] error of acceleration over g
+# [s] smoothing of the accelerometers, because their largest unsmoothed reading would be noise
+FELT_S: Final = 0.06
+# [m] The accelerations count for a cell within this distance after a fix in it, once the vehicle
+# has driven at least the position error in it. Without these two conditions, a sixth of the visits
+# to ice next to dry road reported grip that was used on the dry road.
 NEAR_FIX_M: Final = 3.0
-EXCLUDED_NATS: Final = (
-    -3.0
-)  # what is less likely by so much was not the friction of a part that has ended
+# [nat] log-likelihood below which a friction is excluded for a part of a visit that has ended
+EXCLUDED_NATS: Final = -3.0
 
 
 class RecordBlock(NamedTuple):
@@ -65,39 +66,39 @@ class RecordBlock(NamedTuple):
 class Visit:
     """One visit (passage of a map cell), open or ended, as a record."""
 
-    sample: int  # of the block, and
-    vehicle: int  # at which it ended
+    sample: int  # index in the block of the sample at which the visit ended
+    vehicle: int  # index of the vehicle
     enter_time: int  # [ns]
-    leave_time: int  # [ns] of the last sample
-    samples: int
-    cell: int  # NOWHERE: no visit
+    leave_time: int  # [ns] time of the last sample
+    samples: int  # number of samples
+    cell: int  # NOWHERE if there is no visit
     sector: int
-    health: int  # flags of all samples
-    speed_sum: float  # [m/s] over the samples
-    mu_utilised: float  # largest, once the window holds nothing of the cell before
-    felt: float  # most that a wheel may have used, by the accelerometers in the cell alone
-    ax: float  # smoothed, of this visit and those before [m/s²]
+    health: int  # union of the health flags of all samples
+    speed_sum: float  # [m/s] sum over the samples
+    # [1] largest grip used, as far as the window of the last second lies in the visit's last part
+    mu_utilised: float
+    felt: float  # [1] upper limit of the grip used, from the accelerometers in this cell alone
+    ax: float  # [m/s²] smoothed, also over earlier visits
     ay: float
-    travelled: float  # in the visit [m]
-    from_fix: float  # since the last fix in the cell [m]; infinite after one outside
-    part_time: int  # at which its last part began: the friction was another before [ns]
-    parts: int  # that ended before
-    earlier: Annotated[
-        FloatArray, mugrid.BINS
-    ]  # log-likelihood of these, the larger of each: it was one or the other
-    earlier_used: float  # least that was used in one of them
-    known: Annotated[FloatArray, len(CONTEXT)]  # samples at which each context signal was known
-    told: Annotated[
-        FloatArray, len(CONTEXT)
-    ]  # its sum over these; of a flag the samples at which it was on
-    driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
+    travelled: float  # [m] driven in the visit
+    from_fix: float  # [m] driven since the last fix in the cell; infinite after a fix outside
+    part_time: int  # [ns] beginning of the visit's last part
+    parts: int  # number of earlier parts
+    # Largest log-likelihood of each friction in the earlier parts, because any part may apply
+    earlier: Annotated[FloatArray, mugrid.BINS]
+    earlier_used: float  # [1] smallest grip used of the earlier parts
+    # Number of samples in which each context signal was known
+    known: Annotated[FloatArray, len(CONTEXT)]
+    # Sum of the context signal over these samples; for a flag the number of samples with it on
+    told: Annotated[FloatArray, len(CONTEXT)]
+    driving: float  # [m²/s⁴] sum of squared accelerations in this direction
     braking: float
     left: float
     right: float
-    mu: float  # at the last sample, and its bounds
+    mu: float  # at the last sample, like its bounds
     mu_lower: float
     mu_upper: float
-    latitude: float  # of the last fix in the cell [deg]
+    latitude: float  # [deg] last fix in the cell
     longitude: float
     yaw: float  # [rad]
 
@@ -110,7 +111,7 @@ class Sample:
     health: int
     speed: float  # [m/s]
     mu_utilised: float
-    ax: float  # as measured; NaN where it is not [m/s²]
+    ax: float  # [m/s²] measured; NaN if missing
     ay: float
     mu: float
     mu_lower: float
@@ -184,7 +185,7 @@ class SampleNotes(NamedTuple):
     if unknown. `position_std`: standard deviation of the position [m].
     """
 
-    row: IntArray  # -1: nowhere
+    row: IntArray
     told: FloatArray
     context: FloatArray
     position_std: float

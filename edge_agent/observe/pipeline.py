@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from edge_agent.estimators import Estimates, EstimatorBank
     from schemas.config import AgentConfig
 
-FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not propagated
+# [s] time from the last sample to the final empty one; short, so that the estimate hardly changes
+FINAL_STEP_S = 1e-3
 
 
 class Seen(NamedTuple):

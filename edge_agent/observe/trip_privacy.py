@@ -34,7 +34,7 @@ class TripEnds:
     def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
         self._metres = metres
         self._ns = round(seconds * NS)
-        self._driven: FloatArray = np.zeros(vehicles)  # [m] until the last sample
+        self._driven: FloatArray = np.zeros(vehicles)  # [m] distance up to the last sample
         self._times: list[IntArray] = []
         self._odometers: list[FloatArray] = []
         self._began: IntArray | None = None

@@ -12,7 +12,7 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import UTILISED_WINDOW_S
 
 SLOTS = 64
-# a slot is at least so long, so that the ring holds the last second at any rate of samples
+# [s] shortest slot, so that the ring covers the last second at any sample rate
 SLOT_S = 0.02
 
 
@@ -21,11 +21,11 @@ class Excitation:
     slot has the largest force over load [1] that any wheel used during the slot.
     """
 
-    time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
+    time: Annotated[FloatArray, SLOTS]  # [s] beginning of each slot
     used: Annotated[FloatArray, SLOTS]
-    newest: int
-    largest: float  # within the last second
-    largest_time: float  # at which its slot began [s]
+    newest: int  # index of the latest slot
+    largest: float  # largest value within the last second
+    largest_time: float  # [s] beginning of its slot
 
 
 @compiled

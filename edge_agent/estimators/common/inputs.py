@@ -30,7 +30,7 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# what became of a sample
+# Result of `take_sample_in` for a sample
 REFUSED = 0
 BEGUN = 1
 STEPPED = 2
@@ -40,11 +40,11 @@ class InputTrack:
     """Values of one vehicle's input signals that are kept from one sample to the next."""
 
     started: bool
-    time: float  # of the last sample [s]
-    position_time: float  # of the last position [s]
-    now: Annotated[FloatArray, INPUTS]  # readings, NaN where there is none
-    inputs: Annotated[FloatArray, INPUTS]
-    inputs_before: Annotated[FloatArray, INPUTS]  # of the sample before
+    time: float  # [s] time of the last sample
+    position_time: float  # [s] time of the last position
+    now: Annotated[FloatArray, INPUTS]  # readings, NaN where missing
+    inputs: Annotated[FloatArray, INPUTS]  # readings, with replacements where missing
+    inputs_before: Annotated[FloatArray, INPUTS]  # `inputs` of the previous sample
     steering: Annotated[FloatArray, 2, 4]  # cosine and sine of the steering in `inputs`
     steering_before: Annotated[FloatArray, 2, 4]
     excitation: Excitation

@@ -12,10 +12,12 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-FIRST_V_STD = 0.3  # [m/s] of the speed from wheels, and of the lateral speed, at the first sample
-UNKNOWN_V_STD = 15.0  # [m/s] without any wheel speed
-SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
-FASTEST_M_S = 150.0  # an estimate beyond has diverged
+# [m/s] error of v_x from the wheel speeds, and of v_y, at the first sample
+FIRST_V_STD = 0.3
+UNKNOWN_V_STD = 15.0  # [m/s] error of v_x without any wheel speed
+SLIDING_THETA = 3.0  # [1] normalised slip that is beyond the peak of every passenger car tyre
+# An estimate beyond these limits has diverged.
+FASTEST_M_S = 150.0
 FASTEST_TURN = 20.0  # [rad/s]
 
 

@@ -19,7 +19,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU, Z_95
 
-# what is known of the friction of a road nobody has measured: moments of the uniform prior
+# Mean and standard deviation of the uniform prior of friction, for a road without measurements
 PRIOR_MU = 0.5 * (LOWER + UPPER)
 PRIOR_MU_STD = (UPPER - LOWER) / math.sqrt(12.0)
 

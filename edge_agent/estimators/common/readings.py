@@ -12,14 +12,15 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position
-# beyond these a reading is an error of the sensor, not of the driver
+# Number of channels before the position: ax, ay, yaw rate, steering, wheel speeds, torques
+INPUTS = 15
+# Limits of readings: a larger one is a sensor error, because no car moves like that.
 LARGEST_ACCELERATION = 40.0  # [m/s^2]
 LARGEST_YAW_RATE = 6.0  # [rad/s]
 LARGEST_STEER = 1.3  # [rad]
 LARGEST_OMEGA = 500.0  # [rad/s]
 LARGEST_TORQUE = 50_000.0  # [N m]
-# largest believable size of a reading on each channel before the position
+# Largest plausible absolute reading of each channel before the position
 LIMITS = np.array(
     [LARGEST_ACCELERATION] * 2
     + [LARGEST_YAW_RATE]
@@ -27,7 +28,7 @@ LIMITS = np.array(
     + [LARGEST_OMEGA] * 4
     + [LARGEST_TORQUE] * 4
 )
-# health flags of a channel without a reading; the rear wheels' steering is optional
+# Health flag of each channel if its reading is missing; steering of the rear wheels is optional.
 MISSING = np.array(
     [flags.NO_INERTIAL] * 3
     + [flags.NO_STEERING] * 2
@@ -35,8 +36,8 @@ MISSING = np.array(
     + [flags.NO_WHEEL_SPEED] * 4
     + [flags.NO_TORQUE] * 4
 )
-GAP_S = 0.5  # a longer silence of all channels starts a filter's motion anew
-POSITION_S = 1.5  # a longer silence of the receiver is reported
+GAP_S = 0.5  # [s] after a longer gap of all channels, a filter restarts its motion
+POSITION_S = 1.5  # [s] a longer gap of the position receiver is reported
 
 
 @compiled

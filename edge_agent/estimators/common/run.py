@@ -32,9 +32,9 @@ class PaperMemory:
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack
-    nis: float  # per row
-    log_likelihood: float  # of what was measured at the sample [nat]
-    adaptation: float  # largest factor on R
+    nis: float  # normalised squared innovation, mean over the measurements
+    log_likelihood: float  # [nat] of the sample's measurements
+    adaptation: float  # [1] largest factor on R
 
 
 Memory = TypeVar("Memory", bound=PaperMemory)

@@ -28,8 +28,8 @@ class TyreOption(NamedTuple):
     """
 
     stiffness: str = "similarity"  # a key of STIFFNESSES
-    quadratic: float = 0.0  # e
-    rear_slope: float = 1.0  # q
+    quadratic: float = 0.0  # see Parameter.QUADRATIC
+    rear_slope: float = 1.0  # see Parameter.REAR_SLOPE
 
 
 PROPORTIONAL: Final = TyreOption("proportional-to-friction")

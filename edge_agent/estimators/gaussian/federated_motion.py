@@ -46,18 +46,19 @@ ROWS = 4
 RULE = cubature_rule(STATES)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
-STEP_S = 0.02  # process variances are per so much time
-# variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque
-# does not know, and the error of the tyre model; the papers' 100, 1 and .01 for all states alike
-# are in no unit
+STEP_S = 0.02  # [s] time to which the process variances refer
+# Process standard deviations per STEP_S. They cover offsets of the accelerometers, drag and slopes
+# that torque does not show, and errors of the tyre model. The papers give 100, 1 and .01 for all
+# states, without a unit.
 PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
 START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
-# [m/s], radius, and how wrong the slip of a force is
-SPEED_STD = 0.03
-SPEED_SHARE = 0.003
-SLIP_SHARE = 0.3
-FARTHEST = 2.0  # innovations in standard deviations beyond which the wheels' speed is trusted less
-LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
+# Error of the vehicle speed according to the wheels
+SPEED_STD = 0.03  # [m/s] constant part
+SPEED_SHARE = 0.003  # [1] relative part, from the wheel radii
+SLIP_SHARE = 0.3  # [1] relative error of the slip computed from force
+# [1] innovation, in standard deviations, beyond which the error of the wheels' speed is increased
+FARTHEST = 2.0
+LEAST_BETA = 0.1  # [1] smallest information share, so that both sub-filters keep some information
 
 
 class MotionSetting(NamedTuple):
@@ -67,11 +68,11 @@ class MotionSetting(NamedTuple):
 
     process: tuple[float, ...] = tuple(map(float, PROCESS**2))
     start: tuple[float, ...] = tuple(map(float, START**2))
-    # with some model error; a_y and r, which both use, with twice the variance. The papers set
-    # theirs by manoeuvre
+    # Measurement noise with some model error. The variances of a_y and r are doubled, because both
+    # sub-filters use them. The papers choose theirs for each manoeuvre.
     first: tuple[float, float, float] = (0.01, 0.02, 2e-4)  # a_x, a_y, r
     second: tuple[float, float] = (0.02, 2e-4)  # a_y, r
-    wheel_speed: bool = True  # whether sub-filter 1 also measures the speed of the wheels
+    wheel_speed: bool = True  # True if sub-filter 1 also measures the speed of the wheels
 
 
 class FederatedMotion:
@@ -81,18 +82,17 @@ class FederatedMotion:
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
     start: Annotated[FloatArray, STATES]  # standard deviations
-    noise: Annotated[FloatArray, 2, 3]  # variances of a_x, a_y, r, by sub-filter
+    noise: Annotated[FloatArray, 2, 3]  # variances of a_x, a_y and r in each sub-filter
     wheel_speed: bool
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]
-    beta: float  # share of sub-filter 1
-    factor: Annotated[FloatArray, 2]  # on R of each sub-filter
+    beta: float  # [1] information share of sub-filter 1
+    factor: Annotated[FloatArray, 2]  # [1] factor on R of each sub-filter
     gamma: Annotated[FloatArray, 2]  # squared innovation over its expectation, per sub-filter
     innovation: Annotated[FloatArray, 2, ROWS]
     expected: Annotated[FloatArray, 2, ROWS]  # innovation variances if R were nominal
-    size: Annotated[
-        FloatArray, 2
-    ]  # trace of the sub-filters' covariances over the starting variances
+    # Trace of each sub-filter's covariance, each variance over its initial value
+    size: Annotated[FloatArray, 2]
 
 
 class FederatedMemory(PaperMemory):
@@ -118,8 +118,8 @@ def set_motion(filters: RecordArray, setting: MotionSetting) -> None:
     call this once, before the first sample.
     """
     motion = filters["motion"]
-    # of the rounded squares: the square roots are those of before, bit for bit, where nothing is
-    # set
+    # For the default setting, use PROCESS and START themselves. The square roots of their rounded
+    # squares may differ from them in the last bit.
     usual = MotionSetting()
     motion["process"] = PROCESS if setting.process == usual.process else np.sqrt(setting.process)
     motion["start"] = START if setting.start == usual.start else np.sqrt(setting.start)

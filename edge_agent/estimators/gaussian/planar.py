@@ -25,13 +25,14 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 from schemas.signals import S
 
-LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
-# or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
+LONGEST_S = 0.02  # [s] longest step of Heun's rule
+# [m/s] At lower speed shorter steps are needed, because the pole of the lateral motion is at about
+# 170/v [1/s].
 CALM_M_S = 2.0
-SHORTEST_SHARE = 0.2
-POINTS = 12  # of the cubature rule in six dimensions, side by side in a row
-# of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing
-# else
+SHORTEST_SHARE = 0.2  # [1] shortest step over the longest one
+POINTS = 12  # number of points of the cubature rule in six dimensions, one per column
+# Number of points in the first of two loops. The loop lengths are constants, so that the compiler
+# turns each loop into vector instructions without a remainder.
 ABREAST = 8
 
 
@@ -53,7 +54,7 @@ class HeunInputs(NamedTuple):
     begin: WheelInputs
     end: WheelInputs
     step: float  # [s]
-    by_torque: bool  # whether forces come from the wheels' torque and z is the yaw acceleration
+    by_torque: bool  # True if forces come from wheel torque, and z is the yaw acceleration
 
 
 class PlanarStep(NamedTuple):

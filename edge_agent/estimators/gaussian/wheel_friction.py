@@ -18,11 +18,10 @@ from edge_agent.filters.householder import triangularize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-FORGET_M = 190.0  # one road change per so many metres (errata)
-INDEPENDENT_S = 0.2  # one independent measurement of the tyre per so much time (errata)
-# [g] of force at which half of what a sample could say of friction is believed (errata)
-DEMAND_HALF = 0.15
-# roads are mostly the same under both sides; the wheels of one side see one road
+FORGET_M = 190.0  # [m] distance constant of forgetting: one road change per 190 m (errata)
+INDEPENDENT_S = 0.2  # [s] time between independent measurements of the tyre (errata)
+DEMAND_HALF = 0.15  # [1] force over load at which the evidence on friction counts by half (errata)
+# [1] correlation of friction between both sides, which are mostly on the same surface
 SIDE_CORRELATION = 0.9
 
 

@@ -22,7 +22,7 @@ from schemas.numeric import FloatArray
 from schemas.signals import S
 
 STATES: Final = 4
-LEAST_SHARE: Final = 0.01  # of the information of a sub-filter
+LEAST_SHARE: Final = 0.01  # [1] smallest information share of a sub-filter
 
 
 class FederatedSetting(NamedTuple):
@@ -30,8 +30,8 @@ class FederatedSetting(NamedTuple):
     option.
     """
 
-    process: float = 1.0  # Q of each friction per sample
-    start: float = 1.0  # P_0
+    process: float = 1.0  # Q: variance that each friction gains per sample
+    start: float = 1.0  # P_0: initial variance
     first: tuple[float, float, float] = (90.0, 1e4, 1e4)  # R of sub-filter 1: a_x, a_y, r
     second: tuple[float, float] = (1e4, 1e4)  # R of sub-filter 2: a_y, r
     mu: float = 1.0

@@ -25,8 +25,9 @@ from edge_agent.estimators.literal.given_motion import GivenMotion
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
-TINY = 1e-12  # below it a slip has no direction and no force
-LEAST_MU = 0.02  # of a tyre that is not proportional: its slip over friction needs one
+TINY = 1e-12  # a smaller slip counts as zero: it has no direction and no force
+# [1] smallest friction by which slip is divided, if stiffness is not proportional to friction
+LEAST_MU = 0.02
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,12 @@ class WheelForces:
     tyre stiffness (proportional to friction or not).
     """
 
-    free: FloatArray  # (T, 4, 2) k*s of the wheels
+    free: FloatArray  # (T, 4, 2) slip stiffness times slip, along and across the wheels
     loads: FloatArray  # (T, 4) [N]
-    turned: FloatArray  # (T, 4, 2) cosine and sine of the steering
-    places: FloatArray  # (4, 2) x and y of the wheels [m]
+    turned: FloatArray  # (T, 4, 2) cosine and sine of the steering angles
+    places: FloatArray  # (4, 2) positions x and y of the wheels [m]
     mass: FloatArray  # (2,) mass [kg] and yaw inertia [kg m^2]
-    air: FloatArray  # (T,) deceleration by the air [m/s^2]
+    air: FloatArray  # (T,) deceleration by air drag [m/s^2]
     proportional: bool
 
     @classmethod

@@ -41,13 +41,13 @@ class UnscentedSetting(NamedTuple):
     alpha: float = 0.001
     beta: float = 2.0
     kappa: float = 0.0
-    process: float = 1e-4  # Q of each friction per sample: "a slight noise variance"
+    process: float = 1e-4  # Q of each friction per sample; the paper says "a slight noise variance"
     noise: tuple[float, float, float] = (1e-3, 1e-3, 1e-4)  # R of a_x, a_y, r'
     torque_noise: float = 1.0  # R of the wheels' forces [N^2]
-    start: float = 0.25  # P_0
-    mu: float = 0.8  # at the start
+    start: float = 0.25  # P_0: initial variance
+    mu: float = 0.8  # [1] initial friction
     torque_rows: bool = True
-    proportional: bool = True  # stiffness to friction
+    proportional: bool = True  # True if stiffness is proportional to friction
     square_root: bool = True
     single: bool = False
 
