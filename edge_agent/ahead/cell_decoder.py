@@ -18,7 +18,8 @@ from schemas.wire.tile import decode_tile
 AHEAD_OF_TIME_S: Final = 60.0  # [s] largest accepted lead of the service's clock over the car's
 # [s] largest accepted age of a cell: three years. In nanoseconds it still fits into an int64.
 OLDEST_S: Final = 1e8
-MOST_TILE_BYTES: Final = 4 << 20  # a tile with every cell and sector of a dense city has 3 MB
+# Maximum size of a tile; one with every cell and sector of a dense city has 3 MB.
+MOST_TILE_BYTES: Final = 4 << 20
 # Tolerance of range checks: values arrive in single precision, and quantiles may be rounded to the
 # edges of their bins.
 SLACK: Final = 1e-3

@@ -28,12 +28,12 @@ SIGHT_M: Final = 60.0  # [m] distance within which a car in a town must be able 
 # Assumed lower end of the friction of a road that no vehicle has measured: the 5 % quantile of the
 # uniform prior.
 UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (mugrid.UPPER - mugrid.LOWER)
-SHORTEST_M: Final = 150.0
-LONGEST_M: Final = 1000.0
+SHORTEST_M: Final = 150.0  # [m] minimum length of a horizon
+LONGEST_M: Final = 1000.0  # [m] maximum length of a horizon
 # P(slippery) from which the car warns. The service raises an alert at 0.9; without a link, such a
 # belief fades to about 0.8 within half an hour.
 WARN_ABOVE: Final = 0.8
-# required vehicles, as for an alert, so that one bad sensor causes no warning
+# Minimum number of vehicles for a warning, as for an alert, so that one bad sensor causes none.
 LEAST_VEHICLES: Final = 2
 
 

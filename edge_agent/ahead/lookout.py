@@ -29,9 +29,10 @@ from schemas.thresholds import NS
 from schemas.wire.ahead import GripWarning, Outlook, Runs, encode_ahead
 
 log = logging.getLogger(__name__)
-LOOK_S: Final = 1.0
+LOOK_S: Final = 1.0  # [s] time between two look-ups for a vehicle
 STALE_S: Final = 3.0  # [s] age of a car's last position from which the lookout ignores the car
-AGAIN_S: Final = 0.1  # [s] shortest time between two look-ups, so that a burst of alerts causes one
+# [s] shortest time between two look-ups, so that a burst of alerts causes only one look-up.
+AGAIN_S: Final = 0.1
 
 Hear = Callable[[str, GripWarning], None]
 RouteOf = Callable[[int], GivenRoute | None]
@@ -224,7 +225,7 @@ class Lookout:
             return
         try:
             self._look_ahead(k, watcher, watcher.subscriber, pose)
-        except Exception:  # the thread must survive any error, because the car drives on
+        except Exception:  # the lookout must continue after any error
             self.counts.failures += 1
             log.exception(
                 "looking ahead for %s failed; it is tried again with the next position",

@@ -30,9 +30,9 @@ TYPE: Final = "tier4_planning_msgs::msg::dds_::VelocityLimit_"
 # text that rmw_zenoh uses for a sender without a type hash
 ANY_HASH: Final = "TypeHashNotSupported"
 SENDER: Final = "gripmap"
-HOLD_S: Final = 3.0
+HOLD_S: Final = 3.0  # [s] time for which a higher limit must last before it is sent
 STEP: Final = 1.0  # [m/s] smallest rise of the limit that is sent to a planner
-FALL_STEP: Final = 0.2  # [m/s] smallest fall that is sent
+FALL_STEP: Final = 0.2  # [m/s] smallest decrease of the limit that is sent to a planner
 # [s] delay of the braking: one second between two look-ups, and the reaction of the planner's
 # brakes
 LATE_S: Final = 1.3
@@ -40,11 +40,11 @@ LATE_S: Final = 1.3
 # of the normal quantiles, less 1. One place in twenty has less grip than its 5 % quantile, but a
 # planner's limit must hold in 99 % of the places.
 CAUTION: Final = 0.566
-LEAST_GRIP: Final = 0.02
+LEAST_GRIP: Final = 0.02  # minimum friction for the computation of a limit
 FREE: Final = 1e3  # [m/s] value sent for "no limit": above any planner's own limit
 MIN_JERK: Final = -1.0  # [m/s^3] jerk limits of the braking, as the message requires
 MAX_JERK: Final = 1.0
-_GID_BYTES: Final = 16
+_GID_BYTES: Final = 16  # [byte] size of the identity of a sender
 
 
 def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:

@@ -38,12 +38,12 @@ from schemas.numeric import FloatArray, IntArray
 # Share of cells in which a map with narrow intervals is wrong, because of other tyres, small
 # patches or positions assigned to the wrong cell.
 SHARE: Final = 0.2
-MOST: Final = 0.98
+MOST: Final = 0.98  # maximum of β, so that the map can always be trusted again
 # Share of the distrust that passes to the next cell. After ten cells (a hundred metres), a map that
 # was wrong is mostly trusted again.
 KEPT: Final = 0.9
-BLIND: Final = 0.5
-# Least probability that the friction changes at the border of a cell. For cells of ten metres, it
+BLIND: Final = 0.5  # assumed value of h if the map knows only one of the two cells
+# Minimum probability that the friction changes at the border of a cell. For cells of ten metres, it
 # corresponds to the estimator's mean of 190 m between changes.
 LEAST_CHANGE: Final = 0.05
 NOWHERE: Final = -1

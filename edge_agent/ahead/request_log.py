@@ -24,14 +24,14 @@ from schemas.thresholds import NS
 BESIDE_M: Final = 12.0
 # [m^2] largest area of a box. Every answer has 3.2 kB of schema, and a cell has 130 bytes.
 AREA_M2: Final = 7000.0
-LONGEST_M: Final = 300.0
+LONGEST_M: Final = 300.0  # [m] maximum length of the path in one box
 # [m] distance beyond the horizon that is requested together with it. Without this reserve, the car
 # would request ten new metres every second.
 FURTHER_M: Final = 300.0
 # [s] time after which the map ahead is requested again. Sudden changes arrive as alerts.
 REFRESH_S: Final = 300.0
 STEP: Final = 4  # [m] distance between the checked points of a path
-MOST_BOXES: Final = 128
+MOST_BOXES: Final = 128  # maximum number of remembered boxes
 MOST_TILES: Final = 6  # largest number of tiles to whose alerts a car subscribes
 # [s] time for which the subscription to a tile continues after the tile is no longer ahead. A car
 # near a border may cross it repeatedly.

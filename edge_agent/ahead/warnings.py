@@ -31,9 +31,9 @@ LINK_M: Final = 30.0  # [m] slippery stretches with a smaller gap are joined
 ABSENT_S: Final = 2.0
 # [m] if a stretch disappears from the horizons when it is nearer than this, the car has passed it.
 NEAR_M: Final = 30.0
-CHANGED_MU: Final = 0.05
-CHANGED_PLACES: Final = 2
-SLOWEST: Final = 0.5  # [m/s] below this speed no time to a stretch is given
+CHANGED_MU: Final = 0.05  # change of the friction from which a warning is updated
+CHANGED_PLACES: Final = 2  # number of new places from which a warning is updated
+SLOWEST: Final = 0.5  # [m/s] at lower speeds a warning contains no time to the stretch
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ CONDITION: Final = "Vehicle.Exterior.RoadSurfaceCondition"
 ICE_BELOW: Final = 20.0  # [%] limit for the upper bound of friction
 DRY_ABOVE: Final = 80.0  # [%] limit for the lower bound of friction
 WRITE_S: Final = 2.0  # [s] timeout for writing one value
-LEAVE_S: Final = 5.0
+LEAVE_S: Final = 5.0  # [s] time to wait for the thread at the end
 
 log = logging.getLogger(__name__)
 

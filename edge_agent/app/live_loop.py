@@ -26,7 +26,7 @@ STATUS_EVERY_S = 5.0
 # [s] time to send remaining records after a signal. The agent then ends within 3 s, including one
 # second for sessions that hang.
 STOPPED_DRAIN_S = 1.7
-ENDED_DRAIN_S = 10.0  # [s] the same at the end of the signals, when the agent may wait longer
+ENDED_DRAIN_S = 10.0  # [s] time to send remaining records when the signals have ended
 
 log = logging.getLogger(__name__)
 

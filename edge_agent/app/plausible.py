@@ -24,7 +24,7 @@ MOST_VIOLATION: Final = 0.05  # largest share of samples with an upper bound bel
 SLACK: Final = 0.05
 # [s] window over which the grip in use is averaged: the time in which a tyre builds up its force.
 SMOOTHED_S: Final = 0.2
-MOST_RESETS_PER_S: Final = 0.2
+MOST_RESETS_PER_S: Final = 0.2  # [1/s] maximum rate of filter resets
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:

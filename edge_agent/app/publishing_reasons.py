@@ -18,9 +18,9 @@ from schemas.signals import S
 # its position.
 FIRST_S: Final = 3.0
 EVERY_S: Final = 1.0
-MISSING_S: Final = 2.5  # [s] a receiver of 1 Hz may omit one fix
+MISSING_S: Final = 2.5  # [s] a receiver of 1 Hz may miss one position without a message
 UNANSWERED_S: Final = 4.0
-STANDING: Final = 0.5  # [rad/s] speed of the wheels below a walking pace
+STANDING: Final = 0.5  # [rad/s] a wheel speed below this is slower than walking pace
 _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 

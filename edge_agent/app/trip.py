@@ -34,7 +34,7 @@ from schemas.vehicle import Vehicle
 
 PART_S: Final = 600.0  # [s] length of a section, 9 MB of signals
 LOOK_S: Final = 30.0  # [s] time between examinations until one finds no fault
-LEAST_S: Final = 60.0  # [s] least length of a section for learning
+LEAST_S: Final = 60.0  # [s] minimum length of a section for learning
 # Largest number of remembered sections. Older ones are forgotten, because tyres wear and are
 # replaced.
 MOST_DRIVES: Final = 50

@@ -26,8 +26,8 @@ GROUPS: Final = {
     "clocks": ("wheel_lag", "steer_lag"),
     "torque": ("force_gain",),
 }
-MOST_FOLDS: Final = 3
-LEAST_PART_S: Final = 20.0  # [s] least length of each half of a single drive
+MOST_FOLDS: Final = 3  # maximum number of drives that are held out, one at a time
+LEAST_PART_S: Final = 20.0  # [s] minimum length of each half of a single drive
 WORSE: Final = 0.02  # [nat/s] a smaller difference between predictions is rounding
 LONGER: Final = 0.005  # a smaller difference between times in contradiction is rounding
 

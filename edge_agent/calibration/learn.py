@@ -49,10 +49,10 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle import Calibration, Vehicle
 
 CALM: Final = 0.7  # [m/s^2] longitudinal acceleration up to which wheels hardly slip
-PULLED: Final = 0.5  # [m/s^2] least acceleration at which torque shows its gain
+PULLED: Final = 0.5  # [m/s^2] minimum acceleration at which torque shows its gain
 STRAIGHT: Final = 1.0  # [m/s^2] largest v·r on a straight
-LEAST_S: Final = 10.0  # [s] least duration of the usable moments
-# Least standard deviation between drives, in the unit of each quantity.
+LEAST_S: Final = 10.0  # [s] minimum duration of the usable moments
+# Minimum of the standard deviation between drives, in the unit of each quantity.
 FLOOR: Final = {
     "radius": 0.0004,
     "ax": 0.10,
@@ -78,7 +78,7 @@ BIAS: Final = {
     "wheel_lag": 0.009,
     "steer_lag": 0.009,
 }
-# Standard deviation between cars.
+# Standard deviation between cars (prior).
 USUAL: Final = {
     "radius": 0.006,
     "ax": 0.4,
@@ -91,15 +91,15 @@ USUAL: Final = {
     "wheel_lag": 0.04,
     "steer_lag": 0.04,
 }
-# Mean over cars; 0 for all other quantities.
+# Mean over cars (prior); 0 for all other quantities.
 SOUND: Final = {
     "steer_gain": 1.0,
     "force_gain": 1.0,
     "understeer": 0.0005,
 }
-STEERED_M_S: Final = 5.0  # [m/s] least speed at which the path shows the steering angle
+STEERED_M_S: Final = 5.0  # [m/s] minimum speed at which the path shows the steering angle
 LINEAR: Final = 4.0  # [m/s^2] largest v·r at which understeer is proportional to it
-# [rad] least standard deviation of the steering angle from the regression
+# [rad] minimum standard deviation of the steering angle from the regression
 LEAST_ANGLE: Final = 0.001
 TRACED: Final = ("steer_offset", "steer_gain", "understeer")
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.

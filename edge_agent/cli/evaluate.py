@@ -11,7 +11,7 @@ from typing import Final
 
 from schemas.errors import InputError
 
-LEAST_SEEDS: Final = 20  # least number of seeds for a campaign whose bars count
+LEAST_SEEDS: Final = 20  # a campaign with fewer seeds does not count for the bars (targets)
 QUICK_SEEDS: Final = 2
 ONLY: Final = ("detection", "searches", "worth", "real")
 PAPERS: Final = ("000", "001", "002", "003", "004")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
 
-MOST_NAMES = 30  # names of signals listed in an error
+MOST_NAMES = 30  # maximum number of signal names in an error message
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 
 from schemas.wire import Kind
 
-# Number of later batches of a stream that were settled while this batch is unanswered, after which
-# the batch is given up. A service does not answer a batch that it cannot read. It remembers 65 536
-# numbers above the first missing one, and would accept no further batches.
+# An unanswered batch is given up when this number of later batches of its stream was settled. A
+# service does not answer a batch that it cannot read. It remembers 65 536 numbers above the first
+# missing one, and would then accept no further batches.
 PASSED_OVER: Final = 50_000
 LEAST_OLDEST: Final = 1000  # number of keys before the list is searched for removed ones
 

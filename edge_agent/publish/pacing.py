@@ -20,7 +20,7 @@ from typing import Final
 # [s] time without an answer after which a service counts as unavailable. A service writes a segment
 # each second, and restarts within several seconds.
 SILENT_S: Final = 8.0
-FIRST_PROBE_S: Final = 4.0
+FIRST_PROBE_S: Final = 4.0  # [s] interval before the first probe
 # [s] longest interval between probes. With it, a thousand cars send eight messages per second to an
 # unavailable service. With five minutes, cars returned so slowly that the service was idle between
 # them, and the return took longer than the transfer of an hour's backlog.

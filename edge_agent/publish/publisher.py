@@ -31,7 +31,8 @@ from schemas.wire import Kind
 
 # [s] interval at which the sender checks for due batches if nothing is offered
 TICK_S: Final = 0.05
-QUEUE_LIMIT: Final = 20_000  # blocks of records: many minutes if the disk does not respond
+# blocks of records: many minutes of records if the disk does not respond
+QUEUE_LIMIT: Final = 20_000
 WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk rejects writes
 RESEND_LIMIT: Final = 64  # batches sent again per round; more would delay new batches
 # Mean number per vehicle of batches sent again per round. A link pauses between two messages of one
@@ -150,7 +151,7 @@ class Publisher:
                 else:
                     log.warning("the outbox cannot be read or written (%s); trying again", error)
                 self._stopped.wait(TICK_S)
-            except Exception:  # the thread must survive any error, because estimation continues
+            except Exception:  # the sender must continue after any error
                 self.counts.failures += 1
                 log.exception("sending failed; trying again")
                 self._stopped.wait(TICK_S)

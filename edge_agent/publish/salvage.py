@@ -16,6 +16,7 @@ _LEAF: Final = 0x0D  # type byte of a page with rows of a table
 _HEADER: Final = 100  # [byte] file header before the cells of the first page
 _WAL_HEADER: Final = 32
 _FRAME: Final = 24
+# Maximum and minimum number of bytes of a row within its page; the rest is on overflow pages.
 _MOST_LOCAL: Final = PAGE - 35
 _LEAST_LOCAL: Final = (PAGE - 12) * 32 // 255 - 23
 _INTEGERS: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # serial type -> size of an integer [byte]

@@ -33,7 +33,7 @@ CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);
 NAME: Final = "vehicle, boot, kind, region, seq, records"
 DAMAGED: Final = "damaged"  # suffix, before a number, of a damaged file that was set aside
 _MAGIC: Final = b"SQLite format 3\0"
-# Least number of bytes equal to _MAGIC in a damaged outbox. A file with fewer belongs to another
+# Minimum number of bytes equal to _MAGIC in a damaged outbox. A file with fewer belongs to another
 # program and is not changed.
 _SIMILAR: Final = 12
 # Types of the columns. The id is not checked, because SQLite stores it as the row number.

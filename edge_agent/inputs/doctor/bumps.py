@@ -20,8 +20,8 @@ from schemas.vehicle import Vehicle
 STEP_M: Final = 0.25  # [m] step of the distance at which wheel speeds are compared
 WINDOW: Final = 4.0  # [wheelbases] length of the running mean that is subtracted
 FAST_M_S: Final = 5.0
-LEAST_M: Final = 300.0  # [m] least driven distance at more than FAST_M_S
-LEAST_LIKE: Final = 0.2  # least correlation at a peak
+LEAST_M: Final = 300.0  # [m] minimum driven distance at more than FAST_M_S
+LEAST_LIKE: Final = 0.2  # minimum correlation at a peak
 NEAR_M: Final = 0.5  # [m] largest difference between the peak's shift and the wheelbase
 # Largest correlation at the mirrored shift (rear axle first), as a share of the peak.
 RIVAL: Final = 0.6

@@ -60,9 +60,7 @@ class EvenDrive:
     # 1 where the car moves and no wheel slips relative to the other wheels, else 0
     moving: FloatArray
     # 0 where all wheels spin or lock together: their speed differs from the one over ground
-    grips: (
-        FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
-    )
+    grips: FloatArray
     yaw_front: FloatArray  # yaw rate from the front wheels alone [rad/s]
     yaw_rear: FloatArray  # yaw rate from the rear wheels alone [rad/s]
     wheelbase: float

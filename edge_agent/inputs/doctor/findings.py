@@ -62,11 +62,11 @@ GENTLE_ACROSS: Final = 3.5
 # (L r / v)^2 on a circle with a radius of eight wheelbases. On larger circles, slip hides the
 # difference between the axles.
 TIGHT = 0.015
-TIGHT_S = 1.5
-FEWEST_OFFSET_S: Final = 8.0
+TIGHT_S = 1.5  # [s] minimum duration of tight turns
+FEWEST_OFFSET_S: Final = 8.0  # [s] minimum duration of the readings for an offset
 # |ln factor| up to which slip may explain a wrong wheel speed. Slip is not larger for long.
 NEAR_ONE: Final = 0.35
-SURE: Final = 2.0
+SURE: Final = 2.0  # number of standard deviations by which an offset must exceed its limit
 WHOLE: Final = 0.35  # largest difference between ln gain of the whole drive and of the fault
 NOISIEST: Final = 1.0  # largest difference of ln gain between parts that may come from noise
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}

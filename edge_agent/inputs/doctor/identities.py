@@ -23,11 +23,11 @@ import numpy as np
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 
-LONGEST_LAG_S: Final = 1.0
-FEWEST_S: Final = 8.0  # [s] least time with excitation for any conclusion
+LONGEST_LAG_S: Final = 1.0  # [s] maximum lag that is searched
+FEWEST_S: Final = 8.0  # [s] minimum time with excitation for any conclusion
 # Excitation is a deviation of the regressor by more than this share of its 95 % quantile.
 SLOW_SHARE: Final = 0.3
-LEAST_LIKE: Final = 0.5  # least correlation at which a lag is used
+LEAST_LIKE: Final = 0.5  # minimum correlation at which a lag is used
 # A lag is unknown if another peak of the correlation, further away than APART_S, is higher than the
 # share RIVAL of the main peak.
 APART_S = 0.3

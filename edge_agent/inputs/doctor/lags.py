@@ -27,15 +27,15 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-LONGEST_S: Final = 0.5
-LEAST_S: Final = 10.0  # [s] least time of driving
+LONGEST_S: Final = 0.5  # [s] maximum delay that is searched
+LEAST_S: Final = 10.0  # [s] minimum time of driving
 # [s] slower changes are removed, because they come from offset and road bank
 SLOW_S: Final = 5.0
-LEAST_LIKE: Final = 0.9  # least correlation at which a lag is used
+LEAST_LIKE: Final = 0.9  # minimum correlation at which a lag is used
 LEAST_RATE: Final = 1e-5  # [rad/s] a smaller standard deviation of the yaw rate is rounding
 ALIKE: Final = 0.02  # correlations that differ by less than this count as equal
 SMOOTH_S: Final = 0.1  # [s] width of the running mean, which is applied twice
-LONGEST_DRIVE_S: Final = 1800.0
+LONGEST_DRIVE_S: Final = 1800.0  # [s] only this first part of a drive is used
 DRIVEN: Final = 4.0  # [m/s] lags are measured above this speed
 SLOWEST: Final = 3.0  # [m/s] below this speed the model's slip angle has no meaning
 NEGLIGIBLE: Final = 1e-18  # share of an earlier motion that disappears in a float64
@@ -89,8 +89,8 @@ def find_lags(
         )
         peaks = [_find_delay(side, turning, driven & np.isfinite(side), least) for side in sides]
         told = [peak for peak in peaks if peak is not None]
-        # Prefer the mean of both axles. If an axle is locked, its own yaw rate shows nothing and
-        # falsifies the mean, so that the other axle agrees best with the gyroscope.
+        # Prefer the mean of both axles. If one axle is locked, its yaw rate shows nothing and
+        # distorts the mean. Then the other axle agrees best with the gyroscope.
         if told:
             likest = max(peak.likeness for peak in told)
             found[name] = (

@@ -14,11 +14,11 @@ from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, over_ground
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
-FEWEST: Final = 200  # least number of samples, four seconds
+FEWEST: Final = 200  # minimum number of samples, four seconds
 # Required gain in agreement with the course (mean cosine) by another interpretation of the yaw.
 BETTER: Final = 0.25
-SOUND: Final = 0.9  # least agreement with the course at which another interpretation is reported
-# [rad] least change of both yaw and course. In a slide, the yaw changes but the course does not.
+SOUND: Final = 0.9  # minimum agreement with the course at which another interpretation is reported
+# [rad] minimum change of both yaw and course. In a slide, the yaw changes but the course does not.
 LEAST_TURN: Final = 0.5
 # Exchanging latitude and longitude must reduce the spread of ground speed over wheel speed to this
 # share.

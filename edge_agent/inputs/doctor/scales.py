@@ -37,7 +37,7 @@ from schemas.vehicle import Vehicle
 
 FAULT_COST: Final = 12.0  # cost of a fault: it must explain a deviation of 3.5 standard deviations
 # Margin from which a late clock is certain. It is small, because a late clock must also exceed
-# LATE_S, which no sound clock reaches.
+# LATE_S.
 CLOCK_SETTLED: Final = 3.0
 SETTLED: Final = 9.0  # margin from which a fault is certain: odds of 90 to 1
 ALIKE: Final = 0.08  # faults with a smaller difference of ln factor have the same effect
@@ -110,9 +110,9 @@ CLOCK_CENTRE_S: Final = {
     "ground": 0.0,
     "turning": -0.06,
 }
-LATE_S: Final = 0.15  # [s] a larger delay is a fault; in sound logs it is below 0.1 s
-# Least correlation at which the lag of an identity is used. Slides shift the two sides relative to
-# each other.
+LATE_S: Final = 0.15  # [s] a larger delay is a fault; in logs without this fault it is below 0.1 s
+# Minimum correlation at which the lag of an identity is used. Slides shift its two sides relative
+# to each other.
 CLOCK_LIKE: Final = 0.8
 # Cost of a late clock. It is below FAULT_COST, because delays have no table of faults from which
 # one could fit by chance.
@@ -150,7 +150,8 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     }
 
 
-# Faults of several quantities with one common cause; such a group costs about as much as one fault.
+# Faults of several quantities with one common cause. The cost of a group is 1.25 times that of one
+# fault.
 JOINT: Final = (
     (("ay", "sign"), ("r", "sign")),
     (("ax", "g"), ("ay", "g")),

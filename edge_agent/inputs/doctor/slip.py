@@ -14,25 +14,27 @@ from edge_agent.inputs.doctor.lags import find_lags
 from schemas.numeric import BoolArray, FloatArray
 from schemas.vehicle import Vehicle
 
-FEWEST_STEPS: Final = 5  # least number of steps in a wheel speed that count as equal steps
-# Least number of samples in motion before a wheel that disagrees with the others counts as foreign.
+FEWEST_STEPS: Final = 5  # minimum number of sudden steps in a wheel speed for `has_equal_steps`
+# Minimum number of samples in motion before a wheel that disagrees with the others counts as
+# foreign.
 FOREIGN_ROWS: Final = 3000
 FOLLOWED: Final = 0.25  # relative difference allowed between the driven and the steered curvature
 RADIUS_PARTS: Final = 4
-STEADY: Final = 0.4
-STEADY_SHARE: Final = 0.75
+STEADY: Final = 0.4  # tolerance of ln gain in a part of the drive
+STEADY_SHARE: Final = 0.75  # share of the parts in which the gain must lie within the tolerance
 
-# Least correlation of each axle's yaw rate with the gyroscope at which the signs are compared.
+# Minimum correlation of each axle's yaw rate with the gyroscope at which the signs are compared.
 AXLES_LIKE: Final = 0.7
 LAGS_APART_S: Final = 0.05  # [s] largest difference between the lags of the two halves of a drive
-HALF_LIKE: Final = 0.7  # least correlation at which the lag of a half counts
-# The same difference as a share of the lag. The halves may contain different numbers of bends.
+HALF_LIKE: Final = 0.7  # minimum correlation at which the lag of a half counts
+# Maximum difference between the lags of the halves as a share of the lag. The halves may contain
+# different numbers of bends.
 LAGS_APART: Final = 0.25
-# [1/m] least root mean square of the curvature at which a locked axle can be recognised
+# [1/m] minimum root mean square of the curvature at which a locked axle can be recognised
 LEAST_CURVATURE: Final = 0.004
-LOCKED_LIKE: Final = 0.75  # least correlation of the other axle's yaw rate with the gyroscope
+LOCKED_LIKE: Final = 0.75  # minimum correlation of the other axle's yaw rate with the gyroscope
 LOCKED_GAIN: Final = 0.2  # largest ratio of the locked axle's yaw rate to the gyroscope's
-# Least correlation of the yaw rate with steering or course; below it the car may spin.
+# Minimum correlation of the yaw rate with steering or course; below it the car may spin.
 TURNS_LIKE: Final = 0.8
 
 

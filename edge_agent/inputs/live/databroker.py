@@ -16,7 +16,7 @@ from schemas.thresholds import NS
 
 # Updates that the broker buffers for a slow subscriber: the largest number that it accepts.
 BUFFER: Final = 1000
-ASK_S: Final = 5.0
+ASK_S: Final = 5.0  # [s] timeout of a call
 NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double")
 
 

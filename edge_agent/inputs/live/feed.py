@@ -21,14 +21,16 @@ from typing import Any, Final, TypeAlias
 from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
 
-BELIEVED_S: Final = 1.0
-EARLY_S: Final = 0.01  # [s] largest lead of a stamp by the host's own clock over its arrival
-WHILE_S: Final = 10.0
-RETRY_S: Final = 0.5
+BELIEVED_S: Final = 1.0  # [s] maximum delay at which the stamps of a source are used unchanged
+# [s] Stamps of the host's own clock may be later than their arrival by this much.
+EARLY_S: Final = 0.01
+WHILE_S: Final = 10.0  # [s] period after which the smallest delay is determined again
+RETRY_S: Final = 0.5  # [s] pause before a lost source is opened again
 TICK_S: Final = 0.1  # [s] longest time until a thread notices that it must stop
 SILENT_S: Final = 2.0  # [s] silence after which a source counts as lost
-MOST_WAITING: Final = 200_000  # messages that may wait for the estimation loop: minutes of a bus
-LEAVE_S: Final = 2.0
+# messages that may wait for the estimation loop, minutes of a CAN bus
+MOST_WAITING: Final = 200_000
+LEAVE_S: Final = 2.0  # [s] time to wait for the thread at the end
 
 Heard: TypeAlias = tuple[float, Any]
 """A received message: its time [s of the host's clock], and its content."""

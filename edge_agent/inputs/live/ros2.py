@@ -46,7 +46,7 @@ CAN_FRAME: Final = "\n".join(
 )
 
 
-# [byte] largest accepted message; motion and bus messages have some hundred
+# [byte] largest accepted message; motion and bus messages have a few hundred
 MOST_MESSAGE: Final = 1 << 20
 MOST_IDENTITY: Final = 64  # [byte] part of a publisher's identity that is used
 MOST_PUBLISHERS: Final = 1000  # publishers whose sequence numbers are followed

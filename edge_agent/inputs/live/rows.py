@@ -36,14 +36,14 @@ from schemas.vehicle import Vehicle
 RATE_HZ: Final = 100.0
 BLOCK_S: Final = 0.1
 DELAY_S: Final = 0.3  # [s] a channel of 10 Hz has delivered its next reading by then
-PATIENCE_S: Final = 1.0
+PATIENCE_S: Final = 1.0  # [s] longest additional wait for an active source that is delayed
 # [s] time for which readings before a row are kept; time stamps that arrive in bursts are smoothed
 # over a second.
 KEPT_S: Final = 3.0
 # [s] If the host slept longer, the rows of this time are left out, and the estimator receives a
 # gap.
 MOST_BEHIND_S: Final = 5.0
-OLDEST_FIX_S: Final = 2.0
+OLDEST_FIX_S: Final = 2.0  # [s] older positions are not moved into a row
 STEERING: Final = per_wheel("delta")
 UNSTEERED: Final = STEERING[2:]
 

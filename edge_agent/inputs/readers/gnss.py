@@ -21,7 +21,7 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".nmea", ".gpsd", ".jsonl", ".json")
 LONGEST_LINE: Final = 100_000
-KNOT: Final = 1852.0 / 3600.0  # [m/s]
+KNOT: Final = 1852.0 / 3600.0  # one knot [m/s]
 UNITS: Final = {"latitude": "deg", "longitude": "deg", "speed": "m/s", "course": "deg"}
 
 

@@ -21,6 +21,7 @@ from schemas.numeric import FloatArray
 
 SUFFIXES: Final = (".vbo",)
 DAY_S: Final = 86_400.0
+# VBO files contain positions in arc minutes, with longitude positive to the west
 MINUTES: Final = 60.0
 LARGEST_G: Final = 3.0  # an acceleration without a unit whose values stay below this limit is in g
 UNITS: Final = {"velocity": "km/h", "heading": "deg", "height": "m"}

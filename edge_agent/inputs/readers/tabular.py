@@ -37,9 +37,9 @@ TIMES: Final = (
     "seconds",
 )
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-MOST_NAMES: Final = 20  # names of columns listed in an error
+MOST_NAMES: Final = 20  # maximum number of column names in an error message
 RACECHRONO: Final = "racechrono"
-LONGEST_PREAMBLE: Final = 50  # [lines]
+LONGEST_PREAMBLE: Final = 50  # [lines] maximum length of the text before the table
 _WORD: Final = re.compile(r"[a-z]+")
 _UNIT: Final = re.compile(r"^(?P<name>.*)[\[(](?P<unit>[^\[\](]*)[\])]\s*$")
 

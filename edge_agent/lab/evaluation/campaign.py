@@ -56,11 +56,11 @@ class Results:
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
-    # experiments of paper 004
+    # experiments of paper 004, by (experiment, estimator)
     noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     # coverage of the default estimator, by kind of tyre
     foreign: dict[str, FloatArray] = field(default_factory=dict)
-    # by (fault, estimator)
+    # drives with sensor faults, by (fault, estimator)
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     # rough world (inaccurate cars): by estimator and "baseline"
     world: dict[str, dict[str, float]] = field(default_factory=dict)

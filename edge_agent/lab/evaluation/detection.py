@@ -53,6 +53,8 @@ from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU, SURFACE
 SLIDING: Final = 2.6
 SLIDE_S: Final = 0.1
 BRIDGED_S: Final = 0.1  # [s] shorter gaps, which anti-lock control causes, do not end a slide
+# A slide of at least TOLD_SLIDE_S on friction below TOLD_MU must be reported as slippery, at most
+# TOLD_AFTER_S after its end.
 TOLD_SLIDE_S: Final = 0.2
 TOLD_MU: Final = 0.36
 TOLD_AFTER_S: Final = 0.1

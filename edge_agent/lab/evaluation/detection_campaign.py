@@ -37,7 +37,7 @@ from schemas.runtime.figures import Figure
 
 SHORT_S: Final = 120.0
 LONG_S: Final = 900.0
-LONGER_THAN_SHORT_S: Final = 300.0  # [s] least duration of a town that counts as long
+LONGER_THAN_SHORT_S: Final = 300.0  # [s] minimum duration of a town that counts as long
 CARS: Final = 16
 SHORT_TOWNS: Final = 10
 LONG_TOWNS: Final = 4

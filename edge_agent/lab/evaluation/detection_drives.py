@@ -31,7 +31,7 @@ RATE_HZ: Final = 100.0
 CHUNK_S: Final = 20.0
 BELIEF_SAMPLES: Final = 5  # samples between two readings of the posterior
 STANDING_M_S: Final = 1.0
-APPEARED: Final = 0.1  # least decrease of the mean friction when a patch appears
+APPEARED: Final = 0.1  # minimum decrease of the mean friction when a patch appears
 
 BankMaker: TypeAlias = Callable[[list[Vehicle]], EstimatorBank]
 Samples: TypeAlias = NDArray[np.float32]

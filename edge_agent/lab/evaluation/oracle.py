@@ -43,9 +43,11 @@ from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
 
 STRETCH_S: Final = 0.5
-ROLL_LEAK_STD: Final = 0.012  # mean 0.07; the suspensions of a fleet differ by 17 %
-PITCH_LEAK_STD: Final = 0.005  # mean 0.03
-ROLL_LAG_STD: Final = 0.03  # [s] mean 0.1 s
+# Standard deviation of the roll leak, whose mean is 0.07; the suspensions of a fleet differ by 17
+# %.
+ROLL_LEAK_STD: Final = 0.012
+PITCH_LEAK_STD: Final = 0.005  # standard deviation of the pitch leak, whose mean is 0.03
+ROLL_LAG_STD: Final = 0.03  # [s] standard deviation of the roll lag, whose mean is 0.1 s
 START_STD: Final = 0.05  # [m/s] uncertainty of the initial speed from the wheels
 # frictions considered; a drive at 0.6 g excludes lower ones
 LIKELY: Final = np.linspace(0.62, UPPER, 59)

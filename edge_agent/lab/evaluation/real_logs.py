@@ -46,9 +46,9 @@ from schemas.vehicle import Vehicle, load_vehicle
 ESTIMATOR: Final = "aco-fckf"
 BEGIN_S: Final = 3.0  # [s] beginning of a log that is not evaluated
 MOVING_M_S: Final = 1.5
-FAST_M_S: Final = 3.0  # [m/s] least speed at which sideslip is evaluated
+FAST_M_S: Final = 3.0  # [m/s] minimum speed at which sideslip is evaluated
 INFORMATIVE: Final = 0.6
-GRIPS: Final = 0.6  # least friction of a road that is not slippery
+GRIPS: Final = 0.6  # minimum friction of a road that is not slippery
 CERTAIN: Final = 0.9  # share of `mu_known` that the surface had at least
 MARGIN: Final = 0.03  # tolerance for the noise of the grip in use
 USED_SHARE: Final = 99.5  # percentile of the grip in use that the surface certainly had

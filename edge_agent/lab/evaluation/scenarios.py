@@ -41,8 +41,8 @@ SMALL: Final = TrueVehicle(
     ),
     power=60e3,
 )
-STRONG: Final = replace(SEDAN, power=400e3)  # reaches 0.6 g at 25 m/s
-LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control, so that wheels spin
+STRONG: Final = replace(SEDAN, power=400e3)  # with enough power for 0.6 g at 25 m/s
+LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # without slip control, so that wheels spin
 
 # Vehicle of paper 004 with the vehicle model of its filter. The paper does not give its tyres.
 MATCHED: Final = matched_to_papers(SEDAN)

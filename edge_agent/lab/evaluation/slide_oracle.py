@@ -34,7 +34,7 @@ FORCE_STD: Final = 0.02
 SPEED_STD: Final = 0.03
 # Stiffness per load of an ordinary tyre; it converts noise of the wheel speeds to noise of q.
 STIFF: Final = 20.0
-SLOWEST: Final = 0.5  # [m/s]
+SLOWEST: Final = 0.5  # [m/s] minimum speed for the computation of the slip noise
 EACH: Final = 4
 TYRES: Final = 128
 LEAST_SLOPE: Final = 0.1

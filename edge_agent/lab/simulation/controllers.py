@@ -37,12 +37,12 @@ BUILD_FAST: Final = 35.0
 BUILD: Final = 2.8
 NEARLY: Final = 0.88
 USUAL_HZ: Final = 8.0
-LEAST_SHARE: Final = 0.02  # least brake torque under ABS, as a share of the demanded torque
-TCS_SLOWEST: Final = 2.5  # [m/s] least speed in the denominator of the drive slip
+LEAST_SHARE: Final = 0.02  # minimum brake torque under ABS, as a share of the demanded torque
+TCS_SLOWEST: Final = 2.5  # [m/s] minimum speed in the denominator of the drive slip
 # Rates [1/s] at which the share of engine torque that is cut grows and decreases.
 CUT_RATE: Final = 5.0
 GIVE_RATE: Final = 0.8
-MOST_CUT: Final = 0.95
+MOST_CUT: Final = 0.95  # maximum share of engine torque that is cut
 MUCH: Final = 2.0  # multiple of the slip limit of traction control at which it also brakes
 # Largest brake torque of traction control, divided by weight times wheel radius.
 TCS_BRAKE: Final = 0.12
@@ -55,7 +55,8 @@ CHARACTERISTIC: Final = 45.0  # [m/s] speed at which understeer halves the effec
 MOST_LATERAL: Final = 9.0  # [m/s^2] largest lateral acceleration expected from steering
 ESC_GAIN: Final = 3.0  # brake torque of ESC over weight times radius, per rad/s
 ESC_BRAKE: Final = 0.15  # largest brake torque of ESC over weight times radius, front wheel
-# The same for a rear wheel. A larger torque would reduce the lateral force that stabilises the car.
+# Largest brake torque of ESC at a rear wheel, over weight times radius. A larger torque would
+# reduce the lateral force that stabilises the car.
 ESC_REAR: Final = 0.04
 # Rate of change of the brake torques of traction control and ESC, over weight times radius [1/s].
 HELD_RATE: Final = 2.0

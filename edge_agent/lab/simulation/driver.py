@@ -82,7 +82,7 @@ WARNED_BRAKES: Final = 1.0
 # pedals. Braking on one axle, or an unequal distribution of braking, reaches the limit at half of
 # the available grip.
 CAREFUL: Final = 0.5
-SLOWEST: Final = 3.0  # [m/s] least target speed, unless the driver stops
+SLOWEST: Final = 3.0  # [m/s] minimum target speed, unless the driver stops
 LARGEST_STEER: Final = 0.55  # [rad]
 # [rad] largest slip angle of the front wheels; more steering gives no more lateral force.
 LARGEST_SLIP_ANGLE: Final = 0.09
@@ -95,7 +95,7 @@ STOP_LENGTH_S: Final = 5.0  # [s] duration of braking and waiting, within a wind
 STOPPING: Final = 0.6  # share of the budget with which the driver brakes to a stop
 RESTING: Final = 0.3  # [m/s] below this speed, the driver holds the car by the brake on any slope
 LEAST_BRAKING: Final = 0.35  # share of the budget that remains for braking in the tightest bend
-# [m/s^2] least braking demand of a driver who is much too fast, on any road
+# [m/s^2] minimum braking demand of a driver who is much too fast, on any road
 FRIGHT: Final = 2.5
 TOO_FAST: Final = 1.4  # squared speed over squared target speed from which FRIGHT applies
 PULL: Final = 0.85  # share of the driven wheels' grip that the driver uses for driving

@@ -43,7 +43,7 @@ class Fault:
     @property
     def indices(self) -> list[int]:
         """Return the indices of the channels that the fault affects."""
-        if self.channel in CHANNELS:  # for example "yaw", which is not a prefix of other channels
+        if self.channel in CHANNELS:  # a full name: "yaw" does not also select "yaw_rate"
             return [CHANNELS.index(self.channel)]
         return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]
 

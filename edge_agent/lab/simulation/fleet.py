@@ -56,7 +56,7 @@ WINTER_STREAM = 4
 # Share of the windows of 7 s in which the driver of a rough (inaccurate) vehicle stops: two or
 # three stops per minute.
 STOPS = 0.3
-# [s] time from a warning to the begin of braking (Green, Transportation Human Factors 2, 2000: 1.2
+# [s] time from a warning to the start of braking (Green, Transportation Human Factors 2, 2000: 1.2
 # to 1.5 s).
 TOLD_S = 1.5
 # Multiples of this number, modulo 1, are evenly distributed for any number of vehicles.

@@ -57,7 +57,7 @@ from schemas.thresholds import GRAVITY
 
 # [s] longest integration step; lateral dynamics at 1 m/s have poles near 150/s.
 LONGEST_SUBSTEP: Final = 1e-3
-# Least ratio of the stiffness to one proportional to the load, even at high overload.
+# Minimum ratio of the stiffness to one proportional to the load, even at high overload.
 SOFTEST: Final = 0.3
 FIRM: Final = 1.0  # friction at which a tyre with softening has its full stiffness
 STANDING: Final = 1.0  # [rad/s] wheel speed below which rolling resistance decreases to zero

@@ -28,7 +28,8 @@ SETBACK_M: Final = 12.0
 # [m] length over which a driver smooths the path where arcs meet straights
 SMOOTHING_M: Final = 5.0
 BRAKING: Final = 0.8  # share of the budget that is used for slowing down
-STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] least curvature for the choice of speed, also on straights
+# [1/m] minimum curvature for the choice of speed, also on straights
+STRAIGHTEST: Final = 1.0 / 400.0
 # [m] v²/q within a junction, where drivers look left and right: speeds of 6 to 9 m/s.
 YIELD_M: Final = 16.0
 # Length of a Bezier handle over the chord. A cubic Bezier curve of 90 degrees is then nearly a

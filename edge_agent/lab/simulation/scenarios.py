@@ -29,7 +29,7 @@ from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
 DRAWN: Final = "hills-"  # prefix of the names of random scenarios; the seed follows
-WINTER: Final = "winter-"  # the same for scenarios with winter roads
+WINTER: Final = "winter-"  # prefix of the names of random scenarios with winter roads
 WINTER_STREAM: Final = 22
 # Kinds of patches on the lanes of a winter town, which are assigned in random order. On a lane with
 # the empty name, the road does not change.

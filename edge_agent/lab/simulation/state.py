@@ -107,6 +107,6 @@ class Wheel(IntEnum):
     FZ = 2
     SPEED = 3  # [m/s] of the wheel's centre, along the wheel
     SLIP = 4  # longitudinal slip
-    THETA = 5  # normalised slip; beyond about 2 the wheel slides
+    THETA = 5  # normalised slip; a wheel slides beyond about 2.6
     SLOPE = 6  # dF_x/dω along the secant [N·s/rad]
     TORQUE = 7  # [N·m] effective torque, positive when driving

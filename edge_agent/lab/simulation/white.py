@@ -14,7 +14,7 @@ from schemas.numeric import FloatArray
 from schemas.signals import S
 
 SCHEDULE: Final = (0.04, 0.01, 0.05)  # successive variances in table 2 of paper 004 [SI]
-SCHEDULE_S: Final = 2.0  # [s] duration of each; the period is six seconds
+SCHEDULE_S: Final = 2.0  # [s] duration of each variance; the period is six seconds
 
 
 def scheduled_variance(t: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ from edge_agent.lab.tuning.search import Iteration, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-# Least spread of the draws, as a share of a variable's range. An archive of equal vectors would
+# Minimum spread of the draws, as a share of a variable's range. An archive of equal vectors would
 # otherwise produce only itself.
 LEAST_SPREAD: Final = 1e-3
 REDRAWS: Final = 32  # number of attempts to draw an admissible vector

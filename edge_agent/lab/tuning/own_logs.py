@@ -16,7 +16,7 @@ from edge_agent.lab.tuning.objectives import TuningSet
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 
-MOST_PARTS: Final = 24  # the same number of drives as in the simulated set
+MOST_PARTS: Final = 24  # maximum number of parts, similar to the number of simulated drives
 FEWEST_PARTS: Final = 3
 HELD_OUT: Final = 3  # the last third of the parts is held out
 

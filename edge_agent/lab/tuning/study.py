@@ -31,7 +31,7 @@ from schemas.vehicle import Vehicle
 
 VERTICES: Final = 2 * SETS
 RATE_HZ: Final = 50.0  # sampling rate of the paper
-FINE: Final = 10  # simulation steps per sample, for the steering
+FINE: Final = 10  # simulation steps per sample; the steering is constant during a step
 DURATION_S: Final = 6.0  # period of the paper's noise schedule
 MU: Final = AT_THE_TRUTH.mu
 VARIANCE: Final = AT_THE_TRUTH.noise[0]  # variance of the noise of all three measurements [SI]
