@@ -32,7 +32,7 @@ HELD_S: Final = 3600.0
 ALERT_HELD_S: Final = 600.0
 MOST_CELLS: Final = 20_000  # 6 MB of memory: fifty kilometres of road with its side streets
 MOST_ALERTS: Final = 4096
-# Bit of a place's key that differs between the two directions of one road: sectors 0 and 2 are
+# Bit of a place's key that differs between the two directions of one road. Sectors 0 and 2 are
 # opposite headings, and so are 1 and 3.
 OTHER_WAY: Final = 2
 # Share of each friction bin that lies below SLIPPERY_MU.

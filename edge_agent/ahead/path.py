@@ -40,7 +40,8 @@ ASTRAY: Final = np.radians(60.0)
 # The same holds this close to the start of the route. Navigation systems leave out the part already
 # driven, so the direction into the start is unknown.
 CORNER_M: Final = 20.0
-# [m] length of a straight path if no road is known. Nobody can tell where the road leads beyond it.
+# [m] length of a straight path if no road is known. Beyond this length, the direction of the road
+# is unknown.
 CORRIDOR_M: Final = 150.0
 # [m/m] growth of the corridor's half width. After 100 m it covers a bend with a radius of a
 # kilometre.

@@ -2,7 +2,7 @@
 needs megabytes and not gigabytes. The module is pure (no I/O).
 
 Each second, the fleet service publishes every changed map tile completely: about 50 kB in a busy
-town. A car needs only the part along its path, and not every second, but it must hear of ice
+town. A car needs only the part along its path, and not every second, but it needs news of ice
 immediately. Therefore it requests narrow boxes along its path, and subscribes to the alerts of the
 tiles there.
 """

@@ -19,14 +19,14 @@ from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_p
 from schemas import grid
 from schemas.numeric import IntArray
 
-# [cell sides] largest distance between successive places of a road: the next cell, a diagonal
-# neighbour, or one cell skipped because no position fell into it.
+# [cell sides] largest distance between successive places of a road. The next place is the next cell
+# or a diagonal neighbour, or one cell is skipped because no position fell into it.
 LINK_CELLS: Final = 2.3
 BEGIN_CELLS: Final = 1.6  # [cell sides] largest distance from the car to the first place
 # [rad] largest angle between two successive links: the right angle of a junction within one cell.
 TURN: Final = math.radians(95.0)
-# [rad] largest angle between a link and the heading sector to which it leads: half a sector (45
-# degrees), and the error from using cell centres.
+# [rad] largest angle between a link and the heading sector to which it leads. It is half a sector
+# (45 degrees), and the error from using cell centres.
 LEAN: Final = math.radians(70.0)
 # [rad] links whose directions differ by more lead to different roads
 FORK: Final = math.radians(50.0)

@@ -21,7 +21,7 @@ from schemas.thresholds import NS
 
 FRICTION: Final = tuple(f"{BRANCH}.{name}" for name in ("MostProbable", "LowerBound", "UpperBound"))
 CONDITION: Final = "Vehicle.Exterior.RoadSurfaceCondition"
-# Only ice and a dry road can be recognised by friction: packed snow has at least 20 %, and wet
+# Only ice and a dry road can be recognised by friction. Packed snow has at least 20 %, and wet
 # asphalt at most 80 % (Pacejka 2012, ch. 1). Between the limits, several conditions are possible.
 ICE_BELOW: Final = 20.0  # [%] limit for the upper bound of friction
 DRY_ABOVE: Final = 80.0  # [%] limit for the lower bound of friction

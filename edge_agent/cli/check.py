@@ -1,5 +1,5 @@
-"""`edge-agent check`: run the signal doctor (automatic check of the signals) on a log; list sound
-and faulty signals with their corrections.
+"""`edge-agent check`: run the signal doctor (automatic check of the signals) on a log; list the
+signals without faults, and the faulty signals with their corrections.
 """
 
 from __future__ import annotations

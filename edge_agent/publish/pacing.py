@@ -23,7 +23,7 @@ SILENT_S: Final = 8.0
 FIRST_PROBE_S: Final = 4.0  # [s] interval before the first probe
 # [s] longest interval between probes. With it, a thousand cars send eight messages per second to an
 # unavailable service. With five minutes, cars returned so slowly that the service was idle between
-# them, and the return took longer than the transfer of an hour's backlog.
+# them. Their return took longer than the transfer of an hour's backlog.
 LONGEST_PROBE_S: Final = 120.0
 FIRST_WINDOW: Final = 16.0  # batches in flight: 3 kB, the same as the initial window of TCP
 # Batches in flight; new batches (one per vehicle, kind and second) are sent regardless.

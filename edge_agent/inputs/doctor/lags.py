@@ -44,8 +44,8 @@ NEAR_PEAK: Final = 1e-6
 # [s] lead of wheels and steering over the gyroscope in a car without delays, because a tyre's force
 # builds up after its slip. The values were measured on twenty simulated rough cars, with other
 # seeds than those of the figures.
-# The reaction of the body depends on the cornering stiffness in the vehicle file: an error of 10 %
-# shifts it by 0.01 s (BIAS of steer_lag in learn.py).
+# The reaction of the body depends on the cornering stiffness in the vehicle file. An error of 10 %
+# shifts the lead by 0.01 s (BIAS of steer_lag in learn.py).
 LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
 
 

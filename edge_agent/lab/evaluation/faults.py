@@ -24,7 +24,7 @@ from edge_agent.lab.simulation.manoeuvres import jump, kmh
 from schemas.numeric import FloatArray
 from schemas.signals import Health
 
-# Begin and end of a fault [s].
+# Start and end of a fault [s].
 BEGINS = 2.0
 ENDS = 5.0
 DRIVES: Final = {

@@ -95,7 +95,7 @@ STOP_LENGTH_S: Final = 5.0  # [s] duration of braking and waiting, within a wind
 STOPPING: Final = 0.6  # share of the budget with which the driver brakes to a stop
 RESTING: Final = 0.3  # [m/s] below this speed, the driver holds the car by the brake on any slope
 LEAST_BRAKING: Final = 0.35  # share of the budget that remains for braking in the tightest bend
-# [m/s^2] minimum braking demand of a driver who is much too fast, on any road
+# [m/s^2] minimum braking demand of a driver whose speed is much too high, on any road
 FRIGHT: Final = 2.5
 TOO_FAST: Final = 1.4  # squared speed over squared target speed from which FRIGHT applies
 PULL: Final = 0.85  # share of the driven wheels' grip that the driver uses for driving
@@ -202,7 +202,7 @@ def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None
 @compiled
 def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
     """Advance the warning stored in the driver's state `d` by `dt` [s]: reduce the remaining
-    reaction time by `dt`, and the distances to the stretch's begin and end by `vx` * `dt`.
+    reaction time by `dt`, and the distances to the stretch's start and end by `vx` * `dt`.
     """
     if d[Driver.WARNED_END] > 0.0:
         d[Driver.WARNED_IN] -= dt

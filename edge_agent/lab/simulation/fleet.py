@@ -280,7 +280,7 @@ class SimulatedFleet:
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
         """Warn the driver of vehicle k of a slippery stretch.
 
-        `stretch` is the begin and the end of the slippery stretch as distances ahead [m]; (0, 0)
+        `stretch` is the start and the end of the slippery stretch as distances ahead [m]; (0, 0)
         cancels the warning. `speed` [m/s] is the advised speed and `mu` the friction to expect.
         """
         d = self._states[1][k]

@@ -26,8 +26,8 @@ def is_always_allowed(_vector: FloatArray) -> bool:
     return True
 
 
-# Number of draws after which an ant accepts a path that was already used. A converged colony would
-# otherwise draw for ever.
+# Number of draws after which an ant accepts a path that was already used. Without this limit, a
+# converged colony would never stop drawing.
 REDRAWS = 32
 
 
