@@ -67,15 +67,15 @@ class Visit:
     """One visit (passage of a map cell), open or ended, as a record."""
 
     sample: int  # index in the block of the sample at which the visit ended
-    vehicle: int  # index of the vehicle
+    vehicle: int
     enter_time: int  # [ns]
     leave_time: int  # [ns] time of the last sample
-    samples: int  # number of samples
+    samples: int
     cell: int  # NOWHERE if there is no visit
     sector: int
     health: int  # union of the health flags of all samples
     speed_sum: float  # [m/s] sum over the samples
-    # [1] largest grip used, as far as the window of the last second lies in the visit's last part
+    # [1] largest grip used in the visit's last part; during its first second the latest value
     mu_utilised: float
     felt: float  # [1] upper limit of the grip used, from the accelerometers in this cell alone
     ax: float  # [m/s²] smoothed, also over earlier visits
@@ -87,11 +87,11 @@ class Visit:
     # Largest log-likelihood of each friction in the earlier parts, because any part may apply
     earlier: Annotated[FloatArray, mugrid.BINS]
     earlier_used: float  # [1] smallest grip used of the earlier parts
-    # Number of samples in which each context signal was known
-    known: Annotated[FloatArray, len(CONTEXT)]
-    # Sum of the context signal over these samples; for a flag the number of samples with it on
+    known: Annotated[FloatArray, len(CONTEXT)]  # number of samples with each context signal
+    # Sum of each context signal over these samples; for a flag, the number of samples with 1
     told: Annotated[FloatArray, len(CONTEXT)]
-    driving: float  # [m²/s⁴] sum of squared accelerations in this direction
+    # [m²/s⁴] sums of squared accelerations, forward, backward, to the left and to the right
+    driving: float
     braking: float
     left: float
     right: float

@@ -88,9 +88,9 @@ class FederatedMotion:
     root: Annotated[FloatArray, STATES, STATES]
     beta: float  # [1] information share of sub-filter 1
     factor: Annotated[FloatArray, 2]  # [1] factor on R of each sub-filter
-    gamma: Annotated[FloatArray, 2]  # squared innovation over its expectation, per sub-filter
+    gamma: Annotated[FloatArray, 2]  # [1] squared innovation over its expectation, per sub-filter
     innovation: Annotated[FloatArray, 2, ROWS]
-    expected: Annotated[FloatArray, 2, ROWS]  # innovation variances if R were nominal
+    expected: Annotated[FloatArray, 2, ROWS]  # innovation variances with nominal R
     # Trace of each sub-filter's covariance, each variance over its initial value
     size: Annotated[FloatArray, 2]
 

@@ -13,8 +13,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# [m/s] A wheel that exceeds the second slowest one by more does not spin: its reading is a decoding
-# error (512 km/h occurred).
+# [m/s] largest difference from the second slowest wheel. A larger one is not a spinning wheel but a
+# decoding error (512 km/h occurred).
 SPINS_M_S = 20.0
 SAME_RAD_S = 0.02  # [rad/s] a reading that changes by less counts as unchanged
 HELD = 3  # number of unchanged readings after which a change counts as a step, not as noise

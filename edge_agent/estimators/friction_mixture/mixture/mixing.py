@@ -44,11 +44,11 @@ from schemas.runtime.lanes import lanes_at, largest_lane, put_lanes, select, sum
 from schemas.runtime.records import LANES
 
 LEAST_MIXING = 1e-3  # [1] smaller shares are not mixed, because they change no digit of the output
-# [1] share of `split_prior`: with a smaller probability the split nodes are deactivated
+# [1] The split nodes are deactivated if their probability is below this share of `split_prior`.
 SLEEPING_SHARE = 0.5
 FORGOTTEN_S = 0.5  # [s] time in which friction returns to its prior once no evidence is used
-# [1] exponent of the doubt in this return. It is large, so that the filter forgets hardly anything
-# while the evidence against the model does not suffice.
+# [1] exponent of the doubt in this return. It is large, so that friction is hardly forgotten before
+# the model counts as contradicted.
 BRINK = 4
 # [1] largest share of a node's probability that moves to its neighbours in a block. A larger share
 # would overshoot the balance between neighbours.

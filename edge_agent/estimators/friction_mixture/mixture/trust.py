@@ -43,15 +43,16 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import SLIPPERY_MU
 
-# [1] actual over stated innovation variance under a contradiction: errors of three times the size
+# [1] innovation variance over the stated one under a contradiction: errors are three times as large
 FACTOR = 9.0
-# [nat/s] largest growth of the evidence against the model, so that half a second cannot suffice
+# [nat/s] largest growth rate of the evidence against the model, so that a burst of large errors of
+# half a second does not suffice
 LARGEST_RATIO = 4.0
 # [1] share of `odd_least` that a reset of the motion adds. One reset alone may come from a pothole.
 CALLED_BACK = 0.5
 LONGEST_PATIENCE = 600.0  # [s] longest time before the model is tried again
 RELAPSE = 4.0  # [1] factor on this time after each further contradiction
-FORGIVEN_S = 300.0  # [s] time in which evidence against the model and earlier contradictions fade
+FORGIVEN_S = 300.0  # [s] time constant with which this evidence and `patience` fade
 # [m/s^2] a_y below which the model is tried again, because the wheels then show the motion
 STRAIGHT = 0.6
 
@@ -70,8 +71,8 @@ def update_consistency(
         return
     trust = memory.trust
     constants = design.constants
-    # Use the prior of any car. A calibration narrows the prior of its own car, and deviations from
-    # a narrower prior are no sign of other errors.
+    # Compare with the prior of any car. The narrower prior of a calibrated car would turn small
+    # deviations into strain.
     cost = mixture_cost(memory.overall_mean, design.nominal)
     trust.strain = belief_strain(
         cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior

@@ -61,7 +61,7 @@ from schemas.runtime.jit import compiled, inlined
 from schemas.runtime.lanes import lanes_at, log_lanes, put_lanes
 
 REAR_ROWS = (2, 3, 5)  # measurements of the rear wheels and of the rear axle
-# [1] share of `distrust_noise` that applies when the evidence against the model almost suffices
+# [1] share of `distrust_noise` that applies just before the model counts as contradicted
 DOUBTED = 0.05
 
 

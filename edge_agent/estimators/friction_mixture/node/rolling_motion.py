@@ -28,20 +28,19 @@ from schemas.runtime.lanes import lanes_at, put_lanes
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# [m/s] error of the velocity zero at standstill: wheel sensors do not see a creeping wheel
+# [m/s] error of velocity zero at standstill, because wheel sensors do not detect creeping wheels
 STANDING_STD = 0.05
 STANDING_RAD_S = 0.05  # [rad/s] a wheel that turns more slowly counts as standing
 # [m/s^2] deviation of a_x from its average at standstill beyond which the car may start to move
 STARTS = 0.25
-# [m/s^2] If the wheels stand while the estimated speed exceeds SLOW_M_S, they are locked, or the
-# estimate is wrong. A car with locked wheels decelerates by more than this, except on the most
-# slippery ice.
+# [m/s^2] smallest deceleration of a car with locked wheels, except on the most slippery ice. With
+# less deceleration, wheels that stand at an estimated speed above SLOW_M_S mean a wrong estimate.
 SLIDES_M_S2 = 1.0
-# [1] share of the speed: slower wheels count as locked while the car decelerates
+# [1] Wheels slower than this share of the speed count as locked while the car decelerates.
 LOCKED_SHARE = 0.1
-# [s] time after which standing wheels without that deceleration mean that the car stands
+# [s] time after which standing wheels mean that the car stands, without such a deceleration
 LOST_S = 2.0
-# [s] longest slide with locked wheels; after it, standing wheels mean that the car stands
+# [s] the same time with such a deceleration: the longest slide with locked wheels
 LONGEST_SLIDE_S = 10.0
 AGREE_FLOOR = 0.15  # [m/s] wheel speeds that differ by less always count as equal
 # [1] relative error of the speed difference of both sides in a turn, from track and yaw rate

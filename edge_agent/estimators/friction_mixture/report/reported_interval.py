@@ -36,8 +36,8 @@ LEARNED = 0.05
 # tail, so the lower level alone could reduce the upper end too far.
 DRAWN_IN = 0.085
 # [1] further reduction of the level, and of the upper end, for a car that agrees with its vehicle
-# file, because its other errors are small too. On level drives the true friction was above the
-# upper end in only 1 of 80 cases. The lower end stays, because safe deceleration depends on it.
+# file, because its other errors are small too. The lower end stays, because safe deceleration
+# depends on it.
 NEARER = 0.15
 
 

@@ -106,13 +106,13 @@ class Constants(NamedTuple):
     split_asymmetry: float = 0.12
 
     # --- Weight of the evidence on friction ---
-    # [1] force over load at which `charge_penalty` charges half of a node's cost and, without fuzzy
-    # rules, the evidence counts by half. With .12 a gentle slalom was taken for ice.
+    # [1] force over load at which evidence counts by half (without fuzzy rules), and at which half
+    # of the cost in `charge_penalty` is charged. With .12 a gentle slalom was taken for ice.
     demand_half: float = 0.13
     # [1] exponent of force over load in this weight
     demand_power: float = 4.0
-    # [nat] loss of log-likelihood in a block beyond which the rest counts in full at any force,
-    # because the node's velocity must be wrong
+    # [nat] loss of log-likelihood in a block that is plausible at a wrong friction. The part beyond
+    # it counts in full at any force, because the node's velocity must be wrong.
     plausible_loss: float = 1.7
     # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
     # compensate for a spike
@@ -287,10 +287,10 @@ class Constants(NamedTuple):
     agreeing_floor: float = 0.1
     # [1] relative error of slip computed from force over load with the nominal stiffness
     agreeing_slip: float = 0.6
-    # [1] further slip near the limit, per cubed force over load
+    # [1] additional slip error near the limit of grip, per cubed force over load
     agreeing_cube: float = 0.05
-    # [1] a_y over g up to which the rear axle follows without sliding. Beyond it the axle may slide
-    # unnoticed.
+    # [1] a_y over g up to which the rear axle is assumed not to slide. Beyond it, a sliding axle
+    # cannot be distinguished from one that follows.
     following_most: float = 0.15
     # [rad] error of the sideslip of a following rear axle, besides the slip that its lateral force
     # needs

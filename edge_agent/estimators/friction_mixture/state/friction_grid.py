@@ -19,7 +19,7 @@ from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-SMALLEST = 1e-12  # [1] smallest probability of a node; above 0, so that a road change can raise it
+SMALLEST = 1e-12  # [1] smallest probability of a node, above 0 so that it can grow again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:

@@ -44,18 +44,18 @@ class BlockSums:
     """
 
     time: float  # [s] beginning of the block
-    samples: int  # number of samples
+    samples: int
     angle: float  # [rad] yaw angle since the beginning
     cos_sum: float  # sum of the cosine of this angle over the samples
     sin_sum: float  # the same sum of the sine
     gain: VelocityGain  # since the beginning
     gain_sum: VelocityGain  # sum of `gain` over the samples
-    sums: Annotated[FloatArray, INPUTS]  # sum of the valid samples of each channel
-    counts: Annotated[IntArray, INPUTS]  # number of valid samples of each channel
+    sums: Annotated[FloatArray, INPUTS]  # sum of each channel's valid samples
+    counts: Annotated[IntArray, INPUTS]  # number of each channel's valid samples
     missing_x: float  # [m^2/s^3] variance that v_x gains per second if a_x is missing
     missing_y: float  # [m^2/s^3] the same for v_y if a_y or the yaw rate is missing
     start_yaw_rate: float  # [rad/s] at the beginning
-    start_omega: Annotated[FloatArray, 4]  # [rad/s] at the beginning
+    start_omega: Annotated[FloatArray, 4]  # [rad/s]
 
 
 class LastInputs:
@@ -75,7 +75,7 @@ class LastInputs:
     omega_held: Annotated[IntArray, 4]  # number of readings since a wheel speed changed
     omega_step: Annotated[FloatArray, 4]  # [rad/s] resolution of a wheel speed signal
     delta: Annotated[FloatArray, 4]  # [rad] steering angles
-    delta_before: Annotated[FloatArray, 4]  # [rad] steering angles in the previous block
+    delta_before: Annotated[FloatArray, 4]  # [rad] in the previous block
     rear_steering: bool  # True once a rear steering angle has been read
 
 
@@ -98,7 +98,7 @@ class RollingMotion:
     moved_time: float  # [s] time at which a wheel last turned
     disagreed_time: float  # [s] time at which the wheels last disagreed
     resting_ax: float  # [m/s^2] moving average of a_x while the wheels stand
-    stands: bool  # True while the car stands
+    stands: bool
     ahead: float  # [m/s] v_x according to agreeing wheels; NaN if they do not agree
     ahead_std: float  # [m/s] its standard deviation
     left: float  # [m/s] v_y according to the rear axle; NaN if this axle may slide
@@ -133,8 +133,7 @@ class Trust:
     left: float  # [s] time until the model is tried again
     patience: float  # [s] duration of the last distrust, fading with time
     strain: float  # [1] chi-square of vehicle and sensor states over degrees of freedom
-    # [1/s] additional rate at which offsets, slope and bank return to their prior
-    hurry: float
+    hurry: float  # [1/s] additional return rate of offsets, slope and bank to their prior
 
 
 class Quantiles:
@@ -151,7 +150,7 @@ class MixtureMemory:
     the next.
     """
 
-    row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
+    row: Annotated[FloatArray, len(Parameter)]  # vehicle parameters
     nominal: Nominal  # prior of its states, narrowed by its calibration
     started: bool
     split: bool  # True while the nodes of split roads are active
@@ -168,8 +167,8 @@ class MixtureMemory:
     patch: Annotated[FloatArray, PATCH_NODES]  # probability of an ice patch here, per ice node
     # [nat] amount charged so far for deviations of a node's vehicle and sensor states
     penalty: Annotated[FloatArray, PLACES]
-    overall_mean: Annotated[FloatArray, STATES]  # mean of the whole mixture
-    overall_covariance: Annotated[FloatArray, STATES, STATES]  # its covariance
+    overall_mean: Annotated[FloatArray, STATES]  # of the whole mixture
+    overall_covariance: Annotated[FloatArray, STATES, STATES]
     # Averaged squared innovations and their expected variances: wheels, axles
     actual: Annotated[FloatArray, 2]
     theoretical: Annotated[FloatArray, 2]
@@ -190,7 +189,7 @@ class MixtureMemory:
     friction: Quantiles
     friction_left: Quantiles
     friction_right: Quantiles
-    health: int  # health flags of the last block
+    health: int  # flags of the last block
     nis: float  # normalised squared innovation, mean over the measurements
     log_likelihood: float  # [nat] of the measurements of the block that ends at the sample
 

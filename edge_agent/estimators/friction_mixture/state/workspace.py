@@ -37,7 +37,7 @@ class BlockFeatures:
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # [rad/s] mean
     novelty: float  # [1] `new`, raised to at least `steady_share`
-    new: float  # [1] membership of forces and lateral slips in "new"
+    new: float  # [1] fuzzy truth of "forces or lateral slips are new"
     demand: float  # [1] larger force over load of the two axles
     change: float  # [m/s^2] mean of the measured a_x
     steering: float  # [rad] mean angle of the front wheels
