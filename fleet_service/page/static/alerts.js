@@ -1,4 +1,4 @@
-// Alerts: which stand, where in plain words, how sure, for how long.
+// List of the active alerts: where each one is, how certain, and for how long.
 import { make } from "./elements.js";
 import { jumpTo } from "./navigation.js";
 import { setOption } from "./options.js";
@@ -15,7 +15,7 @@ export function alertsPanel(page) {
 
 export const alertList = page => make("ol", { class: "alerts" }, ...bySeverity(page.state.alerts).map((alert, k) => item(page, alert, k + 1)));
 
-// Two lines each, so that more than alerts fits on a small screen.
+// The short list of alerts. Each alert has two lines, so that other content fits on a small screen.
 export const shortList = (page, most) => make("ol", { class: "alerts" }, ...bySeverity(page.state.alerts).slice(0, most).map((alert, k) => make("li", { "data-alert": alert.id, class: surface(alert) }, badge(k + 1),
   make("a", { href: "#alert", onclick: e => { e.preventDefault(); jumpTo(page, alert); } }, make("strong", {}, wordsOf(page, alert)), make("span", {}, say("alerts.short", valuesOf(page, alert)))))));
 
@@ -33,7 +33,7 @@ function item(page, alert, number) {
       make("div", { class: "line" }, make("button", { type: "button", onclick: () => jumpTo(page, alert) }, say("alerts.jump")), make("span", { class: "note place" }, coordinates(alert.longitude, alert.latitude)))));
 }
 
-// Those of `after` that were not there before.
+// Return the alerts of `after` that `before` does not contain.
 export function begun(before, after) {
   const known = new Set(before.map(alert => alert.id));
   return after.filter(alert => !known.has(alert.id));

@@ -1,14 +1,14 @@
-// How the page looks: light or dark, the sheet of a phone, the divider between two moments, paper.
+// Appearance of the page: light or dark, height of the sheet on a phone, divider of a comparison, printing.
 import { setTheme } from "./colours.js";
 import { byId, make } from "./elements.js";
 import { ladder, mapKey } from "./legend.js";
 import { clock, say, zone } from "./texts.js";
 
-const HEIGHTS = ["44%", "86%", "9.5rem"];  // of the sheet: half, most, or a strip of the screen
+const HEIGHTS = ["44%", "86%", "9.5rem"];  // heights of the sheet: half of the screen, most of it, or a strip
 
 const device = matchMedia("(prefers-color-scheme: dark)");
 
-/** Return true if the page is dark: as was chosen here, else as the device has it. */
+/** Return true if the page is dark: by the user's choice, or else by the device's setting. */
 export const isDark = page => (page.state.theme ?? (device.matches ? "dark" : "light")) === "dark";
 
 /** Call `changed` when the device changes between light and dark. */
@@ -22,7 +22,7 @@ export function applyTheme(page) {
   return name;
 }
 
-/** Apply the theme, and what depends on it: the button, the key of the map, the picture. */
+/** Apply the theme to everything that depends on it: the button, the map's legend and the map. */
 export function dress(page) {
   const name = applyTheme(page);
   Object.assign(byId("theme"), { textContent: name === "dark" ? "☀" : "☾", title: say(`theme.${name}`), ariaLabel: say(`theme.${name}`) });
@@ -37,7 +37,7 @@ export function lift() {
   Object.assign(byId("sheet"), { ariaLabel: say(next === HEIGHTS[1] ? "sheet.less" : "sheet.more"), ariaExpanded: String(next !== HEIGHTS[2]) });
 }
 
-// Two moments lie upon each other; the divider shows more of one or of the other. Returns the share that was set.
+// Move the divider between two moments that are drawn in the same place. Return the share that was set.
 export function moveDivider(share) {
   const kept = Math.min(.98, Math.max(.02, share)), percent = Math.round(100 * kept);
   byId("beside").style.clipPath = `inset(0 0 0 ${percent}%)`;
@@ -59,7 +59,7 @@ export function listenToDivider(slide, share) {
   });
 }
 
-// What paper needs beside the map: the moment with its zone, and the legend.
+// Add what a printed page needs: the moment with its time zone, and the legend.
 export function preparePaper(at) {
   byId("paper")?.remove();
   byId("side").append(make("section", { id: "paper" }, make("h2", {}, say("print.head", { moment: clock(at), zone: zone(at) })), ladder()));

@@ -1,4 +1,4 @@
-// The operator's own raster tiles below the cells; none unless the server was started with --base-map.
+// The operator's own raster tiles below the cells. There are none unless the server was started with --base-map.
 const MOST = 300, LEAST_PX = 128;
 
 export class BaseMap {
@@ -8,8 +8,8 @@ export class BaseMap {
 
   paint(pen, view) {
     const [least, most] = this.zooms, z = Math.max(least, Math.min(most, Math.round(view.zoom))), n = 2 ** z, px = view.scale / n, { west, east, north, south } = view.box;
-    if (px < LEAST_PX) return;  // of a file that begins nearer: hundreds of tiles
-    pen.globalAlpha = .55;  // the cells' colours are what is read
+    if (px < LEAST_PX) return;  // the tile file begins at a nearer zoom, which would need hundreds of tiles
+    pen.globalAlpha = .55;  // the cells' colours must stand out
     for (let x = Math.max(0, Math.floor(west * n)); x < Math.min(n, east * n); x++)
       for (let y = Math.max(0, Math.floor(north * n)); y < Math.min(n, south * n); y++) {
         const picture = this.picture(z, x, y);

@@ -1,4 +1,5 @@
-// Blocks of cells as the server sends them (records.py): a head of 32 bytes, then columns that are used as they lie.
+// Blocks of cells as the server sends them (records.py): a header of 32 bytes, then columns that are used without
+// copying.
 export const BOUND = 0, MEASURED = 1, BORROWED = 2, GONE = 255, NO_NUMBER = 255;
 export const COLUMNS = ["last", "place", "mu", "lower", "upper", "slippery", "basis", "vehicles", "unknown"];
 const HEAD = 32, BYTES = 13;
@@ -25,7 +26,7 @@ export function fromBase64(text) {
   return bytes.buffer;
 }
 
-// Two blocks by place, the second laid over the first; what it calls gone is left out.
+// Merge two blocks by place. The second one overrides the first; rows that it marks as GONE are left out.
 export function laidOver(before, change) {
   const made = { ...change, base: 0 }, from = [], most = before.count + change.count;
   for (let a = 0, b = 0; a < before.count || b < change.count;) {
@@ -43,7 +44,8 @@ export function laidOver(before, change) {
   return made;
 }
 
-// All headings of a place as one: of each number the worst of what was measured, as records.py does for ancestors.
+// Merge all headings of a place into one row with the worst measured value of each column, as records.py does for
+// ancestors.
 export function worstOf(block) {
   const made = { ...block, count: 0 }, n = block.count, { place, basis } = block;
   for (const name of COLUMNS) made[name] = new block[name].constructor(n);

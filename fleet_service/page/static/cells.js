@@ -1,12 +1,12 @@
-// The tiles of one moment: fetched as they come into view, changed as events tell, made ready to be drawn.
+// Map tiles of one moment. They are fetched when they come into view, changed by events, and prepared for drawing.
 import { decode, laidOver, worstOf } from "./blocks.js";
 import { kindOf } from "./colours.js";
 import { CELL_LEVEL, TILE_LEVEL, TILES, columnOf, rowOf } from "./grid.js";
 
 const AT_ONCE = 200, MOST_TILES = 4000;
 
-// What a block's rows have beside their record: column and row within the tile, the corner as x and y in [0, 1], the
-// side; for squares, where all headings are one, and for parts, a heading each.
+// Return what drawing needs in addition to a block's records: column and row within the tile, the corner as x and y in
+// [0, 1], and the side. Squares have all headings merged; parts have one row per heading.
 function ready(block) {
   const steps = 2 ** (block.level - TILE_LEVEL), side = 1 / (TILES * steps);
   const west = columnOf(block.tile) / TILES, north = rowOf(block.tile) / TILES;
@@ -33,10 +33,10 @@ function ready(block) {
 
 export class Cells {
   constructor(at = null) {
-    this.at = at;  // seconds since 1970, or null: now
+    this.at = at;  // [s since 1970]; null means now
     this.tiles = new Map();
     this.known = new Set();
-    this.asking = new Map();  // of each tile that was asked for: when its answer is here
+    this.asking = new Map();  // promise of the answer, by requested tile
     this.changed = () => {};
     this.borrowed = false;
     this.generation = 0;
@@ -48,7 +48,7 @@ export class Cells {
     return answer.ok;
   }
 
-  // All tiles in view at a level; what is there already stays until its successor has come.
+  // Load all tiles in view at a level. A tile that is already shown stays until its successor has arrived.
   async show(box, level) {
     const asked = [], awaited = [];
     for (const tile of this.known) {
@@ -61,7 +61,7 @@ export class Cells {
     if (this.tiles.size > MOST_TILES) this.forget(box);
   }
 
-  // Ask for tiles, whether they are held or not.
+  // Request tiles, also those that are already loaded.
   fetch(tiles, level) {
     const answered = this.request(tiles, level).finally(() => tiles.forEach(tile => { if (this.asking.get(tile) === answered) this.asking.delete(tile); }));
     tiles.forEach(tile => this.asking.set(tile, answered));
@@ -81,7 +81,7 @@ export class Cells {
     }
   }
 
-  // True where the block could be used; false where something before it is missing and the tile must be asked for.
+  // Apply a block. Return false if an earlier block is missing, so that the tile must be requested.
   take(block) {
     const held = this.tiles.get(block.tile)?.block;
     this.known.add(block.tile);
@@ -101,7 +101,7 @@ export class Cells {
       if (west > box.east || west + 1 / TILES < box.west || north > box.south || north + 1 / TILES < box.north) this.tiles.delete(tile);
   }
 
-  // What the cells that are held lie in, and tiles that are not held; null where there is none.
+  // Bounding box of the loaded cells and of the known tiles that are not loaded; null without any.
   get extent() {
     const found = { west: Infinity, north: Infinity, east: -Infinity, south: -Infinity };
     const grow = (west, north, side) => {
@@ -119,13 +119,13 @@ export class Cells {
     return Number.isFinite(found.west) ? found : null;
   }
 
-  // Answers to earlier requests are ignored from now on.
+  // From now on, ignore answers to earlier requests.
   restart() {
     this.generation++;
     this.asking.clear();
   }
 
-  // All records of a place of a tile, by heading; [] where nobody was.
+  // Return all records of a place in a tile, one per heading; [] if no vehicle was there.
   at_place(tile, local) {
     const held = this.tiles.get(tile);
     if (!held) return [];

@@ -2,10 +2,11 @@
 import { draw } from "./elements.js";
 import { clock, say } from "./texts.js";
 
-const LEAST = .05, MOST = 1.2;  // of mu: the friction grid
+const LEAST = .05, MOST = 1.2;  // limits of the friction grid
 
-// A density with the quantiles that a service gives: 5, 50 and 95 %. The normal score of grip is a monotone cubic through
-// them (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980), straight beyond; so the density is smooth, and exact there.
+// Return a density with the quantiles that the service gives: 5, 50 and 95 %. The normal score of the friction is a
+// monotone cubic through them (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980) and linear beyond. The density is
+// smooth, and its quantiles are exact.
 export function densityOf({ lower, mu, upper }) {
   const left = Math.max(mu - lower, .005), right = Math.max(upper - mu, .005), score = 1.6449;
   const chords = [score / left, score / right], middle = 2 / (1 / chords[0] + 1 / chords[1]);

@@ -1,9 +1,9 @@
-// What a cell is drawn in, by the numbers of /settings; the same rule as colours.py, in steps instead of numbers.
-// Kinds: 0 to 3 well known, 4 and 5 roughly, 6 hardly, 7 a mere bound (no colour).
+// Colours of cells, by the numbers of /settings. The rule is that of colours.py, with integer steps instead of values.
+// Kinds: 0 to 3 are well known, 4 and 5 roughly known, 6 hardly known, 7 a lower bound only (no colour).
 import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
 
 export const LITTLE = 6, HOLLOW = 7;
-export const DANGER = [0, 1, 4, 2, 5, 3, 6, 7];  // kinds from the most dangerous to the least known
+export const DANGER = [0, 1, 4, 2, 5, 3, 6, 7];  // all kinds, from the most dangerous to the least known
 const RANK = DANGER.map((_, kind) => DANGER.indexOf(kind));
 const INKS = {
   light: { bound: "#82858a", casing: "#ffffff", halo: "#ffffff", text: "#1b1d22", soft: "#5b6068", land: "#f6f5f2", park: "#e6ebdd", water: "#cfe0ea", building: "#e8e4dc", edge: "#d9d5cc", road: "#ffffff", route: "#0a4fb3", hatch: "#b9b9b9" },
@@ -29,7 +29,8 @@ export const inks = () => rule[rule.theme].inks;
 export const rankOf = kind => RANK[kind];
 export const isKnownSlippery = slippery => slippery > rule.known;
 
-// A place that is more likely slippery than not is never hollow and never grey, whatever its basis says.
+// Return the kind of a cell. A place that is more likely slippery than not is never hollow or grey, whatever its basis
+// is.
 export function kindOf(basis, mu, lower, upper, slippery = 0) {
   const sure = isKnownSlippery(slippery);
   if ((basis !== MEASURED && basis !== BORROWED) || mu === NO_NUMBER) return !sure ? HOLLOW : upper < rule.edges[0] ? 0 : upper < rule.slippery ? 1 : 4;

@@ -1,11 +1,11 @@
-// What is pressed: zoom, tabs, the search, light and dark, the sheet of a phone, the divider.
+// Controls: zoom, tabs, search, theme, sheet of a phone, divider.
 import { dress, isDark, lift, listenToDivider, preparePaper } from "./appearance.js";
 import { byId, make } from "./elements.js";
 import { showAll } from "./navigation.js";
 import { searchBox } from "./search.js";
 import { say } from "./texts.js";
 
-// Mark the tab that is open.
+// Mark the open tab.
 export function markTab(tabs, name) {
   for (const one of tabs) Object.assign(byId(`tab-${one}`), { ariaSelected: String(one === name), tabIndex: one === name ? 0 : -1 });
   byId("panel").setAttribute("aria-labelledby", `tab-${name}`);

@@ -1,4 +1,4 @@
-// Making elements without markup in text: what a service or a file says is never read as HTML.
+// Create elements without parsing markup: text from a service or a file is never read as HTML.
 export const byId = id => document.getElementById(id);
 
 export function make(tag, attributes = {}, ...children) {

@@ -1,7 +1,7 @@
-// Where on earth: the Web Mercator square as [0, 1] × [0, 1], cells at zoom 21, tiles at zoom 14, as schemas/grid.py.
+// Coordinates: the Web Mercator square as [0, 1] × [0, 1], cells at zoom 21, tiles at zoom 14, as in schemas/grid.py.
 export const CELL_LEVEL = 21, TILE_LEVEL = 14, SECTORS = 4;
 export const CELLS = 2 ** CELL_LEVEL, TILES = 2 ** TILE_LEVEL;
-export const HEADINGS = ["east", "north", "west", "south"];  // of a sector, as files and alerts name it
+export const HEADINGS = ["east", "north", "west", "south"];  // names of the sectors, as in files and alerts
 const EARTH_M = 2 * Math.PI * 6378137;
 
 export const worldX = longitude => (longitude + 180) / 360;
@@ -11,7 +11,7 @@ export const latitudeOf = y => Math.atan(Math.sinh(Math.PI * (1 - 2 * y))) * 180
 export const degreesOf = (x, y) => [longitudeOf(x), latitudeOf(y)];
 export const metresPerWorld = y => EARTH_M * Math.cos(latitudeOf(y) * Math.PI / 180);
 
-// Every second bit of a number below 2^32.
+// Collect every second bit of a number below 2^32.
 export function gather(v) {
   v &= 0x55555555;
   v = (v | (v >>> 1)) & 0x33333333;
@@ -31,7 +31,7 @@ export const tileOf = (x, y) => (spread(x) | (spread(y) << 1)) >>> 0;
 export const columnOf = quadint => gather(quadint);
 export const rowOf = quadint => gather(quadint >>> 1);
 
-// A cell of 42 bits is its tile and the 14 bits within.
+// A cell number has 42 bits: the number of its tile, and 14 bits within the tile.
 export const cellOf = (tile, local) => tile * 16384 + local;
 export const tileOfCell = cell => Math.floor(cell / 16384);
 export const localOfCell = cell => cell % 16384;

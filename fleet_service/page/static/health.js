@@ -1,4 +1,4 @@
-// How the services are: by what they say of themselves, and by what a reader hears.
+// State of the services: by their own reports, and by what a reader receives.
 import { make } from "./elements.js";
 import { ago, say } from "./texts.js";
 

@@ -1,4 +1,4 @@
-// What the colours mean, for somebody who has never seen the page: one ladder from the most dangerous to the unknown.
+// Legend for new users: all kinds of cells, from the most dangerous to the unknown.
 import { byId, make } from "./elements.js";
 import { DANGER, HOLLOW, LITTLE } from "./colours.js";
 import { setOption } from "./options.js";
@@ -10,7 +10,7 @@ const ribbon = kind => make("span", { class: `ribbon ${kind === HOLLOW ? "hollow
 
 export const ladder = () => make("ul", { class: "ladder" }, ...DANGER.map(kind => make("li", { "data-kind": kind }, ribbon(kind), make("span", {}, say(`legend.kind.${kind}`), make("small", {}, say(`legend.sure.${kind < 4 ? "well" : kind < LITTLE ? "roughly" : kind === LITTLE ? "hardly" : "bound"}`))))));
 
-// The short one, on the map itself.
+// The short legend on the map itself.
 export function mapKey() {
   byId("key").replaceChildren(...DANGER.map(kind => make("div", {}, make("span", { class: `swatch ${kind === HOLLOW ? "hollow" : `k${kind}`}` }), say(`legend.short.${kind}`))), make("div", {}, make("span", { class: "swatch ground" }), say("legend.short.nobody")));
 }

@@ -1,8 +1,9 @@
-// What the server pushes, and whether it still does: by this page's own clock, not only by errors that a browser reports.
+// Events that the server pushes. The page's own clock detects silence, because browsers do not report every lost
+// connection.
 import { decode, fromBase64 } from "./blocks.js";
 import { ago, clock, say } from "./texts.js";
 
-const SILENT_MS = 5000, PAD = 1;  // a view's width on each side is listened to
+const SILENT_MS = 5000, PAD = 1;  // a margin of one view width on each side is subscribed, too
 
 export class Live {
   constructor({ blocks, alerts, beat, reload }) {
@@ -13,7 +14,7 @@ export class Live {
     this.listens = null;
   }
 
-  // Listen to what a view shows; opened anew only when it has left what is listened to.
+  // Subscribe to the shown area. The subscription is renewed only when the view has left the subscribed area.
   look(view) {
     const [west, south, east, north] = view.degrees(), old = this.listens;
     if (old && old.level === view.level && old.box[0] <= west && old.box[1] <= south && old.box[2] >= east && old.box[3] >= north) return false;
@@ -25,7 +26,7 @@ export class Live {
     source.addEventListener("tiles", e => this.blocks(e.data.split("\n").flatMap(text => decode(fromBase64(text)))));
     source.addEventListener("alerts", e => this.alerts(JSON.parse(e.data)));
     source.addEventListener("reload", () => this.reload());
-    source.addEventListener("open", () => this.reload());  // what was missed while it was not open
+    source.addEventListener("open", () => this.reload());  // changes before the opening were missed
     source.addEventListener("beat", e => {
       this.state = JSON.parse(e.data);
       this.beaten = performance.now();
@@ -37,7 +38,7 @@ export class Live {
     return true;
   }
 
-  // Seconds since 1970 by the server, whose clock stamped the cells.
+  // Current time by the server's clock, which stamped the cells [s since 1970].
   now() {
     return this.state ? this.state.now + (performance.now() - this.beaten) / 1000 : Date.now() / 1000;
   }

@@ -1,4 +1,4 @@
-// The page: its parts, how they start, and what concerns all of them.
+// The page: its parts, their start, and what concerns all of them.
 import { applyTheme, dress, onDeviceTheme } from "./appearance.js";
 import { Cells } from "./cells.js";
 import { setColours } from "./colours.js";
@@ -18,8 +18,9 @@ import { Timeline } from "./timeline.js";
 import { Updates } from "./updates.js";
 import { START, boxOf, levelOf } from "./view.js";
 
-const PHONE_PX = 800, SIDE_PX = 400, SHEET = .44;  // as in style.css: panel beside the map, or share of a phone's screen below it
-const BARE_MS = 300;  // so long may the first picture keep the buttons waiting
+// As in style.css: width of the panel beside the map, or share of a phone's screen that the panel below it takes.
+const PHONE_PX = 800, SIDE_PX = 400, SHEET = .44;
+const BARE_MS = 300;  // longest time for which the first picture may delay the buttons
 
 /** The page: state, map, panels, updates from the server, and timeline. */
 class Page {
@@ -63,7 +64,7 @@ class Page {
     panels.refresh();
   }
 
-  /** Draw the place of a link before there are buttons and panels, unless its cells take long. */
+  /** Draw the place of a link before the buttons and panels exist, unless its cells take too long. */
   async drawFirst(words) {
     this.state.restore(words, TABS);
     applyTheme(this);
@@ -71,7 +72,7 @@ class Page {
     await Promise.race([this.map.drawFirst(...placeOf(words)), new Promise(resolve => setTimeout(resolve, BARE_MS))]);
   }
 
-  /** Listen to the window: size, theme, links, dropped files, and the key of the first alert. */
+  /** Listen to window events: size, theme, links, dropped files, and the key that goes to the first alert. */
   listen() {
     onDeviceTheme(() => dress(this));
     new ResizeObserver(() => this.map.resize()).observe(byId("map"));
@@ -85,7 +86,7 @@ class Page {
     byId("map").addEventListener("keydown", e => { if (e.key === "a" && this.state.alerts.length) jumpTo(this, this.state.alerts[0]); });
   }
 
-  /** Show what a link says, given as the parts of the address after "#". */
+  /** Restore the state of a link, given as the parts of the address after "#". */
   async restore(words) {
     const { state, map, timeline, panels } = this;
     state.restore(words, TABS);
@@ -99,7 +100,7 @@ class Page {
     panels.open(state.tab);
   }
 
-  /** Choose a place, see State.choose, and show it. */
+  /** Choose a place (see State.choose) and show it. */
   choose(tile, local, sector = null) {
     this.state.choose(tile, local, sector);
     this.remember();
@@ -111,10 +112,11 @@ class Page {
   remember() { if (this.map.view.gone || this.state.cells.known.size) history.replaceState(null, "", linkTo(this)); }
 }
 
-// The place and zoom of a link.
+// Return the place and zoom of a link.
 const placeOf = words => ["x", "y", "zoom"].map(name => numberIn(words, name, START[name]));
 
-// Ask for the cells of a link before the map has a size; they arrive while the page is set up. Cells below the panel are not requested.
+// Request the cells of a link before the map has a size; they arrive while the page is set up. Cells that the panel
+// will cover are not requested.
 function askEarly(now, words) {
   if (!words.x || [words.at, words.compare, words.borrowed].some(one => one !== undefined)) return;
   const [x, y, zoom] = placeOf(words);
@@ -128,5 +130,5 @@ const [settings] = await Promise.all([fetch("/settings").then(answer => answer.j
 document.title = say("title");
 setColours(settings);
 const page = new Page(settings, now);
-globalThis.gripmap = page;  // for a person at the console
+globalThis.gripmap = page;  // for use in the browser's console
 await page.start();

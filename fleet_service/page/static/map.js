@@ -1,4 +1,4 @@
-// The large map: its two canvases, its view, and the order of drawing.
+// The large map: two canvases, the view, and the order of drawing.
 import { moveDivider } from "./appearance.js";
 import { BaseMap } from "./basemap.js";
 import { byId } from "./elements.js";
@@ -12,7 +12,7 @@ import { View } from "./view.js";
 
 const LOOK_MS = 120, NEAR_PX = 12;
 
-/** Map of the page. It draws the state, and asks for the cells that come into view. */
+/** Map of the page. It draws the state, and requests the cells that come into view. */
 export class MapWindow {
   /** @param {Page} page the page, whose state is drawn */
   constructor(page) {
@@ -26,7 +26,7 @@ export class MapWindow {
 
   /** Give the canvases the size of the window; draw if it changed. */
   resize() {
-    if (matchMedia("print").matches) return;  // paper takes the picture of the screen
+    if (matchMedia("print").matches) return;  // a printed page shows the picture of the screen
     const ratio = devicePixelRatio || 1, state = this.page.state;
     for (const id of ["beside", "divider"]) byId(id).hidden = !state.comparing;
     this.slide(state.swipe);
@@ -48,14 +48,14 @@ export class MapWindow {
   /** Move the divider of a comparison to a share of the width, from 0 to 1. */
   slide(share) { this.page.state.swipe = moveDivider(share); }
 
-  /** Draw after the view moved, and ask for missing cells when it rests. */
+  /** Draw after the view has moved, and request missing cells when it rests. */
   moved() {
     this.draw();
     clearTimeout(this.waiting);
-    if (this.asked) this.waiting = setTimeout(() => this.look(), LOOK_MS);  // at the start it is looked anyway
+    if (this.asked) this.waiting = setTimeout(() => this.look(), LOOK_MS);  // the start requests the cells itself
   }
 
-  /** Draw a place, in parts of the world, as soon as its cells are here. */
+  /** Draw a place (coordinates from 0 to 1) as soon as its cells have arrived. */
   async drawFirst(x, y, zoom) {
     this.view.go(x, y, zoom);
     reservePicture(byId("map"));
@@ -63,7 +63,7 @@ export class MapWindow {
     this.drawNow();
   }
 
-  /** Ask for the cells in view and for their changes, and draw them when they have come. */
+  /** Request the cells in view and their changes, and draw them when they have arrived. */
   async look() {
     const { page } = this, { state } = page;
     if (!page.started) return;
@@ -71,7 +71,7 @@ export class MapWindow {
     const shown = Promise.all(stores.map(store => store.show(box, level)));
     if (page.live.look(this.view)) this.draw();
     try { await shown; } catch { page.panels.note(say("error.asked")); }
-    if (!this.asked && this.view.gone) this.drawNow();  // before any panel is made
+    if (!this.asked && this.view.gone) this.drawNow();  // draw before any panel is made
     this.asked = true;
     const { chosen } = state;
     if (chosen && chosen.level !== level) page.choose(chosen.tile, chosen.local, chosen.sector);
@@ -79,7 +79,7 @@ export class MapWindow {
     this.draw();
   }
 
-  /** Draw in the next frame, but not before the first cells were asked for: an empty picture takes as long as a full one. */
+  /** Draw in the next frame, but not before the first cells were requested: drawing an empty picture takes as long as a full one. */
   draw() {
     if (this.frame || !this.asked) return;
     this.frame = requestAnimationFrame(() => { this.frame = 0; this.drawNow(); });
@@ -106,7 +106,7 @@ export class MapWindow {
     else this.chooseAt(at.x, at.y);
   }
 
-  /** Choose the place at a point of the world, each coordinate from 0 to 1: the drawn ribbon near it, or the cell. */
+  /** Choose the place at a point (coordinates from 0 to 1): the ribbon drawn near it, or else the cell. */
   chooseAt(x, y) {
     const { page } = this, { roads, cells } = page.state, near = NEAR_PX * metresPerWorld(y) / this.view.scale;
     const { tile, local, sector = null } = this.asRoads ? roads.meantAt(cells, x, y, sidewaysOf(this.view), near) : cellAt(x, y);
@@ -115,7 +115,7 @@ export class MapWindow {
   }
 }
 
-// The right side of a comparison.
+// Draw the right side of a comparison.
 function drawBeside(view, state, extra) {
   const isNow = state.pinned.at === null;
   paint(byId("beside").getContext("2d"), view, state.pinned, { ...extra, away: isNow ? state.away : [], alerts: isNow ? state.alerts : [] });

@@ -1,4 +1,4 @@
-// Past moments of the map: one of them alone, or two side by side.
+// Past moments of the map: a single one, or two side by side.
 import { Cells } from "./cells.js";
 import { byId } from "./elements.js";
 
@@ -14,7 +14,7 @@ export async function goToMoment(page, at) {
     await past.list();
     await past.show(map.view.box, map.view.level);
   }
-  if (state.past !== before) return;  // another was chosen meanwhile
+  if (state.past !== before) return;  // the user chose another moment meanwhile
   state.past = past;
   if (state.chosen) page.choose(state.chosen.tile, state.chosen.local, state.chosen.sector);
   page.panels.tick();
@@ -24,7 +24,7 @@ export async function goToMoment(page, at) {
 }
 
 /**
- * Begin or end a comparison: the moment that is shown now stays on the right, and the slider moves the left.
+ * Begin or end a comparison. The moment that is shown now stays on the right, and the slider changes the left side.
  * @param {Page} page the page
  * @param {boolean} on true to begin
  * @param {Cells} pinned cells for the right side

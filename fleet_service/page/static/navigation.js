@@ -1,14 +1,14 @@
-// Ways to a part of the map: a place, an area, an alert, all cells.
+// Navigation to a part of the map: a place, an area, an alert, all cells.
 import { byId } from "./elements.js";
 import { worldX, worldY } from "./grid.js";
 
 const PLACE_ZOOM = 18, ALERT_ZOOM = 17.5, ROUNDS = 4;
-const DOT_PX = .1, DOT_ZOOM = 16, FAR = 1e-3;  // of the world: some 40 km
+const DOT_PX = .1, DOT_ZOOM = 16, FAR = 1e-3;  // share of the world's width: about 40 km
 
-/** Show a point [deg], at least as near as streets are read. */
+/** Show a point [deg], at a zoom at which streets are legible. */
 export function goTo({ map: { view } }, longitude, latitude) { view.go(worldX(longitude), worldY(latitude), Math.max(view.zoom, ALERT_ZOOM)); }
 
-/** Show the place of an alert, and give the map the keyboard. */
+/** Show the place of an alert, and move the keyboard focus to the map. */
 export function jumpTo(page, alert) {
   goTo(page, alert.longitude, alert.latitude);
   byId("map").focus();
@@ -31,9 +31,10 @@ export function fitTo({ map }, points) {
   map.view.fit({ west: Math.min(...xs), east: Math.max(...xs), north: Math.min(...ys), south: Math.max(...ys) });
 }
 
-/** Show all cells, also new ones, until the user moves the map. */
+/** Show all cells, including new ones, until the user moves the map. */
 export async function showAll({ map, state }) {
-  for (let zoom = null, k = 0; k < ROUNDS && zoom !== map.view.zoom; k++) {  // again to the cells, where only their tiles or squares were known before
+  // Repeat this, because the first rounds may know only tiles or squares instead of cells.
+  for (let zoom = null, k = 0; k < ROUNDS && zoom !== map.view.zoom; k++) {
     zoom = map.view.zoom;
     const { extent } = state.cells;
     if (extent) { map.view.fit(extent); map.view.gone = false; }
@@ -42,7 +43,7 @@ export async function showAll({ map, state }) {
   }
 }
 
-/** Show the area with most alerts if several lie far apart, else the whole map. */
+/** Show the area with most alerts if there are several distant areas, else the whole map. */
 export async function showFirst(page) {
   const { map, state } = page, { extent } = state.now;
   if (extent && extent.east - extent.west > FAR) await page.updates.loadAreas();
@@ -56,6 +57,6 @@ export function followCells(page) {
   const { map: { view }, state } = page, { box } = view, extent = view.gone || state.past ? null : state.now.extent;
   if (!extent) return;
   const size = Math.max((extent.east - extent.west) / view.width, (extent.south - extent.north) / view.height) * view.scale;
-  const isDot = view.zoom < DOT_ZOOM && size < DOT_PX;  // the first cells, on a map of the world
+  const isDot = view.zoom < DOT_ZOOM && size < DOT_PX;  // the cells are a dot on a map of the world
   if (isDot || extent.west < box.west || extent.east > box.east || extent.north < box.north || extent.south > box.south) showFirst(page);
 }

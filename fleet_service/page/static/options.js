@@ -1,4 +1,4 @@
-// What a person chooses to see on the map, and to hear.
+// Options of the user: what the map shows, and whether alerts have a sound.
 import { beep } from "./sound.js";
 
 /** Set an option of `page.state.show`, such as `roads` or `sound`, and apply it. */

@@ -1,4 +1,4 @@
-// The first panel: what is slippery now, how much is unknown, and where there are data.
+// The first panel: what is slippery now, how much is unknown, and where data exist.
 import { shortList } from "./alerts.js";
 import { byId, make } from "./elements.js";
 import { showPlace } from "./navigation.js";
@@ -20,7 +20,7 @@ export function overviewPanel(page) {
   ].filter(Boolean);
 }
 
-// Of the roads in view: slippery stretches without an alert, and the share that nobody knows.
+// Summary of the roads in view: slippery stretches without an alert, and the unknown share.
 function inView(page) {
   const found = slipperyStretches(page.state.roads, page.map.view.box, page.state.alerts), shares = sharesOf(page.state.roads, page.map.view.box), more = found.length - MOST_STRETCHES;
   const item = one => make("li", {}, make("a", { class: "stretch", href: "#stretch", onclick: e => { e.preventDefault(); showPlace(page, one.x, one.y); } },

@@ -1,5 +1,5 @@
-// Drawing: base map, roads as ribbons, squares where the map is far or cells are asked for; a bound is hollow, nobody is
-// nothing.
+// Drawing: base map, roads as ribbons, and squares at small zooms or if the user wants cells. Cells with only a lower
+// bound are hollow, and unvisited cells are not drawn.
 import { BORROWED, NO_NUMBER } from "./blocks.js";
 import { HOLLOW, alertColour, fills, groundColour, inks, isKnownSlippery, themeName } from "./colours.js";
 import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
@@ -7,10 +7,10 @@ import { Pixels } from "./pixels.js";
 import { ribbons, ribbonWidth, streets, track } from "./ribbons.js";
 import { write } from "./vector.js";
 
-const CORNER_PX = [60, 140];  // of the buttons at the upper right
+const CORNER_PX = [60, 140];  // size of the buttons in the upper right corner
 const NEAR_PX = 14, MOST_RECORDS = 9000, LEAST_RIBBON_ZOOM = 14.7, pixels = new Pixels();
 
-/** Take the memory of a picture as large as a canvas, while there is nothing to draw yet. */
+/** Allocate the memory of a picture of a canvas's size before it is needed. */
 export const reservePicture = canvas => pixels.reserve(canvas.width, canvas.height);
 
 const hatches = {};
@@ -24,7 +24,7 @@ function hatching(pen) {
   return hatches[themeName()] = pen.createPattern(tile, "repeat");
 }
 
-// Returns how many places were drawn, by kind, and whether roads were drawn as ribbons.
+// Draw the map. Return the number of drawn places by kind, and whether roads were drawn as ribbons.
 export function paint(pen, view, cells, extra) {
   const drawn = new Array(8).fill(0), box = view.box, near = view.scale / CELLS >= NEAR_PX, passes = passing(extra);
   const seen = [...cells.tiles.values()].filter(({ west, north }) =>
@@ -55,7 +55,7 @@ export function paint(pen, view, cells, extra) {
   }
   if (extra.truth) truthDots(pen, view, extra.truth);
   const badges = extra.alerts.map(alert => badgeAt(view, tracesOf(view, alert, asRoads ? roads : null)));
-  const placed = [...badges.map(([x, y]) => [x, y + 5, 15, 21]), [view.width, 0, CORNER_PX[0], CORNER_PX[1]]];  // no name lies below them
+  const placed = [...badges.map(([x, y]) => [x, y + 5, 15, 21]), [view.width, 0, CORNER_PX[0], CORNER_PX[1]]];  // no name is drawn over these places
   if (extra.base?.label) extra.base.label(pen, view, placed);
   else if (named) names(pen, view, roads, placed);
   badges.forEach((at, k) => badge(pen, at, k + 1));
@@ -64,10 +64,11 @@ export function paint(pen, view, cells, extra) {
   return { drawn, asRoads };
 }
 
-// What a person asked to see, or null: all. What is known to be slippery is no mere bound, whatever its basis.
+// Return a filter for the user's options; null if everything is shown. Known slippery places never count as mere
+// bounds.
 export const passing = extra => extra.oldest === 0 && extra.bounds ? null : (rows, k) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== NO_NUMBER || isKnownSlippery(rows.slippery[k]));
 
-// 0 east, 1 north, 2 west, 3 south: the triangle on that side of the square.
+// Corners of the triangle of each heading within the square: 0 east, 1 north, 2 west, 3 south.
 export const SIDES = [[1, 0, 1, 1], [1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 1, 1]];
 
 function triangle(pen, left, top, px, sector) {
@@ -89,7 +90,7 @@ function headings(pen, view, tile, passes, drawn) {
   parts(pen, view, tile, shown);
 }
 
-// Headings of cells, a triangle each; too small for that, a square.
+// Draw the headings of cells: a triangle for each, or one square if they are too small.
 function parts(pen, view, { rows, x, y, kind, side }, shown) {
   const px = side * view.scale, colours = fills(), ink = inks();
   for (const k of shown) {
@@ -103,7 +104,7 @@ function parts(pen, view, { rows, x, y, kind, side }, shown) {
   }
 }
 
-// Cells that lie on no road of the map, such as a turn into a yard.
+// Draw cells that lie on no road of the map, such as a driveway.
 function dots(pen, view, { x, y, kind, side }, shown) {
   const radius = Math.max(1.5, Math.min(6, ribbonWidth(view) * .3)), colours = fills(), ink = inks();
   for (const k of shown) {
@@ -124,7 +125,7 @@ function regionAway(pen, view, [west, south, east, north]) {
   pen.strokeRect(left, top, right - left, bottom - top);
 }
 
-// Where an alert is drawn: along the ribbons of its lanes, else from cell to cell.
+// Return the lines on which an alert is drawn: along the ribbons of its lanes, or else from cell to cell.
 function tracesOf(view, alert, roads) {
   const found = roads ? roads.under(alert).map(({ lane, first, end }) => {
     const [left, top] = track(view, roads, lane);
@@ -134,7 +135,7 @@ function tracesOf(view, alert, roads) {
   return [alert.points?.length ? alert.points.map(([latitude, longitude]) => [view.left(worldX(longitude)), view.top(worldY(latitude))]) : [middle(view, alert)]];
 }
 
-// A stretch under alert: a broad outline around its ribbons, and its number in the list beside it.
+// Draw a wide outline around the ribbons of an alert; its number in the list is drawn beside it.
 function halo(pen, view, traces) {
   const width = Math.max(18, 2.6 * ribbonWidth(view)), path = new Path2D();
   for (const points of traces) {
@@ -152,7 +153,7 @@ function halo(pen, view, traces) {
 
 const middle = (view, { bbox: [west, south, east, north] }) => [view.left(worldX((west + east) / 2)), view.top((worldY(south) + worldY(north)) / 2)];
 
-// The middle of an alert's badge: above the middle of its longest trace.
+// Return the position of an alert's badge: above the middle of its longest line.
 function badgeAt(view, [points]) {
   const [x, y] = points[points.length >> 1];
   return [x, y - Math.max(18, 2.6 * ribbonWidth(view)) * .5 - 16];
@@ -171,7 +172,7 @@ function badge(pen, [x, y], number) {
   pen.fillText(String(number), x, y + .5);
 }
 
-// Names of roads where no base map has them.
+// Draw road names where no base map has them.
 function names(pen, view, roads, placed) {
   const said = new Set(), ink = inks();
   if (view.zoom < LEAST_RIBBON_ZOOM) return;
@@ -184,7 +185,7 @@ function names(pen, view, roads, placed) {
   }
 }
 
-// Along a route, below the cells: as broad as they are, so that none is hidden.
+// Draw a route as a wide band. It is drawn below the cells, so that it hides none of them.
 function corridor(pen, view, points) {
   const px = Math.max(10, 2.6 * ribbonWidth(view));
   pen.lineJoin = pen.lineCap = "round";

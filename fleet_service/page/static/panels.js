@@ -1,4 +1,4 @@
-// The panel beside the map: one of seven, chosen by tab, and the words that change with time.
+// The panel beside the map: one of seven, chosen by a tab, and the texts that change with time.
 import { alertsPanel } from "./alerts.js";
 import { markTab } from "./controls.js";
 import { byId } from "./elements.js";
@@ -30,21 +30,21 @@ export class Panels {
     this.refresh();
   }
 
-  /** Make the open panel again, and replace the shown one if it differs. */
+  /** Build the open panel again, and replace the shown one if it differs. */
   async refresh() {
     const { state } = this.page, name = state.tab, made = await MAKERS[name](this.page);
     const held = byId("panel"), same = held.childNodes.length === made.length && made.every((one, k) => one.isEqualNode(held.childNodes[k]));
     if (name === state.tab && !same) held.replaceChildren(...made);
   }
 
-  /** Show for some seconds what has happened. */
+  /** Show a message for some seconds. */
   note(words) {
     byId("said").textContent = words;
     clearTimeout(this.noting);
     if (words) this.noting = setTimeout(() => this.note(""), NOTE_MS);
   }
 
-  /** Show whether the map is live, and the card of a state without a map. */
+  /** Show whether the map is live. Show a card if there is no map. */
   tick() {
     const { live, state } = this.page, words = live.words(state.past?.at ?? null), place = byId("live");
     if (place.textContent !== words) place.textContent = words;
@@ -52,7 +52,7 @@ export class Panels {
     place.dataset.state = words === say("live") ? "live" : "late";
   }
 
-  /** Refresh by the clock what no event of the server changes. */
+  /** Refresh periodically what no event of the server changes. */
   keepFresh() {
     const { state, timeline, updates } = this.page;
     setInterval(() => this.tick(), CLOCK_MS);

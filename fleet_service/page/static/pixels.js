@@ -1,12 +1,12 @@
-// Squares as numbers in memory: of twenty thousand, each a call of the canvas, a browser without a graphics card paints
-// some eight pictures a second; written into one picture it is as many as it shows.
+// Draw squares as numbers in memory. With a canvas call for each of 20 000 squares, a browser without a graphics card
+// draws about eight pictures per second. A single picture in memory reaches the display's frame rate.
 import { BORROWED } from "./blocks.js";
 import { HOLLOW, fills, groundColour, inks } from "./colours.js";
 
 const LEAST_PX = 3, DASH_PX = 2;
-const TIE = 1e-4;  // of a point: neighbours, of two tiles too, round their common edge to the same side
+const TIE = 1e-4;  // [px] neighbours, also of two tiles, round their common edge to the same side
 
-const word = colour => {  // "#rrggbb" as the four bytes of a point
+const word = colour => {  // colour "#rrggbb" as the four bytes of a pixel
   const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
   return new Uint32Array(new Uint8Array([r, g, b, 255]).buffer)[0];
 };
@@ -14,16 +14,17 @@ const word = colour => {  // "#rrggbb" as the four bytes of a point
 export class Pixels {
   constructor() { this.canvas = document.createElement("canvas"); }
 
-  // Memory of a picture of so many points.
+  // Allocate the memory of a picture of this size.
   reserve(width, height) {
     if (this.canvas.width === width && this.canvas.height === height && this.image) return;
     Object.assign(this.canvas, { width, height });
     this.image = new ImageData(Math.max(1, width), Math.max(1, height));
     this.points = new Uint32Array(this.image.data.buffer);
-    this.points.fill(1);  // a machine gives memory only when it is written
+    this.points.fill(1);  // write the memory now, because the system allocates it at the first write
   }
 
-  // Begin a picture of so many points, `ratio` to a pixel of the page; opaque where nothing lies below it.
+  // Begin a picture of a size in pixels; `ratio` is pixels per CSS pixel. `opaque` is true if nothing is drawn below
+  // it.
   begin(width, height, ratio, opaque) {
     this.reserve(width, height);
     Object.assign(this, { width, height, ratio, opaque, line: Math.max(1, Math.round(ratio)) });
@@ -40,10 +41,10 @@ export class Pixels {
     pen.drawImage(this.canvas, 0, 0, this.width / this.ratio, this.height / this.ratio);
   }
 
-  // A tile's squares; those that are hollow lie below the coloured ones. Counts what is in view, by kind.
+  // Draw a tile's squares, first the hollow ones. Add the numbers of squares in view to `drawn`, by kind.
   squares(view, { rows, column, row, kind, side, west, north, steps }, passes, drawn) {
     const px = side * view.scale * this.ratio, least = Math.round(LEAST_PX * this.ratio);
-    const edges = first => {  // where the columns, or rows, begin and end; neighbours meet without a gap
+    const edges = first => {  // begin and end of each column or row; neighbours meet without a gap
       const from = new Int32Array(steps), to = new Int32Array(steps);
       for (let k = 0; k < steps; k++) {
         from[k] = Math.round(first + k * px + TIE);
@@ -67,21 +68,22 @@ export class Pixels {
     }
   }
 
-  // A hole in the middle, as large as the share that is unknown: of the smallest square a point, and never all of it.
+  // Draw a hole in the middle of a square, whose area is the unknown share: at least a pixel, but never the whole
+  // square.
   notch(left, top, right, bottom, share) {
     const size = length => Math.max(1, Math.min(length - 2, Math.round(length * Math.sqrt(share) * .8)));
     const width = size(right - left), height = size(bottom - top), x = left + (right - left - width >> 1), y = top + (bottom - top - height >> 1);
     this.fill(x, y, x + width, y + height, this.ground);
   }
 
-  // What is beyond the picture's edges is left out.
+  // Fill a rectangle, clipped at the picture's edges.
   fill(left, top, right, bottom, ink) {
     const { points, width } = this, from = Math.max(0, left), to = Math.min(width, right), last = Math.min(this.height, bottom);
     for (let y = Math.max(0, top); y < last; y++)
       for (let at = y * width + from, end = y * width + to; at < end; at++) points[at] = ink;
   }
 
-  // A dashed line around.
+  // Draw a dashed line around a rectangle.
   dashed(left, top, right, bottom) {
     const { line } = this, step = Math.round(DASH_PX * this.ratio);
     for (let x = left; x < right; x += 2 * step)

@@ -1,4 +1,4 @@
-// One place: what is believed of each heading, how surely, since when, and how fast one may drive by it.
+// The panel of one place: for each heading the friction, its certainty and age, and the safe speed.
 import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
 import { density, history } from "./charts.js";
 import { make } from "./elements.js";
@@ -14,10 +14,11 @@ export function safeSpeed(lower, sight, reaction) {
   return grip > 0 ? grip * (Math.sqrt(reaction ** 2 + 2 * sight / grip) - reaction) : 0;
 }
 
-// A record in numbers; `mu` is null where nothing was measured.
+// Return a record as numbers; `mu` is null if nothing was measured.
 export function numbers(record, settings) {
   const { mu_steps: steps, share_steps: shares } = settings;
-  const sure = record.slippery > shares / 2, basis = BASES[record.basis] ?? (sure ? "measured" : "bound");  // known ice is never a mere bound
+  // Known ice is never a mere bound.
+  const sure = record.slippery > shares / 2, basis = BASES[record.basis] ?? (sure ? "measured" : "bound");
   const mu = basis === "bound" ? null : record.mu === NO_NUMBER ? (record.lower + record.upper) / 2 / steps : record.mu / steps;
   return {
     ...record, basis, mu, lower: record.lower / steps, upper: record.upper / steps,
@@ -26,7 +27,7 @@ export function numbers(record, settings) {
 }
 
 const two = value => value.toFixed(2);
-// Never a higher grip than the number, never a lower risk.
+// Round so that neither the friction nor the certainty is overstated.
 const down = value => (Math.floor(value * 100 + 1e-6) / 100).toFixed(2);
 const percent = value => value > .995 ? say("percent.over", { n: 99 }) : value < .005 ? say("percent.under", { n: 1 }) : String(Math.ceil(value * 100 - 1e-6));
 
@@ -41,7 +42,7 @@ export function placePanel(page) {
   return [...head, ...ordered.map(record => one(page, chosen, numbers(record, page.settings), kind(record)))];
 }
 
-// Where it is: road, coordinates to copy, and the number of the cell.
+// Build the head of the panel: road, coordinates to copy, and number of the cell.
 function placeHead(page, chosen) {
   const [longitude, latitude] = degreesOf(chosen.middleX, chosen.middleY), where = coordinates(longitude, latitude), road = page.state.roadAt(longitude, latitude);
   const copy = make("button", { type: "button", onclick: async e => { await navigator.clipboard?.writeText(`${latitude.toFixed(6)}, ${longitude.toFixed(6)}`); e.target.textContent = say("cell.copied"); } }, say("cell.copy"));
@@ -68,14 +69,14 @@ function one(page, chosen, cell, kind) {
   return section;
 }
 
-// Alerts of a place, and of a heading where one is named: what one direction found is not said of the other.
+// Return the alerts of a place, and of a heading if one is given: an alert holds for its own headings only.
 const alertsAt = (page, { x, y }, heading) => page.state.cells.at !== null ? [] : page.state.alerts.filter(alert => {
   if (heading !== null && !alert.headings.includes(heading)) return false;
   const [west, south, east, north] = alert.bbox, at = degreesOf(x, y);
   return west <= at[0] && at[0] <= east && south <= at[1] && at[1] <= north;
 });
 
-// What only the service and the archive know: exact counts, and how it was before.
+// Fill in what only the service and the archive know: exact counts and the history.
 async function fillIn(page, chosen, cell, list, past) {
   const name = `${cellOf(chosen.tile, chosen.local)}/${cell.sector}`;
   if (page.state.cells.at === null) {

@@ -1,18 +1,18 @@
-// Drawing roads: the street itself, then a ribbon per direction: wide where the grip is well known, narrower where it is
-// roughly known, thin and grey or hollow where it is not.
+// Drawing of roads: the street, then a ribbon for each direction. The ribbon is wide where the friction is well known,
+// narrower where it is roughly known, and thin and grey or hollow where it is unknown.
 import { DANGER, HOLLOW, LITTLE, fills, groundColour, inks } from "./colours.js";
 import { metresPerWorld } from "./grid.js";
 import { isNone } from "./roads.js";
 
 const LANE_M = 3.4, SHARE = [1, 1, 1, 1, .7, .7, .34, .34], ARROW_PX = 110, ARROWS_PX = 9, SIDEWAYS = .56;
-// Kinds that are too near the ground in lightness without an edge (WCAG 1.4.11 asks for 3 : 1).
+// Kinds with too little contrast to the ground without an edge (WCAG 1.4.11 demands 3 : 1).
 const EDGED = [2, 3, 5, 6];
 
 export function ribbonWidth(view) {
   return Math.max(4.5, Math.min(26, LANE_M * view.scale / metresPerWorld(view.y)));
 }
 
-// A lane is drawn beside the middle of its road where both directions share it: that far [m], and its points on the screen.
+// Return the sideways shift [m] of a lane from the middle of its road, which both directions share.
 export const sidewaysOf = view => SIDEWAYS * ribbonWidth(view) * metresPerWorld(view.y) / view.scale;
 
 export function track(view, roads, lane) {
@@ -22,7 +22,7 @@ export function track(view, roads, lane) {
 
 const inView = (lane, box, pad) => lane.west - pad <= box.east && lane.east + pad >= box.west && lane.north - pad <= box.south && lane.south + pad >= box.north;
 
-// The streets of the road map, where no base map draws them.
+// Draw the streets of the road map if no base map draws them.
 export function streets(pen, view, roads) {
   const width = 2 * ribbonWidth(view) + 5, ink = inks(), path = new Path2D(), pad = 30 / view.scale, box = view.box;
   for (const line of roads.lines) {

@@ -1,12 +1,12 @@
-// Roads as ribbons: lines cut into pieces, each direction with the most dangerous of the records that lie on it.
+// Roads as ribbons: lines are cut into pieces. For each direction, a piece shows its most dangerous record.
 import { CELLS, HEADINGS, cellAt, columnOf, metresPerWorld, rowOf, worldX, worldY } from "./grid.js";
 import { kindOf, rankOf } from "./colours.js";
 
 const PIECE_M = 8, REACH_M = 24, LEAST_COS = .3, NONE = 255, BRIDGED = 2, LINKED = 5;
-export const WAYS = [[1, 0], [0, -1], [-1, 0], [0, 1]];  // of the headings, x to the east and y to the south
+export const WAYS = [[1, 0], [0, -1], [-1, 0], [0, 1]];  // direction of each heading: x to the east, y to the south
 const keyOf = (column, row) => row * CELLS + column;
 
-// A line in equal pieces: points and unit normals to its right, in parts of the world.
+// Cut a line into equal pieces. Return points and unit normals to the right, in coordinates from 0 to 1.
 function cut(points) {
   const xs = points.map(point => worldX(point[0])), ys = points.map(point => worldY(point[1])), metre = 1 / metresPerWorld(ys[0]), run = [0];
   for (let k = 1; k < xs.length; k++) run.push(run[k - 1] + Math.hypot(xs[k] - xs[k - 1], ys[k] - ys[k - 1]));
@@ -21,7 +21,7 @@ function cut(points) {
   return { x, y, count, length };
 }
 
-// One direction of a line.
+// Return one direction of a line.
 function laneOf({ x, y, count, length }, name, backward) {
   const lane = { name, count, length, x: new Float64Array(count + 1), y: new Float64Array(count + 1), nx: new Float64Array(count + 1), ny: new Float64Array(count + 1), kind: new Uint8Array(count).fill(NONE), records: new Array(count).fill(null), any: false };
   for (let i = 0; i <= count; i++) { const from = backward ? count - i : i; lane.x[i] = x[from]; lane.y[i] = y[from]; }
@@ -48,12 +48,12 @@ export class Roads {
         this.byCell.get(key).push([number, i]);
       }
     });
-    this.found = new Map();  // of a cell and heading: its lane and piece, looked up once
+    this.found = new Map();  // cache: lane and piece of a cell and heading
   }
 
   get names() { return [...new Set(this.lines.map(line => line.name).filter(Boolean))].sort(); }
 
-  // Lane and piece of a record; null where no road is near.
+  // Return lane and piece of a record; null if no road is near.
   pieceOf(column, row, sector) {
     const key = keyOf(column, row) * 4 + sector, known = this.found.get(key);
     if (known !== undefined) return known;
@@ -70,7 +70,7 @@ export class Roads {
     return best;
   }
 
-  // Lay the records of tiles upon the lanes; what lies on no road comes back, tile by tile, as row numbers.
+  // Assign the records of tiles to lanes. Return the row numbers of the remaining records, tile by tile.
   lay(tiles, passes, drawn, box) {
     for (const lane of this.lanes) { lane.kind.fill(NONE); lane.records.fill(null); lane.any = false; }
     const left = [];
@@ -91,7 +91,7 @@ export class Roads {
     return left;
   }
 
-  // The pieces of the lanes that an alert lies on: { lane, first, end } from neighbour to neighbour.
+  // Return the pieces of lanes under an alert as runs of neighbours: { lane, first, end }.
   under(alert) {
     const pieces = new Map(), found = [];
     for (const [latitude, longitude] of alert.points ?? []) for (const heading of alert.headings) {
@@ -110,7 +110,7 @@ export class Roads {
     return found;
   }
 
-  // The record that is drawn nearest to a place of the map, within some metres; null where no ribbon is near.
+  // Return the drawn record that is nearest to a point, within some metres; null if no ribbon is near.
   drawnAt(x, y, offset, within) {
     const metre = 1 / metresPerWorld(y);
     let best = null, kind = NONE, least = within * metre;
@@ -126,14 +126,15 @@ export class Roads {
     return best && { tile: best.tile.block.tile, local: best.tile.parts.rows.place[best.k] >> 2, sector: best.tile.parts.rows.place[best.k] & 3, kind };
   }
 
-  // The cell and heading that a click means: those under it if their record is drawn like the ribbon there, else those of the ribbon.
+  // Return the cell and heading that a click means: those under the pointer if their record is drawn like the ribbon
+  // there, else those of the ribbon.
   meantAt(cells, x, y, offset, within) {
     const under = cellAt(x, y), ribbon = this.drawnAt(x, y, offset, within), here = ribbon ? cells.at_place(under.tile, under.local) : [];
     const same = here.some(one => one.sector === ribbon.sector && kindOf(one.basis, one.mu, one.lower, one.upper, one.slippery) === ribbon.kind);
     return ribbon && !same ? ribbon : { ...under, sector: ribbon?.sector };
   }
 
-  // The road nearest to a point, within a distance: its name and direction of travel there.
+  // Return the name of the nearest road within a distance [m] and the direction of travel there.
   nearest(x, y, within = 40) {
     const column = Math.floor(x * CELLS), row = Math.floor(y * CELLS), most = Math.ceil(within / 8);
     let best = null, least = within / metresPerWorld(y);
@@ -145,21 +146,22 @@ export class Roads {
     return best?.name ?? "";
   }
 
-  // Where a road lies, for the search.
+  // Return the bounding box of a road, for the search.
   extentOf(name) {
     const own = this.lanes.filter(lane => lane.name === name);
     return { west: Math.min(...own.map(l => l.west)), east: Math.max(...own.map(l => l.east)), north: Math.min(...own.map(l => l.north)), south: Math.max(...own.map(l => l.south)) };
   }
 }
 
-// From a point to a piece of a lane.
+// Return the distance from a point to a piece of a lane.
 function distance(x, y, lane, i) {
   const ax = lane.x[i], ay = lane.y[i], dx = lane.x[i + 1] - ax, dy = lane.y[i + 1] - ay, along = ((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1);
   const share = Math.min(1, Math.max(0, along));
   return Math.hypot(ax + share * dx - x, ay + share * dy - y);
 }
 
-// A gap of a piece or two between two pieces with records is the width of a cell, not an unknown road.
+// Fill gaps of one or two pieces between pieces with records: such a gap comes from the cell size, not from an unknown
+// road.
 function bridge({ kind }) {
   for (let i = 0; i < kind.length; i++) {
     if (kind[i] !== NONE || i === 0 || kind[i - 1] === NONE) continue;

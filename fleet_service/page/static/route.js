@@ -1,4 +1,5 @@
-// A route: clicked or from a GPX file; the grip along it, what is unknown of it, and how fast its worst place bears.
+// A route from clicks or from a GPX file: the friction along it, its unknown share, and the safe speed at its worst
+// place.
 import { profile } from "./charts.js";
 import { make } from "./elements.js";
 import { fitTo, goTo } from "./navigation.js";
@@ -24,7 +25,7 @@ export function routePanel(page) {
 }
 
 /**
- * Show another route, and the grip along it.
+ * Show another route, and the friction along it.
  * @param {Page} page the page
  * @param {number[][]} points longitude and latitude [deg] of each point; empty for no route
  * @param {string} error why there is no route
@@ -55,7 +56,7 @@ export function pointsOf(text) {
   return all.filter((_, k) => k % step === 0 || k === all.length - 1);
 }
 
-/** Ask the server for the grip along a line. */
+/** Ask the server for the friction along a line. */
 async function askGrip(points) {
   const words = points.map(([longitude, latitude]) => `${longitude.toFixed(7)},${latitude.toFixed(7)}`).join("|");
   const answer = await fetch(`/route?${new URLSearchParams({ points: words })}`);

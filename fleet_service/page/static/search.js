@@ -1,4 +1,4 @@
-// Search: a place, a road, a coordinate or the number of a cell; and the areas with data.
+// Search for a place, a road, a coordinate or a cell number; list of the areas with data.
 import { make } from "./elements.js";
 import { CELLS, middleOf, worldX, worldY } from "./grid.js";
 import { showArea, showPlace } from "./navigation.js";
@@ -7,7 +7,7 @@ import { coordinates } from "./words.js";
 
 const MOST = 8, AREA_ZOOM = 16;
 
-// What a text may mean, the best first: { words, go }.
+// Return the possible meanings of a text, the best first: { words, go }.
 export function found(page, text) {
   const asked = text.trim().toLowerCase(), answers = [];
   if (!asked) return answers;

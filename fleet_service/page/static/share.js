@@ -1,11 +1,11 @@
-// The whole state as a link, and what is seen as a file.
+// The state of the page as a link, and the visible map as a file.
 import { numbers } from "./place.js";
 import { byId, make } from "./elements.js";
 import { HEADINGS, cellOf, latitudeOf, longitudeOf } from "./grid.js";
 import { SIDES } from "./paint.js";
 import { say } from "./texts.js";
 
-// The hash of a link to what the page shows.
+// Return the part after "#" of a link to the current state.
 export function linkTo(page) {
   const { map: { view }, state: { show, chosen } } = page, words = new URLSearchParams(), state = {
     x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: page.state.past?.at, compare: page.state.comparing ? page.state.pinned.at ?? "now" : null, tab: page.state.tab,
@@ -31,7 +31,7 @@ export function sharePanel(page) {
     make("p", { class: "note" }, say("share.zoomed_out"))];
 }
 
-// The places in view as rows; what is a mere bound has no mu.
+// Return the places in view as rows. A lower bound has no mu.
 function seen(page) {
   const box = page.map.view.box, rows = [];
   for (const tile of page.state.cells.tiles.values()) {

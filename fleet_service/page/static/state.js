@@ -1,7 +1,7 @@
-// What the page shows: maps of now and of a past moment, alerts, roads, and what a person chose.
+// State of the page: maps of now and of a past moment, alerts, roads, and the user's choices.
 import { CELLS, CELL_LEVEL, cellOf, middleOf, worldX, worldY } from "./grid.js";
 
-/** State of the page, without elements of the document. */
+/** State of the page. It does not contain elements of the document. */
 export class State {
   /** @param {Cells} now cells of the live map */
   constructor(now) {
@@ -43,7 +43,7 @@ export class State {
   }
 
   /**
-   * Set what a link says: options, theme, tab and route.
+   * Restore the state of a link: options, theme, tab and route.
    * @param {Object<string, string>} words parts of the address after "#"
    * @param {string[]} tabs names of the tabs
    */

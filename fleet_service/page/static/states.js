@@ -1,8 +1,8 @@
-// States of the page with words and the next step: loading, empty, no service, no network, no answer.
+// States without a map: loading, empty, no service, no network, no answer. Each has a text and the next step.
 import { byId, make } from "./elements.js";
 import { say } from "./texts.js";
 
-const SILENT_MS = 6000, SLOW_MS = 800;  // until a page that is about to be shown says that it loads
+const SILENT_MS = 6000, SLOW_MS = 800;  // a page that starts quickly shows no loading message before SLOW_MS
 
 export function stateOf({ live, state: { now }, map: { asked } }) {
   if (!asked) return performance.now() > SLOW_MS ? "loading" : null;

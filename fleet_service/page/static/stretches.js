@@ -1,11 +1,12 @@
-// What the ribbons in view say in words: slippery stretches that are under no alert, and how much of the road is unknown.
+// Text about the ribbons in view: slippery stretches without an alert, and the unknown share of the roads.
 import { LITTLE, rankOf } from "./colours.js";
 import { HEADINGS, metresPerWorld } from "./grid.js";
 import { WAYS, isNone } from "./roads.js";
 
-const SLIPPERY = [0, 1, 4], GAP = 2, LEAST_PIECES = 2, ASIDE_M = 1.9;  // pieces of eight metres; the middle of a lane lies beside that of the road
+// GAP and LEAST_PIECES count pieces of 8 m. ASIDE_M is the distance between the middle of a lane and that of the road.
+const SLIPPERY = [0, 1, 4], GAP = 2, LEAST_PIECES = 2, ASIDE_M = 1.9;
 
-// The heading of a lane at a piece: the nearest of the four.
+// Return the heading of a lane at a piece: the nearest of the four.
 function headingAt(lane, i) {
   const cosines = WAYS.map(([wx, wy]) => lane.ny[i] * wx - lane.nx[i] * wy);
   return HEADINGS[cosines.indexOf(Math.max(...cosines))];
@@ -13,7 +14,7 @@ function headingAt(lane, i) {
 
 const inBox = (lane, i, box) => lane.x[i] >= box.west && lane.x[i] <= box.east && lane.y[i] >= box.north && lane.y[i] <= box.south;
 
-// Stretches of lanes in view, the most dangerous first; what is under an alert is left out.
+// Return the slippery stretches of lanes in view, the most dangerous first. Stretches under an alert are left out.
 export function slipperyStretches(roads, box, alerts) {
   const alerted = new Map(), found = [];
   for (const { lane, first, end } of alerts.flatMap(alert => roads.under(alert))) for (let i = first - GAP; i < end + GAP; i++) alerted.set(lane, (alerted.get(lane) ?? new Set()).add(i));
@@ -35,13 +36,16 @@ function stretchOf(lane, pieces) {
   const most = name => Math.max(0, ...own.map(i => lane.records[i].tile.parts.rows[name][lane.records[i].k]));
   return {
     name: lane.name, heading: headingAt(lane, worst), kind: lane.kind[worst], length_m: pieces.length * lane.length / lane.count / metre, slippery: most("slippery"), vehicles: most("vehicles"),
-    x: (lane.x[worst] + lane.x[worst + 1]) / 2 + lane.nx[worst] * aside, y: (lane.y[worst] + lane.y[worst + 1]) / 2 + lane.ny[worst] * aside,  // of its worst piece
+    // Position of the worst piece.
+    x: (lane.x[worst] + lane.x[worst + 1]) / 2 + lane.nx[worst] * aside, y: (lane.y[worst] + lane.y[worst + 1]) / 2 + lane.ny[worst] * aside,
   };
 }
 
-// Shares of the lanes in view: slippery, not slippery, unknown although somebody drove there, and not driven at all; null where no lane is in view.
+// Return the shares of the lanes in view: slippery, not slippery, visited but unknown, and never visited. Return null
+// if no lane is in view.
 export function sharesOf(roads, box) {
-  const metres = { slippery: 0, grip: 0, unknown: 0, never: 0 };  // lines learned from vehicles tell nothing of roads that nobody drove
+  // Lines that were learned from vehicles do not show roads that no vehicle visited.
+  const metres = { slippery: 0, grip: 0, unknown: 0, never: 0 };
   for (const lane of roads.lanes) {
     const piece = lane.length / lane.count * metresPerWorld(lane.y[0]);
     for (let i = 0; i < lane.count; i++) {

@@ -1,4 +1,5 @@
-// Every word that a person reads: one table a language, texts.en.json; the server gives that of the browser's language.
+// All texts of the page: one table per language, such as texts.en.json. The server selects it by the browser's
+// language.
 let table = {};
 
 export async function loadTexts() {
@@ -6,7 +7,7 @@ export async function loadTexts() {
   document.documentElement.lang = table["language"];
 }
 
-// "{count} {count|region|regions}": a value, and a word that goes with one or with several.
+// Fill in a text. In "{count} {count|region|regions}" the second part is the singular or the plural form.
 export function say(key, values = {}) {
   const text = table[key] ?? key;
   return text.replace(/\{(\w+)(?:\|([^|}]*)\|([^}]*))?\}/g, (_, name, one, many) =>
@@ -26,7 +27,7 @@ export function clock(seconds) {
   return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
 }
 
-// The browser's time zone, as it was at a moment.
+// Return the browser's time zone at a moment.
 export function zone(seconds = Date.now() / 1000) {
   const minutes = -new Date(seconds * 1000).getTimezoneOffset(), two = n => String(n).padStart(2, "0"), size = Math.abs(minutes);
   return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "−" : "+"}${two(Math.floor(size / 60))}:${two(size % 60)}`;

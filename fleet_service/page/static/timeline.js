@@ -1,4 +1,4 @@
-// The kept moments as a slider: its last place is now. The moment that is shown is always said.
+// Slider of the stored moments. Its last position is now. The shown moment is always written beside it.
 import { make } from "./elements.js";
 import { compareMoments, goToMoment } from "./moments.js";
 import { clock, say, zone } from "./texts.js";
@@ -15,7 +15,7 @@ export class Timeline {
     this.play = make("button", { type: "button", id: "play", onclick: () => this.timer ? this.stop() : this.start() }, say("time.play"));
     this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => compareMoments(page, !page.state.comparing) }, say("time.compare"));
     this.none = make("span", { class: "note" }, say("time.none"));
-    addEventListener("beforeprint", () => this.say(true));  // paper has no clock beside it
+    addEventListener("beforeprint", () => this.say(true));  // a printed page has no clock next to it
     addEventListener("afterprint", () => this.say());
     footer.append(this.play, this.slider, this.shown, this.compare, this.none);
     this.say();
@@ -34,7 +34,7 @@ export class Timeline {
     return this.moments[Number(this.slider.value)] ?? null;
   }
 
-  // Show a moment, or the last kept before it; null: now.
+  // Show a moment, or the last stored one before it; null means now.
   put(at) {
     const found = at === null ? -1 : this.moments.findLastIndex(moment => moment <= at);
     this.slider.value = found < 0 ? this.moments.length : found;

@@ -1,4 +1,4 @@
-// What comes from the server after the start: changed cells, alerts, the state of services, roads and areas.
+// Data that the server sends after the start: changed cells, alerts, state of the services, roads and areas.
 import { begun } from "./alerts.js";
 import { kindOf } from "./colours.js";
 import { byId } from "./elements.js";
@@ -16,7 +16,7 @@ export class Updates {
   /** @param {Page} page the page, whose state is updated and drawn */
   constructor(page) { Object.assign(this, { page, missed: false, moreRoads: 0 }); }
 
-  /** Load what the first picture does not need: the server computes it while it could send cells. */
+  /** Load what the first picture does not need. The server would otherwise compute it while it should send cells. */
   loadBeside() {
     const { page } = this;
     return Promise.all([page.timeline.load(), this.loadAreas(), this.firstRoads ?? this.loadRoads(), page.settings.overlay ? this.loadTruth() : null]);
@@ -41,7 +41,7 @@ export class Updates {
     if (state.tab === "now" && before !== JSON.stringify(state.areas)) panels.refresh();
   }
 
-  /** Load the cells of the map that is drawn over the live one; try again later if there is none yet. */
+  /** Load the cells of the map that is drawn over the live one. Try again later if there is none yet. */
   async loadTruth() {
     const { state, map, settings } = this.page, told = await (await fetch("/overlay")).json();
     if (!told) { setTimeout(() => this.loadTruth(), AGAIN_MS); return; }
@@ -54,7 +54,7 @@ export class Updates {
 
   /** Load all held cells again, because changes may have been missed. */
   async reload() {
-    if (!document.body.dataset.ready) { this.missed = true; return; }  // after the first picture
+    if (!document.body.dataset.ready) { this.missed = true; return; }  // reload after the first picture
     const { state: { now }, map, panels } = this.page;
     await now.list();
     followCells(this.page);
@@ -96,11 +96,11 @@ export class Updates {
   /** Show which regions have no service, by what the server reports every two seconds. */
   beat({ away, served, now }) {
     const { state, map, panels } = this.page, words = byId("away");
-    state.away = away.length || served ? away : [{ box: WORLD }];  // no service has answered, so nothing is known to be empty
+    state.away = away.length || served ? away : [{ box: WORLD }];  // without any answer of a service, every region counts as not served
     words.hidden = !away.length;
     if (away.length) words.textContent = say("away", { count: away.length, ago: ago(now - Math.min(...away.map(one => one.since))) });
     panels.tick();
-    if (state.tab === "now" && state.isServed !== served) panels.refresh();  // its words say whether a service answers
+    if (state.tab === "now" && state.isServed !== served) panels.refresh();  // the texts of this tab depend on it
     state.isServed = served;
     map.draw();
   }

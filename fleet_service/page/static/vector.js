@@ -1,5 +1,5 @@
-// Vector base map: Mapbox Vector Tiles 2.1 decoded once, kept as paths, drawn in a light or a dark style.
-// Layers and classes are those of OpenMapTiles and of Protomaps.
+// Vector base map: Mapbox Vector Tiles 2.1, decoded once, stored as paths, and drawn in a light or a dark style. The
+// layers and classes are those of OpenMapTiles and of Protomaps.
 import { inks } from "./colours.js";
 import { metresPerWorld } from "./grid.js";
 
@@ -81,7 +81,7 @@ function partsOf(commands) {
   return parts;
 }
 
-// Paths of a tile by what is drawn, and its labels; coordinates in [0, 1] of the tile.
+// Return the paths of a tile by what they show, and its labels. Coordinates are in [0, 1] of the tile.
 function ready(layers, language) {
   const areas = { park: new Path2D(), water: new Path2D(), building: new Path2D() }, ways = new Map(), labels = [];
   const add = (path, parts, extent) => parts.forEach(part => part.forEach(([x, y], k) => k ? path.lineTo(x / extent, y / extent) : path.moveTo(x / extent, y / extent)));
@@ -135,7 +135,7 @@ export class VectorMap {
     pen.lineCap = "butt";
   }
 
-  // Names above all else, none upon another.
+  // Draw names on top of everything else, without overlaps.
   label(pen, view, placed) {
     const ink = inks(), said = new Map();
     for (const { tile, left, top, px } of this.seen(view)) for (const label of tile.labels)
@@ -156,7 +156,7 @@ export class VectorMap {
   }
 }
 
-// A name along a line, where the line is straight enough for it.
+// Draw a name along a line, if the line is straight enough.
 function street(pen, ink, { name, along }, left, top, px, placed, view, said) {
   const half = name.length * LABEL_PX / 2 + 6, points = along.map(([x, y]) => [left + x * px, top + y * px]), run = [0];
   for (let k = 1; k < points.length; k++) run.push(run[k - 1] + Math.hypot(points[k][0] - points[k - 1][0], points[k][1] - points[k - 1][1]));

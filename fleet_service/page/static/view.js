@@ -1,21 +1,21 @@
-// The window on the world: where it is, how large, and how mouse, fingers and keys move it.
+// The view: its position and size, and its control by mouse, touch and keys.
 import { CELL_LEVEL, TILE_LEVEL, latitudeOf, longitudeOf } from "./grid.js";
 
-/** Place and zoom at which the view begins. */
+/** Position and zoom at which the view begins. */
 export const START = { x: .5, y: .35, zoom: 3 };
 
 const LEAST_ZOOM = 2, MOST_ZOOM = 21, TILE_PX = 256, TURN = 1.25, STEP_PX = 60, CONTROLS_PX = 56;
 
-/** Return the box that a window of a size [px] shows around a place, in parts of the world. */
+/** Return the box that a window of a size [px] shows around a place, in coordinates from 0 to 1. */
 export function boxOf({ x, y, zoom, width, height }) {
   const scale = TILE_PX * 2 ** zoom, w = width / 2 / scale, h = height / 2 / scale;
   return { west: x - w, east: x + w, north: y - h, south: y + h };
 }
 
-/** Return the level of squares of four pixels or more; the finest level where those are cells. */
+/** Return the finest level at which squares have at least four pixels. This is the cell level for near zooms. */
 export const levelOf = zoom => Math.max(TILE_LEVEL, Math.min(CELL_LEVEL, zoom >= 14.7 ? CELL_LEVEL : Math.floor(zoom) + 6));
 
-/** Window on the world. */
+/** The visible part of the world. */
 export class View {
   constructor(canvas) {
     Object.assign(this, { canvas, ...START, gone: false, width: 1, height: 1, covered: 0, moved: () => {}, clicked: () => {} });
@@ -35,14 +35,14 @@ export class View {
   place(px, py) { return { x: this.x + (px - this.width / 2) / this.scale, y: this.y + (py - this.height / 2) / this.scale }; }
 
   go(x, y, zoom = this.zoom) {
-    this.gone = true;  // somebody chose where to look
+    this.gone = true;  // the user or a command has moved the view
     this.zoom = Math.min(MOST_ZOOM, Math.max(LEAST_ZOOM, zoom));
     this.x = Math.min(1, Math.max(0, x));
     this.y = Math.min(1, Math.max(0, y));
     this.moved();
   }
 
-  // Into the part of the window that no key, time bar or button covers.
+  // Fit a box into the part of the window that no legend, time bar or button covers.
   fit({ west, east, north, south }) {
     const high = Math.max(this.height - this.covered, this.height / 2), wide = this.width - CONTROLS_PX, fits = Math.min(wide / Math.max(east - west, 1e-6), high / Math.max(south - north, 1e-6));
     const zoom = Math.min(Math.log2(.85 * fits / TILE_PX), 18);

@@ -1,4 +1,4 @@
-// Plain words for places and alerts, with the names of roads where they are known.
+// Plain texts for places and alerts, with road names if they are known.
 import { latitudeOf, longitudeOf } from "./grid.js";
 import { say } from "./texts.js";
 
@@ -6,10 +6,10 @@ const BOUNDS = { east: "eastbound", north: "northbound", west: "westbound", sout
 
 export const coordinates = (longitude, latitude) => `${Math.abs(latitude).toFixed(5)}° ${latitude < 0 ? "S" : "N"}, ${Math.abs(longitude).toFixed(5)}° ${longitude < 0 ? "W" : "E"}`;
 
-// The most dangerous first: ice before snow, then the longer one.
+// Sort alerts by danger: ice before snow, then by certainty, then by length.
 export const bySeverity = alerts => [...alerts].sort((a, b) => surfaceRank(a.mu) - surfaceRank(b.mu) || b.p_slippery - a.p_slippery || b.length_m - a.length_m);
 
-// "a", "a and b", "a, b and c".
+// Join words: "a", "a and b", "a, b and c".
 const listed = words => [words.slice(0, -1).join(", "), words.at(-1)].filter(Boolean).join(` ${say("and")} `);
 
 const surfaceRank = mu => mu < .2 ? 0 : 1;
@@ -23,5 +23,5 @@ export function stretchWords({ name, heading, kind, x, y }) {
   return say(name ? "alert.on_road" : "alert.on_no_road", { what: say(kind === 0 ? "alert.ice" : "alert.slippery"), road: name, ways: say(`alert.${BOUNDS[heading]}`), place: coordinates(longitudeOf(x), latitudeOf(y)) });
 }
 
-// Percent of certainty, never rounded up to all of it.
+// Return the certainty in percent; it is never rounded up to 100.
 export const certainty = share => share > .995 ? say("percent.over", { n: 99 }) : String(Math.floor(share * 100));
