@@ -1,4 +1,4 @@
-# Two commands are all that a fresh machine with Python 3.11+ and make needs: `make demo` and `make test`.
+# A fresh machine with Python 3.11+ and make needs only two commands: `make demo` and `make test`.
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -6,7 +6,7 @@ PAPERS := .venv/.papers
 LIGHT := .venv/.light
 ONLY ?=
 
-# two processes more than cores, because many tests wait for processes of their own
+# Two processes more than cores, because many tests wait for processes that they started.
 PYTEST := -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 2 )) --dist loadfile
 TESTS := $(BIN)/python $(PYTEST)
 export PYTHONDONTWRITEBYTECODE :=  # keep byte code: tests start hundreds of processes
@@ -40,7 +40,7 @@ $(PAPERS): $(STAMP)
 demo: $(LIGHT)  ## router, service, page and simulated cars; prints the address of the live map
 	$(BIN)/gripmap demo $(ARGS)
 
-# what the demo needs, and nothing for developers
+# Packages for the demo only, without those for developers.
 $(LIGHT): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[demo,page]'

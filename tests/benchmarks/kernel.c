@@ -1,4 +1,4 @@
-/* The limit for a Python filter: `paper-aco-fckf` as one would write it by hand in C, bare of checks and reports.
+/* Lower limit of the time of a filter: `paper-aco-fckf` written by hand in C, without checks and reports.
 
    State x = [v_x, v_y, a_x, a_y, r, mu], four Dugoff tyres, twelve cubature points carried by Heun's rule, covariance
    summed and factorized, Carlson's triangular update, R adapted by five fuzzy sets. One vehicle is one struct.
@@ -54,7 +54,7 @@ static double infer(double mismatch, const double *in, const double *out) {
     return out[4];
 }
 
-/* Mean and factor of the moved points; a pivot is at least its own noise. */
+/* Compute the mean and the covariance factor of the predicted points. A pivot is at least its own process noise. */
 static void gather(Filter *f, double x[POINTS][N], const double *process, double pace) {
     double (*L)[N] = f->root;
     for (int i = 0; i < N; i++) {
@@ -80,7 +80,7 @@ static void gather(Filter *f, double x[POINTS][N], const double *process, double
     }
 }
 
-/* Take in a reading of state i with noise `after`. */
+/* Update the filter with a reading of state i with noise `after`. */
 static void look(Filter *f, int i, double reading, double after) {
     double gain[N] = {0}, share;
     for (int j = i; j >= 0; j--) {
@@ -136,7 +136,8 @@ static void step(Filter *f, const double *p, const Setting *z, const double *now
     for (int i = 0; i < INPUTS; i++) f->before[i] = now[i];
 }
 
-/* readings (samples, vehicles, INPUTS), parameters (vehicles, 12), out (samples, vehicles, N): the means. */
+/* Run the filters. Shapes: readings (samples, vehicles, INPUTS), parameters (vehicles, 12), out (samples, vehicles, N)
+   with the means. */
 void drive(Filter *filters, const double *parameters, const Setting *z, const double *readings, double gone, int samples,
            int vehicles, double *out) {
 #pragma omp parallel for schedule(static)

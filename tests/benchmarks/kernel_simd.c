@@ -1,7 +1,7 @@
-/* The limit for a bank: `paper-aco-fckf` as in kernel.c, LANES vehicles side by side in vectors (structure of arrays).
+/* Lower limit of the time of a bank: `paper-aco-fckf` as in kernel.c, with LANES vehicles in vectors (structure of arrays).
 
-   Every quantity is a vector over vehicles, so that each operation is one instruction for all of them; what kernel.c
-   branches on is selected. Nothing is reassociated: results differ from kernel.c by the vector exp, sin and cos only. */
+   Every quantity is a vector over vehicles, so that each operation is one instruction for all of them. Selections replace
+   the branches of kernel.c. No operation is reassociated: results differ from kernel.c only by the vector exp, sin, cos. */
 
 #include <math.h>
 
@@ -12,7 +12,7 @@ enum { AX, AY, RATE, DELTA, OMEGA = DELTA + 4, INPUTS = OMEGA + 4 };
 typedef double V __attribute__((vector_size(8 * LANES)));
 typedef long M __attribute__((vector_size(8 * LANES)));
 
-/* the vector library of glibc, which gcc else uses with fast-math only */
+/* vector functions of glibc; otherwise gcc uses them only with fast-math */
 __attribute__((simd("notinbranch"))) double exp(double);
 __attribute__((simd("notinbranch"))) double sin(double);
 __attribute__((simd("notinbranch"))) double cos(double);
@@ -83,7 +83,7 @@ INLINE V infer(V mismatch, const double *in, const double *out) {
     return choose(mismatch <= in[0], mismatch * 0.0 + out[0], found);
 }
 
-/* Mean and factor of the moved points; a pivot is at least its own noise. */
+/* Compute the mean and the covariance factor of the predicted points. A pivot is at least its own process noise. */
 INLINE void gather(Filters *f, V x[POINTS][N], const double *process, double pace) {
     V(*L)[N] = f->root;
     for (int i = 0; i < N; i++) {
@@ -111,7 +111,7 @@ INLINE void gather(Filters *f, V x[POINTS][N], const double *process, double pac
     }
 }
 
-/* Take in a reading of state i with noise `after` (Carlson). */
+/* Update the filters with a reading of state i with noise `after` (Carlson). */
 INLINE void take(Filters *f, int i, V reading, V after) {
     V gain[N] = {{0}};
     for (int j = i; j >= 0; j--) {
@@ -169,8 +169,8 @@ INLINE void step(Filters *f, const V *p, const Setting *z, const V *now, double 
     for (int i = 0; i < INPUTS; i++) f->before[i] = now[i];
 }
 
-/* All arrays end in LANES: filters (blocks), parameters (blocks, 12), readings (samples, blocks, INPUTS), and out
-   (samples, blocks, N), the means. */
+/* Run the filters. The last axis of all arrays is LANES. Other axes: filters (blocks), parameters (blocks, 12), readings
+   (samples, blocks, INPUTS), out (samples, blocks, N) with the means. */
 void drive(Filters *filters, const V *parameters, const Setting *z, const V *readings, double gone, int samples, int blocks,
            V *out) {
     double keep = exp(-log(2.0) * gone / z->window_s);

@@ -1,13 +1,13 @@
-/* A vehicle in C: publishes an observation, waits for its acknowledgement, subscribes to alerts and queries a tile.
+/* A vehicle in C: it publishes an observation, waits for its acknowledgement, subscribes to alerts and queries a tile.
  *
- * It follows schemas/README.md and schemas/proto/gripmap.proto alone. It needs zenoh-pico or zenoh-c, version 1:
+ * It uses only the definitions in schemas/README.md and schemas/proto/gripmap.proto. It needs zenoh-pico or zenoh-c, version 1:
  *
  *   cc -std=c11 -DZENOH_LINUX -o client client.c $(pkg-config --cflags --libs zenohpico) -lm -lpthread
  *   cc -std=c11 -DUSE_ZENOH_C -o client client.c $(pkg-config --cflags --libs zenohc) -lm -lpthread
  *   ./client tcp/127.0.0.1:7447 anna 57.7 11.97 60
  *
  * Arguments: endpoint, enrolled name of the vehicle, latitude and longitude of the ice, seconds to wait. It prints one
- * line of JSON and returns 0 when it was acknowledged, saw an alert in its tile and received the tile.
+ * line of JSON and returns 0 if the observation was acknowledged, an alert in its tile arrived and the tile arrived.
  */
 #define _POSIX_C_SOURCE 200809L
 #include <inttypes.h>
@@ -28,7 +28,7 @@ enum { VISITS = 6, ZOOM = 14, KEY_SIZE = 128, BATCH_SIZE = 4096, FIRST_RETRY_S =
 
 static const double PI = 3.14159265358979323846;
 
-/* ---- what the callbacks of Zenoh, which run on its threads, tell the main thread ---- */
+/* ---- data that Zenoh's callbacks, which run on its threads, pass to the main thread ---- */
 
 typedef struct {
     pthread_mutex_t lock;
@@ -44,7 +44,7 @@ typedef struct {
     int cells;
 } Heard;
 
-/* ---- protobuf: one field after the other ---- */
+/* ---- protobuf: read one field after the other ---- */
 
 typedef struct {
     const uint8_t *at;
@@ -53,8 +53,8 @@ typedef struct {
 
 typedef struct {
     uint32_t number;
-    uint64_t value;  /* of a varint, or the bits of a fixed-width number */
-    Reader content;  /* of a message, a string or bytes */
+    uint64_t value;  /* value of a varint, or the bits of a fixed-width number */
+    Reader content;  /* content of a message, a string or bytes */
 } Field;
 
 static bool read_varint(Reader *reader, uint64_t *value) {
@@ -104,7 +104,7 @@ static bool has_first_seq(Reader range) {
     return first <= 1 && 1 <= last;
 }
 
-/* A StreamAck of our boot settles batch 1 of the observations: in `durable`, or in `rejected` with the reason. */
+/* Record whether a StreamAck of this boot settles batch 1 of the observations: in `durable`, or in `rejected`. */
 static void read_stream_ack(Reader stream, Heard *heard) {
     Field field;
     uint64_t boot = 0, kind = 0;
@@ -175,7 +175,7 @@ static void on_tile(z_loaned_reply_t *reply, void *context) {
     Reader reader = copy_payload(is_tile ? z_sample_payload(z_reply_ok(reply))
                                          : z_reply_err_payload(z_reply_err(reply)), &slice);
     if (is_tile) {
-        static const char NEEDLE[] = "\"mu_lower\"";  /* each cell of `format=json` has this column once */
+        static const char NEEDLE[] = "\"mu_lower\"";  /* with `format=json` each cell has this column once */
         const size_t length = sizeof NEEDLE - 1;
         pthread_mutex_lock(&heard->lock);
         heard->tiles++;
@@ -197,7 +197,7 @@ static void on_last_tile(void *context) {
     pthread_mutex_unlock(&heard->lock);
 }
 
-/* Wait until `*flag`, a batch is rejected or the time is over; return the flag. */
+/* Wait until `*flag` is true, a batch is rejected or the time is over. Return the flag. */
 static bool wait_for(Heard *heard, const bool *flag, double seconds) {
     struct timespec until;
     clock_gettime(CLOCK_REALTIME, &until);
@@ -214,7 +214,7 @@ static bool wait_for(Heard *heard, const bool *flag, double seconds) {
 
 /* ---- keys ---- */
 
-/* Write the quadkey of a place at zoom 14 as chunks <d4>/<d3>/<d3>/<d4>: a tile; without the last, its region. */
+/* Write the quadkey of a place at zoom 14 as chunks <d4>/<d3>/<d3>/<d4>: its tile. The first three are its region. */
 static void write_tile_key(double latitude, double longitude, char key[static 18]) {
     double phi = latitude * PI / 180.0;
     uint32_t side = 1u << ZOOM;
@@ -238,7 +238,7 @@ static int append_column(char *text, int at, const char *name, double value) {
     return at + snprintf(text + at, (size_t)(BATCH_SIZE - at), "]");
 }
 
-/* Write visits that used nearly all grip of ice, one a second until now, heading north. */
+/* Write visits that used nearly all the grip of ice: one per second until now, heading north. */
 static void write_batch(const char *vehicle, uint64_t boot, double latitude, double longitude, char text[static BATCH_SIZE]) {
     struct timespec now;
     clock_gettime(CLOCK_REALTIME, &now);

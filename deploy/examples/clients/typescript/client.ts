@@ -1,15 +1,15 @@
-// A vehicle in TypeScript: publishes an observation, waits for its acknowledgement, subscribes to alerts and queries a
+// A vehicle in TypeScript: it publishes an observation, waits for its acknowledgement, subscribes to alerts and queries a
 // tile.
 //
-// It follows schemas/README.md and schemas/proto/gripmap.proto alone. zenoh-ts needs Zenoh's router `zenohd` with the
-// remote-api plug-in; Node.js 20 or later.
+// It uses only the definitions in schemas/README.md and schemas/proto/gripmap.proto. zenoh-ts needs Node.js 20 or later,
+// and Zenoh's router `zenohd` with the remote-api plug-in.
 //
 //   npm ci && npm run build
 //   npm start -- ws/127.0.0.1:10000 ../../../../schemas/proto/gripmap.proto berta 57.7 11.97 60
 //
 // Arguments: locator, message definitions, enrolled name of the vehicle, latitude and longitude of the ice, seconds to
-// wait. It prints one line of JSON and exits with 0 when it was acknowledged, saw an alert in its tile and received the
-// tile.
+// wait. It prints one line of JSON, and exits with 0 if the observation was acknowledged, an alert in its tile
+// arrived and the tile arrived.
 import { randomBytes } from "node:crypto";
 import { Config, CongestionControl, Encoding, Priority, Sample, Session } from "@eclipse-zenoh/zenoh-ts";
 import protobuf from "protobufjs";
@@ -31,7 +31,7 @@ interface StreamAck {
     rejected: { seq: string; row: number; reason: string }[];
 }
 
-/** Return the quadkey of a place at zoom 14 as chunks <d4>/<d3>/<d3>/<d4>: a tile; without the last, its region. */
+/** Return the quadkey of a place at zoom 14 as chunks <d4>/<d3>/<d3>/<d4>: its tile. The first three are its region. */
 function tileKey(latitude: number, longitude: number): string {
     const side = 2 ** ZOOM;
     const phi = (latitude * Math.PI) / 180;
@@ -42,7 +42,7 @@ function tileKey(latitude: number, longitude: number): string {
     return [digits.slice(0, 4), digits.slice(4, 7), digits.slice(7, 10), digits.slice(10)].join("/");
 }
 
-/** Return visits that used nearly all grip of ice, one a second until now, heading north. */
+/** Return visits that used nearly all the grip of ice: one per second until now, heading north. */
 function makeBatch(vehicle: string, boot: string, latitude: number, longitude: number): string {
     const now = BigInt(Date.now()) * 1_000_000n;
     const constants = { latitude, longitude, yaw: Math.PI / 2, mu: 0.2, mu_lower: 0.12, mu_upper: 0.28, mu_utilised: 0.19 };
@@ -51,7 +51,7 @@ function makeBatch(vehicle: string, boot: string, latitude: number, longitude: n
     return JSON.stringify({ vehicle, boot, seq: "1", enter_time: times, ...Object.fromEntries(columns) });
 }
 
-/** Return "durable", or the reason of a rejection, if an acknowledgement settles batch 1 of this boot; else "". */
+/** Return "durable", or the reason of the rejection, if an acknowledgement settles batch 1 of this boot; else "". */
 function readAck(type: protobuf.Type, payload: Uint8Array, boot: string): string {
     const ack = type.toObject(type.decode(payload), { longs: String, enums: String, arrays: true, defaults: true });
     for (const stream of ack.streams as StreamAck[]) {
