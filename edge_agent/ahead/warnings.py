@@ -29,7 +29,8 @@ LINK_M: Final = 30.0  # [m] slippery stretches with a smaller gap are joined
 # [s] time for which a stretch may be missing from the horizons before its warning ends, because
 # positions jump.
 ABSENT_S: Final = 2.0
-# [m] if a stretch disappears from the horizons when it is nearer than this, the car has passed it.
+# [m] A car counts as having passed a stretch if the stretch disappears from the horizons at a
+# smaller distance.
 NEAR_M: Final = 30.0
 CHANGED_MU: Final = 0.05  # change of the friction from which a warning is updated
 CHANGED_PLACES: Final = 2  # number of new places from which a warning is updated

@@ -14,7 +14,7 @@ from schemas.wire import Kind
 
 BEHIND_S: Final = 1.0  # [s] delay from which the agent is too slow for its vehicles
 UNANSWERED_S: Final = 60.0  # [s] time without any answer; a service needs less to restart
-FULL: Final = 0.9  # share of the outbox in use from which it counts as full
+FULL: Final = 0.9  # used share of the outbox from which the outbox counts as full
 _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 IMPLAUSIBLE: Final = 3  # exit code
 FURTHEST_SPEED: Final = 0.15  # largest median of |v_x − wheel speed| / wheel speed
-LEAST_SPEED: Final = 3.0  # [m/s] speeds are compared above this value
+LEAST_SPEED: Final = 3.0  # [m/s] speeds are compared only above this value
 MOST_VIOLATION: Final = 0.05  # largest share of samples with an upper bound below the grip in use
-# Tolerance of this comparison: a tilted mount changes the acceleration by 0.5 m/s^2.
+# Tolerance of the comparison of upper bound and grip in use. A tilted mount changes the
+# acceleration by 0.5 m/s^2.
 SLACK: Final = 0.05
 # [s] window over which the grip in use is averaged: the time in which a tyre builds up its force.
 SMOOTHED_S: Final = 0.2

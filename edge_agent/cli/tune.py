@@ -61,7 +61,7 @@ QUICK_DURATION_S = 2.0
 STUDY_DURATION_S: Final = 6.0
 REPEATS = 8  # number of searches of each kind in the study
 QUICK_REPEATS = 2
-POSITIONS: Final = 7  # per vertex: the default and three on each side of it
+POSITIONS: Final = 7  # values per vertex in the study: the default and three on each side of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -42,7 +42,7 @@ SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
 COURSE_SPEED: Final = 3.0  # [m/s] below this speed, the course of a receiver is noise
 RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
 FEWEST: Final = 20  # minimum number of readings for the estimate of a period
-# No interpolation between readings that are further apart than the larger of the two limits.
+# Readings are not interpolated if they are further apart than the larger of these two limits.
 GAP_PERIODS = 3.0  # [periods of the signal]
 GAP_S = 0.1  # [s]
 ZONE_S: Final = 900.0

@@ -39,7 +39,8 @@ PARTS: Final = 8
 # over cars.
 USUAL_BEND = 0.3
 BEND_SPREAD = 0.4
-BENDS: Final = np.linspace(-0.3, 1.8, 22)  # candidates for this share
+# candidates for the share of the steering that understeer needs
+BENDS: Final = np.linspace(-0.3, 1.8, 22)
 # [1/m] yaw rate of the wheels per speed, from unequal radii: standard deviation over cars
 UNLIKE_RADII: Final = 0.004
 CORRELATED_S: Final = 1.0  # [s] two moments count as independent if they are this far apart

@@ -21,8 +21,8 @@ from schemas.vehicle import Vehicle
 TURNS_M_S: Final = 5.0  # [m/s] rim speed from which an axle turns
 STANDS_M_S: Final = 0.3
 LEAST_S: Final = 5.0  # [s] minimum time in which an axle turns
-# Minimum share of this time in which the other axle stands. Wheels that spin on ice do so only for
-# moments.
+# Minimum share of the time with a turning axle in which the other axle stands. Wheels that spin on
+# ice do so only for moments.
 LEAST_SHARE: Final = 0.8
 RESTS_M_S2: Final = 0.3  # [m/s^2] deviation of the accelerometers from their median at rest
 RESTS_RAD_S: Final = 0.01

@@ -20,8 +20,9 @@ FEWEST_STEPS: Final = 5  # minimum number of sudden steps in a wheel speed for `
 FOREIGN_ROWS: Final = 3000
 FOLLOWED: Final = 0.25  # relative difference allowed between the driven and the steered curvature
 RADIUS_PARTS: Final = 4
-STEADY: Final = 0.4  # tolerance of ln gain in a part of the drive
-STEADY_SHARE: Final = 0.75  # share of the parts in which the gain must lie within the tolerance
+# largest difference of ln gain at which a part of the drive agrees with the fit
+STEADY: Final = 0.4
+STEADY_SHARE: Final = 0.75  # minimum share of the parts that agree with the fit
 
 # Minimum correlation of each axle's yaw rate with the gyroscope at which the signs are compared.
 AXLES_LIKE: Final = 0.7

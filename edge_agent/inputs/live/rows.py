@@ -145,7 +145,8 @@ class LiveRows:
         self.ground = np.full(size, np.nan)
         fixes: dict[str, Series] = {}
         for name, (place, channel) in found_in(recordings, self._profile).items():
-            # Position fixes have their own times; other readings have the time of their arrival.
+            # Position fixes have exact times. Other readings have times of arrival, which
+            # `make_channel` smooths.
             sparse = name in SPARSE
             try:
                 series, _ = make_channel(
@@ -155,7 +156,7 @@ class LiveRows:
                     self._radius,
                     self._ratio,
                 )
-            except InputError:  # the signal with the sign of this channel has not arrived yet
+            except InputError:  # the signal that gives the sign has not arrived yet
                 continue
             series = Series(series.t - channel.delay_s, series.values)
             if name in CONTEXT:

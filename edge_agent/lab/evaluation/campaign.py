@@ -62,13 +62,13 @@ class Results:
     foreign: dict[str, FloatArray] = field(default_factory=dict)
     # drives with sensor faults, by (fault, estimator)
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
-    # rough world (inaccurate cars): by estimator and "baseline"
+    # towns with inaccurate cars ("rough"): by estimator and "baseline"
     world: dict[str, dict[str, float]] = field(default_factory=dict)
     # errors of an oracle (ideal observer), by figure
     oracle: dict[str, FloatArray] = field(default_factory=dict)
     # benefit of fuzzy inference and the ant colony
     worth: worth.Scores = field(default_factory=dict)
-    rough: RealWorldResults | None = None  # first town of the rough world, kept for plots
+    rough: RealWorldResults | None = None  # first town with inaccurate cars, stored for plots
     # ranks of the true friction in the posterior, by estimator
     ranks: dict[str, list[FloatArray]] = field(default_factory=dict)
     seeds: int = 0

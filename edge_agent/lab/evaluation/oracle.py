@@ -43,11 +43,12 @@ from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
 
 STRETCH_S: Final = 0.5
-# Standard deviation of the roll leak, whose mean is 0.07; the suspensions of a fleet differ by 17
-# %.
+# Standard deviation of the share of gravity that roll adds to a_y per a_y. Its mean is 0.07; the
+# suspensions of a fleet differ by 17 %.
 ROLL_LEAK_STD: Final = 0.012
-PITCH_LEAK_STD: Final = 0.005  # standard deviation of the pitch leak, whose mean is 0.03
-ROLL_LAG_STD: Final = 0.03  # [s] standard deviation of the roll lag, whose mean is 0.1 s
+# Standard deviation of the share of gravity that pitch adds to a_x per a_x; its mean is 0.03.
+PITCH_LEAK_STD: Final = 0.005
+ROLL_LAG_STD: Final = 0.03  # [s] standard deviation of the lag of the roll angle; its mean is 0.1 s
 START_STD: Final = 0.05  # [m/s] uncertainty of the initial speed from the wheels
 # frictions considered; a drive at 0.6 g excludes lower ones
 LIKELY: Final = np.linspace(0.62, UPPER, 59)

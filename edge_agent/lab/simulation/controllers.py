@@ -39,7 +39,7 @@ NEARLY: Final = 0.88
 USUAL_HZ: Final = 8.0
 LEAST_SHARE: Final = 0.02  # minimum brake torque under ABS, as a share of the demanded torque
 TCS_SLOWEST: Final = 2.5  # [m/s] minimum speed in the denominator of the drive slip
-# Rates [1/s] at which the share of engine torque that is cut grows and decreases.
+# Rates [1/s] at which traction control reduces the engine torque and restores it.
 CUT_RATE: Final = 5.0
 GIVE_RATE: Final = 0.8
 MOST_CUT: Final = 0.95  # maximum share of engine torque that is cut

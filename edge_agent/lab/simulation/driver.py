@@ -40,7 +40,7 @@ class Driver(IntEnum):
     STEER = 0  # [rad] mean road-wheel angle, delayed by the driver's arms
     FORCE = 1  # [N] longitudinal force, delayed by the driver's foot
     BELIEF = 2  # grip that the driver believes in
-    STYLE = 3  # share of this grip that the driver uses
+    STYLE = 3  # share of the believed grip that the driver uses
     COMFORT = 4  # [m/s^2] largest acceleration that the driver accepts
     CRUISE = 5  # [m/s] speed on a dry open road
     WOBBLE = 6  # [m] amplitude of the lateral movement in the lane
@@ -50,9 +50,9 @@ class Driver(IntEnum):
     CROSS_SLOPE = 9
     WARNED_IN = 10  # [s] remaining time until the driver reacts to a warning
     WARNED_START = 11  # [m] distance to the start of the stretch with a warning
-    WARNED_END = 12  # [m] distance to its end; 0 or less: no warning
-    WARNED_SPEED = 13  # [m/s] advised speed on this stretch
-    WARNED_MU = 14  # expected grip on this stretch
+    WARNED_END = 12  # [m] distance to the end of the stretch; 0 or less: no warning
+    WARNED_SPEED = 13  # [m/s] advised speed on the stretch with a warning
+    WARNED_MU = 14  # expected grip on the stretch with a warning
 
 
 class Route(IntEnum):
@@ -73,14 +73,15 @@ BETTER_S: Final = 2.5
 ALARM_S: Final = 0.7  # [s] time constant with which the believed grip falls while wheels slide
 SLIDING: Final = 3.5  # normalised slip, well beyond the peak, that a driver notices
 LEAST_BELIEF: Final = 0.12
-# [s] travel time before the stretch at which a warned driver assumes its grip: three times WORSE_S.
+# [s] travel time before a stretch with a warning at which the driver assumes its grip: three times
+# WORSE_S.
 PREPARED_S: Final = 1.5
-# [m/s^2] deceleration towards such a stretch: only engine braking, because the stretch may begin
-# earlier.
+# [m/s^2] deceleration towards a stretch with a warning: only engine braking, because the stretch
+# may begin earlier.
 WARNED_BRAKES: Final = 1.0
-# Factor for the driver's share of the grip on such a stretch, where the driver hardly uses the
-# pedals. Braking on one axle, or an unequal distribution of braking, reaches the limit at half of
-# the available grip.
+# Factor for the used share of the grip on a stretch with a warning, where the driver hardly uses
+# the pedals. Braking on one axle, or an unequal distribution of braking, reaches the limit at half
+# of the available grip.
 CAREFUL: Final = 0.5
 SLOWEST: Final = 3.0  # [m/s] minimum target speed, unless the driver stops
 LARGEST_STEER: Final = 0.55  # [rad]
@@ -304,7 +305,7 @@ def wished_acceleration(
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     longitudinal = math.sqrt(1.0 - across * across)  # share of the budget left by cornering
-    # Share of the driving force on the axle that drives more. It carries half of the weight.
+    # Share of the driving force on the axle that drives more; this axle carries half of the weight.
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     gas = min(
         PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),

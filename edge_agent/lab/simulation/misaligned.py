@@ -72,7 +72,7 @@ MISALIGNED: Final = {
 class Misaligned(IntEnum):
     """Index of a column in a vehicle's row of sensor errors."""
 
-    ROUGH = 0  # 1 if the vehicle has any of these errors
+    ROUGH = 0  # 1 if the vehicle has any of the errors below
     AX = 1  # g θ [m/s^2]
     AY = 2
     TURN = 3  # ψ [rad]

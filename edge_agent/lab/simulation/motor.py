@@ -51,8 +51,8 @@ class Pmsm(NamedTuple):
     voltage: float = 600.0  # [V] largest voltage of the inverter
     bandwidth: float = 600.0  # [rad/s] of the current control
     proportional: float = 1.5  # [1/s] gain of the speed control for the error of speed
-    integral: float = 0.3  # [1/s^2] gain for the integral of this error
-    derivative: float = 0.05  # [1] gain for the acceleration
+    integral: float = 0.3  # [1/s^2] gain of the speed control for the integral of the error
+    derivative: float = 0.05  # [1] gain of the speed control for the acceleration
 
 
 def speed_demand(motor: Pmsm, error: float, summed: float, acceleration: float) -> float:

@@ -34,7 +34,8 @@ class TrueVehicle:
     curvature: float = -0.3
     degression: float = 0.15
     lag: float = 0.1
-    roll_leak: float = 0.07  # 4 degrees of roll per g
+    # share of gravity that roll adds to a measured a_y per a_y: 4 degrees of roll per g
+    roll_leak: float = 0.07
     pitch_leak: float = 0.03
     drag: float = 0.4  # [kg/m] half of 1.2 kg/m^3 · 0.3 · 2.2 m^2
     rolling: float = 0.008

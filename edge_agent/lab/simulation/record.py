@@ -22,10 +22,11 @@ class RecordColumn(IntEnum):
     # [m/s^2] reading of an accelerometer at the centre of gravity, in the plane of the road
     AX = 0
     AY = 1
-    AX_FELT = 2  # [m/s^2] reading if it is fixed to the rolling and pitching body
+    # [m/s^2] reading of an accelerometer that is fixed to the rolling and pitching body
+    AX_FELT = 2
     AY_FELT = 3
     YAW_RATE = 4
-    DELTA = 5  # this and the next two quantities have four columns, one per wheel
+    DELTA = 5  # DELTA, OMEGA and TORQUE have four columns each, one per wheel
     OMEGA = 9
     TORQUE = 13
     X = 17

@@ -99,8 +99,9 @@ TOWNS: Final = {
 ROUGH_SHARE: Final = 0.5  # share of inaccurate cars in a town
 # Share of the samples on wet and dry road that may be false ice at no cost.
 MOST_FALSE_ICE: Final = 0.0012
-FALSE_ICE_PRICE: Final = 60.0  # interval score per share of false ice beyond this limit
-MISSED_ICE_PRICE: Final = 0.5  # interval score per share of missed ice
+# increase of the interval score per share of false ice above the limit
+FALSE_ICE_PRICE: Final = 60.0
+MISSED_ICE_PRICE: Final = 0.5  # increase of the interval score per share of missed ice
 # Distance of friction below SLIPPERY_MU within which slippery and other roads cannot be
 # distinguished.
 SURE_MARGIN: Final = 0.04
@@ -134,7 +135,8 @@ class TuningScores:
     surface_score: float = math.nan
     # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]
     false_ice: float = math.nan
-    # share of the samples on noticeable ice and snow whose interval does not lie below it [1]
+    # share of the samples on noticeable ice and snow whose interval does not lie below SLIPPERY_MU
+    # [1]
     missed_ice: float = math.nan
 
 
