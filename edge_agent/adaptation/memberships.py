@@ -71,7 +71,7 @@ class Memberships:
     outputs: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
-    # Without these two rules, contradictions in town were three times as frequent.
+    # Without the two rules of `consequents`, contradictions in town were three times as frequent.
     consequents: tuple[float, ...] = (0.67, 0.25)
     shares: tuple[float, ...] = (
         -5.0,

@@ -71,7 +71,7 @@ LARGEST = 20.0
 # accelerometers), yaw rate (model error), torque, wheel speed, force and its derivative
 A_PROCESS = np.array([0.05, 0.05, 0.2, *[20.0] * 4, *[0.5] * 4, *[100.0] * 4, *[2e4] * 4])
 A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of measured r, tau and omega
-B_PROCESS = np.array([0.1, 0.1, 0.1])  # process of v_x, v_y and r, in the same units
+B_PROCESS = np.array([0.1, 0.1, 0.1])  # process of v_x, v_y and r per s^.5
 B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of measured r, a_x and a_y, with model errors
 
 

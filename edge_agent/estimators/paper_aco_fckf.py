@@ -57,8 +57,8 @@ STATES = 6
 ROWS = 3
 # [s] sampling time of the paper, to which Q and the fuzzy steps refer
 STEP_S = 0.02
-# Number of points in the table of the fuzzy inference. Five sets need five points, and free lower
-# vertices need more.
+# Number of points in the table of the fuzzy inference. `Memberships` need five points, and
+# `LowerVertices` more.
 KNOTS = 48
 WINDOW_S = 0.5  # [s] half-life of the innovation averages
 # [1] limits of R over its setting; table 2 of the paper varies R by a factor of 5

@@ -30,13 +30,14 @@ OFF_S: Final = 1.0  # [s] time for which a flag must have been off before it is 
 # [s] time at standstill after which an active flag is implausible. Locked wheels stand too, but a
 # controller releases them within a fraction of a second.
 STANDING_S: Final = 5.0
-# [1] largest plausible share of the time. A long icy road reaches less, an average winter drive far
-# less.
+# [1] largest plausible share of active time. A long icy road reaches less, an average winter drive
+# far less.
 MOST_ACTIVE: Final = 0.3
-# [s] shortest active time for this test: braking from 30 m/s to rest on ice of friction .1
+# [s] A flag that was on for less is not too often on: braking from 30 m/s to rest on ice of
+# friction .1 takes as long.
 LEAST_ACTIVE_S: Final = 30.0
-MEMORY_S: Final = 600.0  # [s] time constant of the exponential forgetting for this share
-MOST_STEP_S: Final = 0.5  # [s] longest step that is counted; longer gaps count as this
+MEMORY_S: Final = 600.0  # [s] time constant of forgetting in the share of active time
+MOST_STEP_S: Final = 0.5  # [s] a longer step between two samples counts as this
 STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (about .3 m/s)
 
 # Reasons why a flag is implausible, as bits that are added

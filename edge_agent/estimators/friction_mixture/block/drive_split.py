@@ -23,15 +23,15 @@ from schemas.thresholds import GRAVITY
 # [1] share of the front axle in the driving force with rear, all-wheel and front drive
 DRIVES = (0.0, 0.45, 1.0)
 ALL_WHEELS = 1  # index of all-wheel drive
-FIRST_ODDS = (0.35, 0.3, 0.35)  # initial probabilities of these kinds
-SHARE_STD = 0.03  # [1] standard deviation of the share in a car of known kind
+FIRST_ODDS = (0.35, 0.3, 0.35)  # initial probabilities of rear, all-wheel and front drive
+SHARE_STD = 0.03  # [1] standard deviation of the front share if the kind is known
 BRAKES_FRONT = 0.64  # [1] share of the front axle in the brake force
-BRAKES_STD = 0.06  # [1] standard deviation of this share between cars
+BRAKES_STD = 0.06  # [1] standard deviation of BRAKES_FRONT between cars
 # [m/s^2] scale of engine braking, which acts on the driven axle only: from twice this deceleration
 # all force counts as brake force
 ENGINE_BRAKE = 1.5
 PULLS = 0.05  # [1] a_x over g from which the slip shows the driven axle
-TURNS_M_S2 = 3.0  # [m/s^2] lateral acceleration below which the slip shows it
+TURNS_M_S2 = 3.0  # [m/s^2] lateral acceleration below which the slip shows the driven axle
 UNLIKE = 0.3  # [1] relative error of the predicted slip, from stiffness and load
 LEAST_ODDS = 1e-4  # smallest probability of a kind, so that an error is corrected within seconds
 

@@ -23,7 +23,7 @@ SLOWEST_M_S = 2.5  # [m/s] below this speed the resolution of wheel speeds looks
 # [1] difference of two wheel speeds over the speed: a wheel may slide (foot), or slides (peak)
 APART_FOOT = 0.04
 APART_PEAK = 0.08
-# [m/s^2] difference of a wheel's acceleration from the car's: foot and peak as above
+# [m/s^2] difference of a wheel's acceleration from the car's: it may slide (foot), or slides (peak)
 SPIN_FOOT = 6.0
 SPIN_PEAK = 12.0
 SEEN = 0.3  # [1] increase of the membership from which a new slide counts as begun

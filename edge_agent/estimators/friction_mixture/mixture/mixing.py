@@ -46,9 +46,9 @@ from schemas.runtime.records import LANES
 LEAST_MIXING = 1e-3  # [1] smaller shares are not mixed, because they change no digit of the output
 # [1] The split nodes are deactivated if their probability is below this share of `split_prior`.
 SLEEPING_SHARE = 0.5
-FORGOTTEN_S = 0.5  # [s] time in which friction returns to its prior once no evidence is used
-# [1] exponent of the doubt in this return. It is large, so that friction is hardly forgotten before
-# the model counts as contradicted.
+FORGOTTEN_S = 0.5  # [s] time in which friction returns to its prior while the model is distrusted
+# [1] exponent of the doubt about the model in the return to the prior. It is large, so that
+# friction is hardly forgotten before the model counts as contradicted.
 BRINK = 4
 # [1] largest share of a node's probability that moves to its neighbours in a block. A larger share
 # would overshoot the balance between neighbours.

@@ -51,8 +51,8 @@ LARGEST_RATIO = 4.0
 # [1] share of `odd_least` that a reset of the motion adds. One reset alone may come from a pothole.
 CALLED_BACK = 0.5
 LONGEST_PATIENCE = 600.0  # [s] longest time before the model is tried again
-RELAPSE = 4.0  # [1] factor on this time after each further contradiction
-FORGIVEN_S = 300.0  # [s] time constant with which this evidence and `patience` fade
+RELAPSE = 4.0  # [1] factor on the time before the next trial after each further contradiction
+FORGIVEN_S = 300.0  # [s] time constant with which evidence against the model and patience fade
 # [m/s^2] a_y below which the model is tried again, because the wheels then show the motion
 STRAIGHT = 0.6
 

@@ -38,9 +38,10 @@ STARTS = 0.25
 SLIDES_M_S2 = 1.0
 # [1] Wheels slower than this share of the speed count as locked while the car decelerates.
 LOCKED_SHARE = 0.1
-# [s] time after which standing wheels mean that the car stands, without such a deceleration
+# [s] time after which standing wheels mean that the car stands, if it decelerates by less than
+# SLIDES_M_S2
 LOST_S = 2.0
-# [s] the same time with such a deceleration: the longest slide with locked wheels
+# [s] longest slide with locked wheels: after it, standing wheels mean that the car stands
 LONGEST_SLIDE_S = 10.0
 AGREE_FLOOR = 0.15  # [m/s] wheel speeds that differ by less always count as equal
 # [1] relative error of the speed difference of both sides in a turn, from track and yaw rate

@@ -49,8 +49,8 @@ class NodeState(IntEnum):
     # over load
     COMPLIANCE = 16
     STEER_GAIN = 17  # [1] relative error of the front steering angle
-    # [m/s^2] gravity along the road, as a_x measures it; tyre forces balance it, so it does not
-    # accelerate the car
+    # [m/s^2] gravity along the road, as a_x measures it. Tyre forces balance it, so the car does
+    # not accelerate.
     SLOPE = 18
     BANK = 19  # [m/s^2] gravity across the road, as a_y (to the left) measures it
 
@@ -109,7 +109,8 @@ class Constants(NamedTuple):
     # [1] force over load at which evidence counts by half (without fuzzy rules), and at which half
     # of the cost in `charge_penalty` is charged. With .12 a gentle slalom was taken for ice.
     demand_half: float = 0.13
-    # [1] exponent of force over load in this weight
+    # [1] exponent of `demand_half` over force over load in these two weights: a larger one makes
+    # the change near `demand_half` steeper
     demand_power: float = 4.0
     # [nat] loss of log-likelihood in a block that is plausible at a wrong friction. The part beyond
     # it counts in full at any force, because the node's velocity must be wrong.
@@ -117,9 +118,9 @@ class Constants(NamedTuple):
     # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
     # compensate for a spike
     largest_loss: float = 3.0
-    # [s] averaging time of the usual force, with which the current force is compared
+    # [s] averaging time of forces and slips. Only a change from these averages is new evidence.
     steady_time: float = 2.0
-    # [1] change of force over load at which the evidence counts as new by half
+    # [1] change of force over load from its average at which the evidence counts as new by half
     steady_half: float = 0.03
     # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
     # Errors of tyre curve and offsets then repeat from block to block.
@@ -142,7 +143,7 @@ class Constants(NamedTuple):
     # [m/s] difference of v_x from the most probable node beyond which a node has diverged. The
     # accelerometers exclude such a difference.
     diverged_x: float = 0.7
-    # [m/s] the same limit for v_y
+    # [m/s] difference of v_y from the most probable node beyond which a node has diverged
     diverged_y: float = 1.0
 
     # --- Tyre ---
@@ -161,7 +162,8 @@ class Constants(NamedTuple):
     # [1] exponent of the stiffness factor by which a wheel's residual is divided. It exceeds 1
     # because slip is noisier than force.
     stiffness_power_x: float = 1.4
-    # [1] the same exponent for an axle, whose slip and force are both noisy
+    # [1] exponent of the stiffness factor by which an axle's residual is divided. It is small,
+    # because slip and force of an axle are both noisy.
     stiffness_power_y: float = 0.3
     # [1] force over load at which a wheel or axle has half of its largest effect on the stiffness
     # states. At smaller forces slip is mostly noise.
@@ -176,7 +178,7 @@ class Constants(NamedTuple):
     # --- Accelerometers and slope of the road ---
     # [1] mean share of measured a_y that is gravity, due to body roll (errata: .07 of the true a_y)
     leak_y_mean: float = 0.06
-    # [1] standard deviation of this share (errata)
+    # [1] standard deviation of the gravity share of a_y (errata)
     leak_y_std: float = 0.05
     # [1] share of measured a_x that is gravity, due to pitch. It is smaller because a body is
     # stiffer in pitch than in roll.
@@ -184,8 +186,8 @@ class Constants(NamedTuple):
     # [m/s^2] standard deviation of the offset of a_x from tilted mount and sensor: .22 to .96 on
     # logs of real cars
     bias_x_std: float = 0.25
-    # [m/s^2] standard deviation of the offset of a_y: .07 to .54 on these logs. A bank that needs
-    # no steering has the same effect.
+    # [m/s^2] standard deviation of the offset of a_y: .07 to .54 on logs of real cars. A crossfall
+    # against which the driver does not steer has the same effect.
     bias_y_std: float = 0.2
     # [m/s^2] standard deviation of slope and bank: a grade of 3 %, a crossfall of 1 to 3 %
     slope_std: float = 0.3
@@ -283,7 +285,8 @@ class Constants(NamedTuple):
     agreeing_width: float = 0.02
     # [1] relative error of the speed computed from agreeing wheels, from radii and slip
     agreeing_std: float = 0.01
-    # [m/s] smallest error of this speed; a car slower than this counts as standing at the start
+    # [m/s] smallest error of the speed computed from agreeing wheels. At its first sample, a car
+    # slower than this counts as standing.
     agreeing_floor: float = 0.1
     # [1] relative error of slip computed from force over load with the nominal stiffness
     agreeing_slip: float = 0.6
@@ -300,7 +303,7 @@ class Constants(NamedTuple):
     # [1] a node's friction may lie this far below the grip in use without penalty: accelerometer
     # offset, slope, smoothing
     guard_margin: float = 0.06
-    # [1] standard deviation of this margin
+    # [1] standard deviation of `guard_margin`
     guard_std: float = 0.03
 
     # --- Strain (`trust.py`) ---
@@ -313,10 +316,10 @@ class Constants(NamedTuple):
     # [1] exponent of strain over `strain_usual` in the factor on R of the axles: how much known
     # errors say about unknown ones
     strain_power: float = 2.0
-    # [1] smallest value of this factor. A search for the best R of the axles found .24 on level
-    # drives.
+    # [1] smallest factor of strain on R of the axles. A search for the best R of the axles found
+    # .24 on level drives.
     strain_least: float = 0.25
-    # [1] largest value of this factor
+    # [1] largest factor of strain on R of the axles
     strain_most: float = 3.0
 
     # --- Contradiction of the model (`trust.py`) ---
@@ -326,9 +329,11 @@ class Constants(NamedTuple):
     # [s] time before the model is tried again after the first contradiction. A few bends of a race
     # track would be over by then, a lap would not.
     patience: float = 120.0
-    # [1] factor on R of the axles while distrusted, minus 1
+    # [1] While the model counts as contradicted (distrusted), R of the axles is multiplied by 1
+    # plus this value.
     distrust_noise: float = 1000.0
-    # [m/s/s^.5] random walk of v_y while distrusted
+    # [m/s/s^.5] random walk of v_y while the model is distrusted
     distrust_drift: float = 3.0
-    # [s] time in which vehicle, sensor and road states return to their prior while distrusted
+    # [s] time in which vehicle, sensor and road states return to their prior while the model is
+    # distrusted
     distrust_forget: float = 5.0

@@ -46,16 +46,16 @@ class BlockSums:
     time: float  # [s] beginning of the block
     samples: int
     angle: float  # [rad] yaw angle since the beginning
-    cos_sum: float  # sum of the cosine of this angle over the samples
-    sin_sum: float  # the same sum of the sine
+    cos_sum: float  # sum of the cosine of `angle` over the samples
+    sin_sum: float  # sum of the sine of `angle` over the samples
     gain: VelocityGain  # since the beginning
     gain_sum: VelocityGain  # sum of `gain` over the samples
     sums: Annotated[FloatArray, INPUTS]  # sum of each channel's valid samples
     counts: Annotated[IntArray, INPUTS]  # number of each channel's valid samples
-    missing_x: float  # [m^2/s^3] variance that v_x gains per second if a_x is missing
-    missing_y: float  # [m^2/s^3] the same for v_y if a_y or the yaw rate is missing
-    start_yaw_rate: float  # [rad/s] at the beginning
-    start_omega: Annotated[FloatArray, 4]  # [rad/s]
+    missing_x: float  # [m^2/s^3] variance of v_x per second if a_x is missing
+    missing_y: float  # [m^2/s^3] variance of v_y per second if a_y or yaw rate is missing
+    start_yaw_rate: float  # [rad/s] yaw rate at the beginning
+    start_omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds at the beginning
 
 
 class LastInputs:
@@ -70,12 +70,12 @@ class LastInputs:
     read_ax: float  # [m/s^2] last reading, used or rejected
     read_ay: float
     yaw_rate: float  # [rad/s] estimate of the scalar filter
-    yaw_rate_var: float  # [rad^2/s^2] its variance
+    yaw_rate_var: float  # [rad^2/s^2] variance of `yaw_rate`
     omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds
     omega_held: Annotated[IntArray, 4]  # number of readings since a wheel speed changed
     omega_step: Annotated[FloatArray, 4]  # [rad/s] resolution of a wheel speed signal
     delta: Annotated[FloatArray, 4]  # [rad] steering angles
-    delta_before: Annotated[FloatArray, 4]  # [rad] in the previous block
+    delta_before: Annotated[FloatArray, 4]  # [rad] steering angles in the previous block
     rear_steering: bool  # True once a rear steering angle has been read
 
 
@@ -87,7 +87,7 @@ class GripInUse:
     slow: float  # smoothed over SLOW_S, for the penalty of nodes
     fast: float  # smoothed over FAST_S
     held: float  # recent maximum of `fast`: the reported upper end is not below it
-    age: float  # [s] time since this maximum
+    age: float  # [s] time since `held` was last reached
 
 
 class RollingMotion:
@@ -100,9 +100,9 @@ class RollingMotion:
     resting_ax: float  # [m/s^2] moving average of a_x while the wheels stand
     stands: bool
     ahead: float  # [m/s] v_x according to agreeing wheels; NaN if they do not agree
-    ahead_std: float  # [m/s] its standard deviation
+    ahead_std: float  # [m/s] standard deviation of `ahead`
     left: float  # [m/s] v_y according to the rear axle; NaN if this axle may slide
-    left_std: float  # [m/s] its standard deviation
+    left_std: float  # [m/s] standard deviation of `left`
 
 
 class WheelSlip:
@@ -117,7 +117,8 @@ class WheelSlip:
     begins: float  # increase of `held` by the current block
     ended: float  # `held` minus the membership of the current block
     axle_held: float  # membership of the last second in "an axle slides on a slippery road"
-    axle_ended: float  # the same difference for `axle_held`; 0 if the force has changed
+    # `axle_held` minus the membership of the current block; 0 if the force has changed
+    axle_ended: float
     # [s] time until which the rear axle may be on another surface than the front axle
     rear_unlike_until: float
 

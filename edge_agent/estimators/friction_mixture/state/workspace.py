@@ -33,7 +33,7 @@ class BlockFeatures:
     duration: float  # [s]
     speed: float  # [m/s] |v_x| at the beginning
     cos: float  # mean cosine of the yaw angle since the beginning
-    sin: float  # mean sine of this angle
+    sin: float  # mean sine of the yaw angle since the beginning
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # [rad/s] mean
     novelty: float  # [1] `new`, raised to at least `steady_share`
@@ -41,7 +41,7 @@ class BlockFeatures:
     demand: float  # [1] larger force over load of the two axles
     change: float  # [m/s^2] mean of the measured a_x
     steering: float  # [rad] mean angle of the front wheels
-    steer_rate: float  # [rad/s] its rate of change
+    steer_rate: float  # [rad/s] rate of change of `steering`
     asymmetry: float  # [1] see `unexplained_slip_difference`
     loads: Annotated[FloatArray, 4]  # [N]
     spin: Annotated[FloatArray, 4]  # [rad/s^2] acceleration of a wheel's rotation
@@ -55,12 +55,12 @@ class BlockFeatures:
     turn_along: Annotated[FloatArray, 4]
     turn_across: Annotated[FloatArray, 4]
     side: Annotated[FloatArray, 2]  # [1] F_y/F_z of an axle in the wheel's frame; NaN if unknown
-    side_leak: Annotated[FloatArray, 2]  # [1] its derivative by the leak
-    side_unit: Annotated[FloatArray, 2]  # [s^2/m] its derivative by a_y
-    noise_std: Annotated[FloatArray, ROWS]  # [1] of a residual, where the tyre curve has slope 1
+    side_leak: Annotated[FloatArray, 2]  # [1] derivative of `side` by the leak
+    side_unit: Annotated[FloatArray, 2]  # [s^2/m] derivative of `side` by a_y
+    noise_std: Annotated[FloatArray, ROWS]  # [1] noise of a residual where the curve's slope is 1
     # [1] variance of slip, as force over load of a linear tyre; `noise_std` contains half of it
     slip_noise: Annotated[FloatArray, ROWS]
-    abrupt_noise: Annotated[FloatArray, 4]  # [1] variance of sudden slip, in the same unit
+    abrupt_noise: Annotated[FloatArray, 4]  # [1] variance of sudden slip, as `slip_noise`
     # [1] factors, 0 to 1, on the effect of the stiffness states on an axle's slips
     informs_x: Annotated[FloatArray, 2]
     axle_scale: float  # [1] adapted R of the axles over the R that the constants state
@@ -90,7 +90,7 @@ class NodeForces:
     """
 
     force: Annotated[LaneArray, ROWS]
-    slip_at_force: Annotated[LaneArray, ROWS]  # slip at which the tyre curve gives it
+    slip_at_force: Annotated[LaneArray, ROWS]  # slip at which the tyre curve gives `force`
 
 
 class NodeWorkspace:
@@ -114,7 +114,7 @@ class NodeWorkspace:
     # Residual at the mean, then its mean over the cubature points, then the innovation
     residual: Annotated[LaneArray, ROWS]
     ahead: Annotated[LaneArray, ROWS]  # residual at the cubature point in positive direction
-    behind: Annotated[LaneArray, ROWS]  # the same in negative direction
+    behind: Annotated[LaneArray, ROWS]  # residual at the cubature point in negative direction
     nonlinearity: Annotated[LaneArray, ROWS]  # variance that the nonlinearity adds
     middle: Annotated[LaneArray, CURVED, ROWS]  # mean of `ahead` and `behind`
     derivative: Annotated[LaneArray, ACTIVE, ROWS]  # of the residuals by the linear states
@@ -141,7 +141,7 @@ class Scratch:
     features: BlockFeatures
     node: NodeWorkspace
     mixing: Annotated[FloatArray, PLACES]  # share of probability that a road change brought
-    share: Annotated[FloatArray, PLACES]  # weight of the active nodes, 0 elsewhere
+    share: Annotated[FloatArray, PLACES]  # probabilities of the active nodes, 0 elsewhere
     updated: Annotated[LaneArray, GROUPS, 2]  # velocity after the measurements [m/s]
     apart: Annotated[LaneArray, GROUPS, STATES]  # deviation from the mean of the mixture
     process: Annotated[FloatArray, STATES]  # process variances of the block
