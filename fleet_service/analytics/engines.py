@@ -28,7 +28,8 @@ except ImportError as error:
 Table: TypeAlias = Any  # an ibis.Table, whose package has no types
 ENGINES: Final = ("duckdb", "spark")
 _MAP_COLUMNS: Final = (
-    # Ibis does not know geometries with a crs. Before format 1.2, lower bounds had a mu, too.
+    # Ibis cannot read geometries with a coordinate system, so geometry is left out. Before format
+    # 1.2, lower bounds had a μ, too.
     "cell, sector, CASE WHEN basis = 'bound' THEN NULL ELSE mu END AS mu, mu_lower, mu_upper, "
     "basis, vehicles"
 )
@@ -63,10 +64,9 @@ class QueryEngine:
         else:
             self.connection = ibis.duckdb.connect()
             self.connection.raw_sql("SET TimeZone = 'UTC'")
-            self.connection.raw_sql(
-                "SET parquet_metadata_cache = true"
-            )  # read each footer only once, for questions about few rows
-            if self.progress:  # in a notebook, even "false" would need ipywidgets
+            # Cache file footers, which helps questions about few rows.
+            self.connection.raw_sql("SET parquet_metadata_cache = true")
+            if self.progress:  # in a notebook, even "false" would require ipywidgets
                 self.connection.raw_sql("SET enable_progress_bar = true")
 
     def files(self, table: str) -> list[Path]:
@@ -160,7 +160,7 @@ class QueryEngine:
         return self.connection.table(name)
 
 
-def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
+def has_value(t: Table) -> Any:  # noqa: ANN401 a boolean column of Ibis
     """Return a condition that is true for rows with a value of mu, and false for rows with only a
     lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of the
     friction mu that it reports (the rule is in `schemas/README.md`).
@@ -173,5 +173,5 @@ def has_value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
     return ~t.mu.isnan() & ~t.mu_utilised.isnan() & enough
 
 
-# far below the columns' steps, so that engines that round differently agree on equal values
+# Tolerance far below the columns' steps, so that engines with different rounding agree.
 _NEARLY: Final = 1e-6

@@ -25,15 +25,10 @@ from schemas.runtime.installing import install_command
 
 SHOWN_ROWS: Final = 20
 PLOTS: Final = (".png", ".svg", ".pdf")
-MAP_CELLS: Final = 200_000  # maximum on a page; more cells make browsers slow
+MAP_CELLS: Final = 200_000  # largest number of cells on a page; more make browsers slow
 PARTS: Final = "members"  # column of rows that stand for several cells
-HIDDEN: Final = (
-    "west",
-    "south",
-    "east",
-    "north",
-    "cell",
-)  # not shown as text on the page, because the map shows the place
+# columns that the page does not show as text, because its map shows the place
+HIDDEN: Final = ("west", "south", "east", "north", "cell")
 TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
@@ -81,7 +76,7 @@ def _json_value(name: str, value: object) -> object:
         return None
     if name in TIMES and isinstance(value, int):
         return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
-    return value.isoformat() if isinstance(value, date) else value  # a datetime is a date
+    return value.isoformat() if isinstance(value, date) else value  # datetime is a kind of date
 
 
 def order_rows(table: pa.Table, question: Question) -> pa.Table:

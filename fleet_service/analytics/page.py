@@ -104,7 +104,6 @@ def render(
         "frame": cells.frame if cells.frame is not None else [0] * len(cells.sector),
         "lasting": cells.lasting,
     }
-    text = json.dumps(data, allow_nan=False).replace(
-        "<", "\\u003c"
-    )  # no value can end or open a tag
+    # Without "<", no value can begin or end an HTML tag.
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     return _TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", text)

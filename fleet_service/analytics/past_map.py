@@ -14,16 +14,15 @@ from fleet_service.replay.rebuild import past_fusion
 from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
 
-LATENESS_S = 120.0  # ServiceConfig.lateness_s
+LATENESS_S = 120.0  # [s] default of ServiceConfig.lateness_s
 
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
     """Return a table of the visited cells that touch a box [deg], with their beliefs (probabilities
     of each friction) at the time `at` [ns].
     """
-    slots = np.flatnonzero(
-        fusion.live.vehicles[: fusion.size] > 0
-    )  # an inaccurate position creates neighbouring cells that no vehicle visited
+    # Inaccurate positions create neighbouring cells that no vehicle has certainly visited.
+    slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
     if box is not None:
         slots = slots[grid.touches(box, grid.bounds(fusion.cell[slots]))]
     return cell_table(fusion, slots, at)

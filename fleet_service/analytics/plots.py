@@ -25,7 +25,7 @@ GRIP_MAP: Final = LinearSegmentedColormap.from_list("grip", GRIP)
 MU: Final = "peak adhesion μ [1]"
 MOST_ROWS: Final = 40  # rows (spells or vehicles) for which a plot is still readable
 MOST_PANELS: Final = 6
-# width [points] of the line around each cell: a road of 10 m stays visible on a map of 10 km
+# [points] Width of the line around each cell: a road of 10 m is still visible on a map of 10 km.
 EDGE: Final = 1.2
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
 PUBLISHED: Final = 0.9  # nominal probability of a published interval
@@ -132,9 +132,8 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
     panels = _make_panels(figure, len(rows))
     for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
         cells = np.array(one["members"], np.int64)
-        patches = paint(
-            axes, cell_shapes(cells), np.full(len(cells), one["mu"])
-        )  # whole squares, because all cells have the same heading
+        # Paint whole squares, because all cells of a stretch have the same heading.
+        patches = paint(axes, cell_shapes(cells), np.full(len(cells), one["mu"]))
         axes.set_title(
             f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} "
             f"{ARROWS[one['sector']]}\n"

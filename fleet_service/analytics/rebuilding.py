@@ -139,7 +139,7 @@ def _compute_part(path: Path) -> pa.Table | None:
     try:
         return rollup.compute_part(path, skip_damaged)
     except FileNotFoundError:
-        return None  # retention removed this day meanwhile
+        return None  # retention has removed the files of this day
 
 
 def _write_atomically(

@@ -25,7 +25,7 @@ START_NS: Final = 1_769_472_000 * NS  # 2026-01-27 00:00 UTC
 DAY_S: Final = 86_400
 LATITUDE = 57.70
 LONGITUDE = 11.97
-CELL_S: Final = 0.7  # time in a cell at 15 m/s
+CELL_S: Final = 0.7  # [s] time in a cell at 15 m/s
 ICE = 0.22
 DRY = 0.85
 _EXCITED: Final = 0.35  # share of visits that give a friction value
@@ -208,9 +208,8 @@ def _make_likelihoods(
     flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)
     below = 0.5 * np.square(distance / flank[0]) * (distance < 0)
     above = 0.5 * np.square(distance / flank[1]) * (distance > 0) * excited[:, None]
-    floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(
-        np.float32
-    )  # contamination: no likelihood is lower
+    # Because of contamination, no likelihood is lower than this.
+    floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(np.float32)
     slope = rng.uniform(0.0, 1.5, (len(mu), 1)).astype(np.float32) * np.abs(distance)
     nats = np.minimum(below + above, floor) + slope * excited[:, None]
     return np.asarray(

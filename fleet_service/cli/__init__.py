@@ -152,9 +152,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         limit_memory(*UNUSED)
     progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
+    # The import of the commands takes a second, so show a status.
     with (
         nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
-    ):  # the import takes a second
+    ):
         arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
         if arguments.verbose:
             logging.basicConfig(

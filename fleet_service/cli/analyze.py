@@ -23,7 +23,7 @@ from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
-# options by question; for another question an option would be ignored without a message
+# Questions to which an option applies. For others it is refused, because it would have no effect.
 FOR: Final = {
     "at": ("before-after", "replay"),
     "stations": ("weather", "change-rates"),

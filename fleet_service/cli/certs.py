@@ -11,10 +11,10 @@ from pathlib import Path
 from schemas.errors import InputError
 from schemas.runtime.installing import install_command
 
-LONGEST_DAYS = 36525.0  # a century; beyond, dates end
-# names that may be revoked without a question: an incomplete list must not revoke a whole fleet
+LONGEST_DAYS = 36525.0  # a century; later dates may not be representable
+# So many names may be revoked without a question. An incomplete list must not revoke a whole fleet.
 ASKED = 3
-SHOWN = 8  # names shown of each kind
+SHOWN = 8  # number of names shown of each kind
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="one seed, as a smoke test; checks no bars"
     )
-    # the second names are those of earlier versions
+    # The second name of an option is that of earlier versions.
     way = parser.add_mutually_exclusive_group()
     way.add_argument(
         "--skip-end-to-end",

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from fleet_service.archive.identity.erasure_requests import Erasure
     from fleet_service.archive.maintenance.retention import ErasureResult
 
-ASK_S: Final = 0.5  # period of the checks whether the service has answered
-LOOK_S: Final = 5.0  # period of the checks whether the service is still running
+ASK_S: Final = 0.5  # [s] period of the checks whether the service has answered
+LOOK_S: Final = 5.0  # [s] period of the checks whether the service is still running
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +106,7 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
 
     question = erasure_requests.write_request(root, wanted) if is_served(root) else None
     looked = time.monotonic()
-    # if the service ends meanwhile, this process carries out the erasure
+    # If the service ends before it answers, this process carries out the erasure.
     while question is not None:
         if (answer := erasure_requests.answer_to(question)) is not None:
             return ErasureResult(
@@ -149,9 +149,8 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
             "config", f"the archive has a copy at {url}, where the data must be removed too", fix
         )
     with closing(BucketReplica(root, url, config.archive.options)) as copy:
-        copy.sync_without_lease(
-            config.name
-        )  # first download files that only the copy has; they may contain the vehicle's rows
+        # First download files that only the bucket has. They may contain rows of the vehicle.
+        copy.sync_without_lease(config.name)
         yield
         try:
             copy.sync()

@@ -19,7 +19,7 @@ FORMS: Final = {
     ".geojson": "geojson",
     ".json": "json",
 }
-NOBODY: Final = 1  # exit code if no service answers for at least a part of the area
+NOBODY: Final = 1  # exit code if no service answers for some part of the area
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from fleet_service.replication.ownership import Ownership
     from schemas.config import ServiceConfig
 
-# data about vehicles are readable only by the service and its group, whatever the process mask
+# File mode mask: only the service and its group may read data about vehicles.
 PRIVATE = 0o027
-# time after which a busy worker lets another thread run; Python's default is ten times this
+# [s] Time after which a busy worker lets another thread run; a tenth of Python's default.
 SWITCH_S = 0.0005
 LEAVE_AT_LAST_S = 2.5  # [s] after a signal; the process must end within 3 s
-FREEING_S = 0.4  # part of this time to release the lease in the bucket
+FREEING_S = 0.4  # [s] part of this time that is reserved to release the lease in the bucket
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
         if config.standby:
             with progress_messages.show_status("compiling"):
-                warm_up()  # compiled when it is needed
+                warm_up()  # so that a take-over does not wait for compilation
         holding = _open_archive(config, root, stop, log_line)
         if holding is None:
             return 0
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("archive", problem, "give a folder that you may read and write") from error
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
-    # Objects loaded from the archive stay: a garbage collection over them would delay alerts.
+    # Objects loaded from the archive are never garbage. A collection over them would delay alerts.
     gc.freeze()
     stopped = threading.Event()
     threading.Thread(
@@ -153,7 +153,7 @@ def _force_exit_when_stuck(
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):
         log_line("shutdown incomplete: a session or a job did not end in time")
-        faulthandler.dump_traceback()  # shows which thread hangs, and where
+        faulthandler.dump_traceback()  # shows where each thread hangs
         if service.failure is not None:
             traceback.print_exception(service.failure)
         code = service.exit_code

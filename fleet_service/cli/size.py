@@ -8,7 +8,7 @@ import math
 
 from schemas.errors import InputError
 
-RATE_HZ = 0.2  # of a vehicle in the simulated country: a visited cell every five seconds
+RATE_HZ = 0.2  # visits per vehicle in the simulated country: one every five seconds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

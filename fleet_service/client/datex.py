@@ -25,13 +25,14 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
-# time for which an ended situation is published, so that clients that poll every few minutes see it
+# [s] Time for which an ended situation stays published, so that clients that poll every few minutes
+# see its end.
 KEPT_S: Final = 3600
-INTERVAL_STD: Final = 2.0 * Z_95  # standard deviations in a 90 % interval of a normal distribution
-# P(slippery) from which on the certainty is stated
+INTERVAL_STD: Final = 2.0 * Z_95  # width of a 90 % interval in standard deviations
+# P(slippery) from which a situation is published as certain, or as probable
 CERTAIN = 0.97
 PROBABLE = 0.8
-DIGITS: Final = 6  # decimal places of a degree: a tenth of a metre, with cells of ten metres
+DIGITS: Final = 6  # decimal places of a degree: .1 m, while cells have 10 m
 _XSI: Final = "http://www.w3.org/2001/XMLSchema-instance"
 _SPACES: Final = {
     "d2": "http://datex2.eu/schema/3/d2Payload",
@@ -125,9 +126,8 @@ def make_publication(
             root.append(_make_situation(supplier, ended))
     ET.indent(root)
     text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
-    used = (
-        f'xmlns:sit="{_SPACES["sit"]}"'.encode()
-    )  # needed for the payload's type, too, if there is no situation
+    # The payload's type needs this namespace even if there is no situation.
+    used = f'xmlns:sit="{_SPACES["sit"]}"'.encode()
     return text if used in text else text.replace(b"<d2:payload ", b"<d2:payload " + used + b" ", 1)
 
 

@@ -22,7 +22,7 @@ from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 
-# period of the queries for all active alerts, and longest time between two publications
+# [s] Period of the queries for all active alerts, and longest time between two publications.
 REFRESH_S: Final = 60.0
 
 

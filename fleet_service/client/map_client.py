@@ -24,11 +24,11 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 TIMEOUT_S: Final = 10.0
-NAMED: Final = 5  # maximum number of regions that a message names
-PAST_S: Final = 60.0  # a past map is rebuilt from the archive, which takes time
+NAMED: Final = 5  # largest number of regions that a message names
+PAST_S: Final = 60.0  # [s] time limit of a query about the past, which reads the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
-SERVED_S: Final = 1.0  # time within which a router states who answers
-# if a service was killed, the router ends its queries and then removes its token
+SERVED_S: Final = 1.0  # [s] time within which a router states which services answer
+# [s] If a service is killed, the router ends its queries and removes its token this much later.
 FALLS_S: Final = 0.1
 SHOWN: Final = (
     "latitude",
@@ -94,10 +94,10 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         before = services.active
         payloads = sorted(query_replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)
-        # services that came meanwhile may not have received the query
+        # Services that started during the query may not have received it.
         after = services.refresh(session)
-        # a service that ended may have received the query instead of its successor, even if it is
-        # back
+        # A service that ended may have received the query instead of its successor. This holds even
+        # if the service has started again.
         withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
         whole = {
@@ -105,15 +105,14 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         }
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
-        if not declared and services.refresh(session):  # a service came during the check
+        if not declared and services.refresh(session):  # a service started during the check
             declared = True
             served = bool(payloads)
-        elif (
-            not declared and served and not payloads
-        ):  # the service came during the check and its token follows, or it has none
+        # The service started during the check and will declare its token, or it declares none.
+        elif not declared and served and not payloads:
             payloads = sorted(query_replies(session, EVERYWHERE, parameters))
     answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
-    if not declared:  # services of an earlier version, or an access list of one
+    if not declared:  # services without tokens: an older version, or an access list of one
         return answer
     tiles = {
         regions.region_of(tile)

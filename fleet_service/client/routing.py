@@ -20,26 +20,22 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
-STEP_M: Final = 5.0  # step along a link
-# Braking distance grows with 1/mu. Squared, a way round of a fifth is worth it from mu .45 of .5
-# on, and ten times the length at mu .16.
-GOOD_GRIP: Final = 0.5  # lower bound of a wet road; above it costs nothing
+STEP_M: Final = 5.0  # [m] step along a link
+# The cost factor of a road is (GOOD_GRIP/μ)^POWER, because braking distance grows with 1/μ. With
+# the square, a detour of a fifth is worth it at μ = .45, and one of ten times the length at
+# μ = .16.
+GOOD_GRIP: Final = 0.5  # lower bound of μ on a wet road, with factor 1
 POWER: Final = 2.0
-# Valhalla refuses larger ratios, and then finds no route to a destination on ice
+# Largest cost factor. Valhalla refuses larger ones, and then finds no route to a destination on
+# ice.
 MOST: Final = 20.0
-STEPS: Final = (
-    1.0,
-    1.5,
-    2.5,
-    5.0,
-    10.0,
-    MOST,
-)  # classes of cost factors; neighbouring parts of one class become one line
-SHORTEST_M: Final = 15.0  # shortest line that can be placed on a link
-# limits of the upper end of the interval and of P(slippery), with which a cell is excluded as ice
+# Cost factors are rounded to these classes. Neighbouring parts of one class become one line.
+STEPS: Final = (1.0, 1.5, 2.5, 5.0, 10.0, MOST)
+SHORTEST_M: Final = 15.0  # [m] shortest line that can be placed on a link
+# A cell is excluded as ice if its upper bound of μ and its P(slippery) pass these limits.
 ICE_LOWER = 0.3
 ICE_SURE = 0.9
-HALF_WIDTH_M: Final = 8.0  # half width of the polygon around a road
+HALF_WIDTH_M: Final = 8.0  # [m] half width of the polygon around a road
 
 
 class RoadLine(NamedTuple):

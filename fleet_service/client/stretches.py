@@ -22,9 +22,10 @@ from schemas.thresholds import METRES_PER_DEGREE, NS
 from schemas.wire import Alert
 
 State = Literal["raised", "changed", "cleared"]
-# Cells in between that nobody drove hard enough over, or that a bend cuts: 30 to 60 m.
+# Largest gap in a stretch: cells in which no vehicle used enough grip, or that a bend cuts; 30 to
+# 60 m.
 LINK_CELLS: Final = 3
-ROUND: Final = 1.3  # a less elongated stretch has no direction
+ROUND: Final = 1.3  # least ratio of length and width for which a stretch has a direction
 
 
 @dataclass(frozen=True)
@@ -171,9 +172,8 @@ class Stretches:
                 if names
                 else _new_name(part[0])
             )
-            while not names and (
-                name in out or name in self._known
-            ):  # a part that split off begins with the same cell
+            # A part that has split off begins with the same cell, so its name must differ.
+            while not names and (name in out or name in self._known):
                 name += "b"
             out[name] = part
         return out
@@ -214,13 +214,13 @@ def link_cells(cell: IntArray) -> IntArray:
     """
     distinct, first, of_cell = np.unique(cell, return_index=True, return_inverse=True)
     one, other = _find_neighbours(distinct)
-    label = first.copy()  # first known cell of the stretch of each cell
+    label = first.copy()  # for each cell, the lowest index found so far in its stretch
     while len(one):
         lower = np.minimum(label[one], label[other])
         joined = label.copy()
         np.minimum.at(joined, one, lower)
         np.minimum.at(joined, other, lower)
-        joined = joined[of_cell[joined]]  # use the result that a cell's first cell has obtained
+        joined = joined[of_cell[joined]]  # adopt the lower index that this cell has found itself
         if (joined == label).all():
             break
         label = joined

@@ -19,7 +19,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime import presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
-GATHER_S: Final = 0.3  # time for which alerts of neighbouring cells are merged
+GATHER_S: Final = 0.3  # [s] time for which alerts of neighbouring cells are merged
 
 
 class WatchOptions(NamedTuple):
@@ -103,7 +103,7 @@ def watch_map(
         if not options.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", print_tile)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", apply_sample)
-        for alert in standing_alerts(session):  # subscribe first, so that no alert is missed
+        for alert in standing_alerts(session):  # after subscribing, so that no alert is missed
             if tile_if_near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
                 apply_alert(alert)
         print_line(json.dumps({"event": "watching"}) if options.as_json else "watching")

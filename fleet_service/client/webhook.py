@@ -30,14 +30,14 @@ from schemas.thresholds import SLIPPERY_MU
 if TYPE_CHECKING:
     import httpx
 
-# time limit of a whole request, so that a very slow receiver does not block the queue
+# [s] Time limit of a whole request, so that a slow receiver does not block the queue.
 TIMEOUT_S: Final = 5.0
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 60.0
-# Answers by which a receiver refuses this message for good; repeating it would block the queue.
+# With these answers a receiver refuses a message for ever. Repeating it would block the queue.
 REFUSALS: Final = frozenset({400, 413, 415, 422})
 LOSSES: Final = ("dropped", "refused", "unstored")
-_OPEN: Final = "0001-01-01T00:00:00Z"  # Alertmanager's end time of an alert that has not ended
+_OPEN: Final = "0001-01-01T00:00:00Z"  # end time of an active alert in Alertmanager
 
 
 def alert_message(alert: StretchAlert) -> dict[str, Any]:
@@ -106,7 +106,7 @@ class Webhook:
         self._say = say
         self._queue = queue
         self._timeout_s = timeout_s
-        # a path may contain a secret
+        # Log only scheme and host, because the path may contain a secret.
         self._name = f"{urlsplit(url).scheme}://{urlsplit(url).hostname}"
         self.counts: Counter[str] = Counter()
         self._failure = ""
@@ -222,7 +222,7 @@ class Webhook:
             if failure is None:
                 self._record_answer(number, status)
                 return ""
-        # any error may occur, and the thread must survive it
+        # Any error may occur, and the thread must continue.
         except Exception as error:  # noqa: BLE001
             failure = f"{type(error).__name__} {error}".strip()
         self.counts["failures"] += 1

@@ -33,19 +33,19 @@ from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
-# Relative error that all vehicles of a place share; the manoeuvre causes more than half of it. In
-# six end-to-end drives (real estimator), the mean error of cells with 20 and more excited vehicles
-# differed from the mean of their surface by .059 dry, .046 wet and .044 snow (robust standard
-# deviations; plain ones were .088, .088 and .066).
-COMMON: Final = 0.05  # hypot(common, by_manoeuvre) of CLEAN
+# Relative error that all vehicles in a place share: hypot(common, by_manoeuvre) of CLEAN. In six
+# end-to-end drives (real estimator), cells with at least 20 excited vehicles had mean errors that
+# differed from those of their surface by .059 (dry), .046 (wet) and .044 (snow). These are robust
+# standard deviations; plain ones were .088, .088 and .066.
+COMMON: Final = 0.05
 NOISE_ABSOLUTE: Final = 0.02
-NOISE_AT_LIMIT: Final = 0.05  # relative
-NOISE_PER_SHARE: Final = 0.10  # increase per share of unused grip: .09 at EXCITED_SHARE
+NOISE_AT_LIMIT: Final = 0.05  # relative standard deviation if all grip is used
+NOISE_PER_SHARE: Final = 0.10  # increase per share of unused grip; .09 in all at EXCITED_SHARE
 CORRELATION: Final = 0.5  # correlation of e between a vehicle's visits to neighbouring cells
 SLOPE_NATS: Final = 0.5
 USED_STD: Final = 0.02
 OVERCONFIDENT_STD: Final = 0.02  # standard deviation that a lying vehicle states
-BOUND_STD: Final = 0.05  # error of the grip used that the agent assumes
+BOUND_STD: Final = 0.05  # standard deviation of the grip used, as the agent assumes it
 
 
 class ErrorModel(NamedTuple):

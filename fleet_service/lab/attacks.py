@@ -38,10 +38,10 @@ VEHICLES = 60
 ATTACKERS = 6
 FLOODERS = 3
 NAMES = 40
-# minute in which the attack begins, and length of the drive
+# [min] when the attack begins, and length of the drive
 BEGIN = 18
 MINUTES = 26
-FLOOD: Final = 400  # visits of one flooding vehicle to its cell
+FLOOD: Final = 400  # visits of each flooding vehicle to its cell
 CLEARLY_DRY = 0.5
 CLEARLY_ICY = 0.25
 ENOUGH = 5
@@ -56,7 +56,7 @@ class AttackedDrive:
 
     town: Town
     visits: Visits
-    counted: BoolArray  # (cells,) with ENOUGH excited vehicles when the attack begins
+    counted: BoolArray
 
 
 def drive_of(rng: Generator) -> AttackedDrive:

@@ -27,10 +27,10 @@ class MapBar(NamedTuple):
     unit: str
 
 
-# excited vehicles per cell; each class extends to the next number
+# classes of cells by their number of excited vehicles; each extends to the next number
 COUNTS: Final = (1, 2, 3, 5, 10, 30)
 ATTACKS: Final = ("replayed", "random", "shifted_pose", "flood_one_cell", "newcomers")
-# percent of visits that are excited on the changing road of another maker's fleet
+# Percentages of excited visits, on the changing road of another maker's fleet.
 EXCITED: Final = (10, 30, 100)
 _ICE: Final = "excited passes over new ice"
 _SHARE: Final = "of cells and snapshots"

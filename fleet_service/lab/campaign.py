@@ -29,19 +29,17 @@ from fleet_service.lab import (
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
-# Seeds from JUDGING on draw towns, drives and errors for the figures; constants are chosen on
-# smaller seeds.
+# Figures use seeds from this one on. Constants are chosen on smaller seeds.
 JUDGING: Final = 20_000
 SEEDS = 10
 QUICK_SEEDS = 1
+# number of vehicles and duration [s] of each drive
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)} | dict.fromkeys(
     end_to_end.WAYS, (20, 1800.0)
-)  # vehicles, seconds
-END_TO_END: Final = (
-    "fusion.whole_way",
-    "fusion.resampled",
-)  # prefixes of the end-to-end figures
-# drives of 20 minutes; the largest difference counts, so no averaging is needed
+)
+# prefixes of the names of end-to-end figures
+END_TO_END: Final = ("fusion.whole_way", "fusion.resampled")
+# Number of seeds (drives of 20 minutes). The largest difference counts, not a mean, so few suffice.
 EXACT_SEEDS: Final = 8
 END_TO_END_PART: Final = "end-to-end"
 

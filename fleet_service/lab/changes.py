@@ -21,12 +21,12 @@ from schemas.numeric import FloatArray, IntArray
 
 DRY = 0.85
 ICE = 0.20
-# minutes after which the road changes
+# number of vehicles, length of the drive [min], and minute in which the road changes
 VEHICLES = 60
 MINUTES = 40
 CHANGE = 22
 EXCITEMENT: Final = 0.3  # probability that a pass over the road is excited
-UNREACHED: Final = 99  # value if the drive ended before the map showed the change
+UNREACHED: Final = 99  # number of passes if the map did not show the change until the end
 
 
 def changing_town(rng: Generator, before: float, after: float) -> Town:

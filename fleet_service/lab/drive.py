@@ -24,8 +24,8 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 
 LATENESS_S: Final = 120.0
-DELAY_S: Final = 4.0  # mean delay: a batch waits a second, and sometimes for the network
-# longest delay of rows that wait in a vehicle's outbox
+DELAY_S: Final = 4.0  # [s] mean delay: a batch waits a second, and sometimes for the network
+# share of rows that wait in a vehicle's outbox, and their longest delay [s]
 LATE_SHARE = 0.02
 LATE_S = 300.0
 TWICE_SHARE: Final = 0.03

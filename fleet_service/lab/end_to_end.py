@@ -31,11 +31,11 @@ from schemas.wire import Alert
 
 OBSERVATIONS = "observations.parquet"
 TRUTH = "truth.parquet"
-# minimum number of vehicles of a judged cell: one vehicle's report is not a map
+# Smallest number of vehicles of an evaluated cell, because one vehicle's report is not a map.
 SEVERAL: Final = 2
-SAME: Final = 0.02  # largest difference of friction within a cell of one surface
+SAME: Final = 0.02  # largest difference of μ within a cell that counts as one surface
 
-# function that simulates a drive and writes both files into a folder
+# Function that simulates a drive and writes both files into a folder.
 Drive = Callable[[Path], None]
 
 
@@ -51,18 +51,17 @@ class World(NamedTuple):
 
     scenario: str
     rough: float
-    prefix: str  # of the figures' names
-    seed: int = 20_000  # of the vehicles
+    prefix: str
+    seed: int = 20_000
 
 
-WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the figures
+WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the names of these figures
 LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
-HILLS: Final = World(
-    "hills-20000", 0.5, f"{WHOLE_WAY}.hills"
-)  # frictions and hills that were not used for tuning
-# Half of the vehicles have the errors of real cars, on ten towns with their own frictions and
-# hills (figures without a further name, see `moments.ask_moments`). All cells of a drive have the
-# same snow, so P(slippery) needs many drives.
+# Friction and hills of this world were not used for tuning.
+HILLS: Final = World("hills-20000", 0.5, f"{WHOLE_WAY}.hills")
+# Ten towns with friction and hills of their own. Half of the vehicles have the errors of real cars.
+# All cells of one drive have the same snow, so P(slippery) needs many drives. Figures of all drives
+# together have no further name, see `moments.ask_moments`.
 WAYS: Final = tuple(
     World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011)
 )

@@ -27,7 +27,7 @@ from schemas.numeric import FloatArray
 VEHICLES = 40
 MINUTES = 20
 UNEXCITED: Final = (1, 3, 10, 100, 1000)
-PARTS: Final = 60  # portions in which the shuffled observations arrive
+PARTS: Final = 60  # number of portions in which the shuffled observations arrive
 
 
 def largest_difference(a: Fusion, b: Fusion) -> float:

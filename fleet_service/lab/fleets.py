@@ -29,10 +29,11 @@ from schemas.numeric import BoolArray
 
 VEHICLES: Final = 60
 CHANGING: Final = 0.1  # share of roads whose surface changes during the drive
-# true friction above which road counts as dry, and below which as ice
+# true friction from which a road counts as dry, and up to which as ice
 DRY = 0.7
 ICY = 0.25
-# minimum excited vehicles of a judged cell and minute, and minimum earlier visits per vehicle
+# Smallest number of excited vehicles of an evaluated cell and minute, and of earlier visits of a
+# vehicle.
 ENOUGH = 5
 EARLIER = 20
 

@@ -34,7 +34,7 @@ from fleet_service.lab.score import (
 from schemas.numeric import FloatArray
 
 VEHICLES: Final = 60
-ACQUAINTED: Final = 60  # minutes
+ACQUAINTED: Final = 60  # [min] part of the drive on other roads, in which vehicles gain trust
 MINUTES: Final = 80
 AT: Final = (62, 64, 68, 72, 80)
 

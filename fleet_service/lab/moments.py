@@ -37,7 +37,7 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.thresholds import NS
 
 MOMENTS: Final = (60.0, 360.0, 1800.0)  # [s] after the first observation
-# middle of the target range of the coverage; the worst drive is the farthest from it
+# Middle of the target range of the coverage. The worst drive is the one farthest from it.
 MIDDLE: Final = 0.91
 
 

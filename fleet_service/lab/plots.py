@@ -58,7 +58,7 @@ def _values_below(values: Mapping[str, float], prefix: str) -> tuple[list[float]
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
-# matplotlib has no types here
+# The axes have no type here, because matplotlib is optional.
 def _draw_reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     axes.plot([0, 1], [0, 1], color="0.7")
     axes.plot(*_values_below(values, "fusion.clean.reliability."), marker="o", markersize=3)

@@ -32,8 +32,8 @@ from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
-NEAREST: Final = 8  # number of visits with the most similar friction, of which one is drawn
-# largest |ln c|, else another vehicle's visit is drawn: surfaces of one kind are closer
+NEAREST: Final = 8  # one of this number of visits with the most similar friction is drawn
+# Largest |ln c|; otherwise another vehicle's visit is drawn. Surfaces of one kind differ less.
 FARTHEST: Final = 0.35
 
 

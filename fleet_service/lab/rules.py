@@ -39,16 +39,16 @@ RULES: Final = (
     "federated reset",
     "median",
 )
-MEDIAN_MIN: Final = 60  # minutes before the reading that the median includes
-# relative standard deviations of the median's interval: shared by all vehicles, and per vehicle
+MEDIAN_MIN: Final = 60  # [min] time before the reading from which the median takes values
+# relative standard deviations of the median: shared by all vehicles, and of a single vehicle
 MEDIAN_COMMON = 0.06
 MEDIAN_OWN = 0.12
-SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
+SAMPLES: Final = 10  # number of posteriors that an agent at 10 Hz sends from one cell
 PRIOR_MEAN: Final = 0.5 * (mugrid.LOWER + mugrid.UPPER)
 PRIOR_VAR: Final = (mugrid.UPPER - mugrid.LOWER) ** 2 / 12.0
-ROAD_VAR: Final = 0.05**2  # per cell driven, because surfaces change every few cells
+ROAD_VAR: Final = 0.05**2  # per cell, because the surface changes every few cells
 DRIFT_VAR: Final = 0.04**2 / 3600.0  # per second
-_KALMAN: Final = 5  # rules that carry a mean and a variance
+_KALMAN: Final = 5  # number of rules that store a mean and a variance
 _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 
 
@@ -138,7 +138,7 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
     pair = v.place[rows] * (int(v.vehicle.max(initial=0)) + 1) + v.vehicle[rows]
-    _, last = np.unique(pair[::-1], return_index=True)  # visits are in order of time
+    _, last = np.unique(pair[::-1], return_index=True)  # the newest visit, as they are sorted
     rows = rows[::-1][last]
     mean = np.full(CELLS, PRIOR_MEAN)
     std = np.full(CELLS, PRIOR_VAR**0.5)

@@ -18,12 +18,13 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
-ENOUGH: Final = 3  # minimum excited vehicles for an error to count
-# P(slippery) below which slippery road is missed, and above which road with grip is called slippery
+ENOUGH: Final = 3  # smallest number of excited vehicles of a cell whose error counts
+# P(slippery) below which slippery road counts as missed, and above which road with grip counts as
+# reported slippery
 MISSED = 0.3
 RAISED = 0.5
-SURE_GRIP: Final = 0.45  # friction of snow and ice is lower, of wet and dry road higher
-BINS: Final = 10  # of P(slippery)
+SURE_GRIP: Final = 0.45  # μ of snow and ice is below this, of wet and dry road above
+BINS: Final = 10  # number of bins of P(slippery)
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 

@@ -25,19 +25,19 @@ from schemas.thresholds import GRAVITY, NS
 from schemas.wire import Batch, Kind
 
 USED: Final = (0.05, 0.12, 0.24, 0.48, 0.7)
-BOUNDED: Final = 100  # vehicles that report only a lower bound
-BACKLOG: Final = 20  # vehicles with an outage
+BOUNDED: Final = 100  # number of vehicles that report only a lower bound
+BACKLOG: Final = 20  # number of vehicles with an outage
 HOUR_S: Final = 3600.0
 ICE = 0.18
 DRY = 0.85
 FREEZING_C: Final = -1.0
-# vehicles in the wet curve, and number of simulated curves
+# number of vehicles in the wet curve, and of simulated curves
 CARS = 60
 CURVES = 20
 WET = 0.60
 GENTLE = 0.30
 WINTER: Final = agent.CLEAN._replace(share=(0.25, 0.35), low=0.65, tyres=-0.05, alike=1.0)
-# share of such passes that look like values: a tenth to a third with common tyres
+# Share of these passes that look like values; with common tyres it is a tenth to a third.
 VALUED: Final = 0.3
 
 

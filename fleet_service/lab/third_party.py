@@ -48,25 +48,26 @@ VEHICLES: Final = 60
 CELLS: Final = 300
 STRETCH: Final = 3
 FRICTIONS: Final = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
-ICE: Final = 0.25  # lower true friction counts as ice
+ICE: Final = 0.25  # true friction below this counts as ice
 MINUTES: Final = 40
-VISITS: Final = 15  # per cell
+VISITS: Final = 15  # visits per cell
 HARD_VISITS: Final = 0.5  # share of visits that are excited
 SHARE: Final = (0.75, 0.97)  # share of the grip used in an excited visit
 GENTLE: Final = (0.03, 0.12)  # share of the grip used in any other visit
 NOISE: Final = 0.08
-GAINS: Final = {"third_party": 0.05, "third_party.gain_common": 0.10}  # standard deviations of g
+# standard deviations of the gain error g
+GAINS: Final = {"third_party": 0.05, "third_party.gain_common": 0.10}
 
 CHANGE_CELLS: Final = 30
-CHANGE_STRETCH: Final = 6  # no cell has a neighbour of another road
+CHANGE_STRETCH: Final = 6  # distance of changing cells in cells, so that they are no neighbours
 DRY = 0.85
 WHITE = 0.15
-CHANGE_VISITS: Final = 240  # visits per cell and phase
-STEP_S: Final = 10.0  # period of the readings of the alerts
+CHANGE_VISITS: Final = 240  # visits per cell, before and after the change
+STEP_S: Final = 10.0  # [s] period in which alerts are read
 NEVER: Final = 999
 CHANGE_SEEDS: Final = 3
 
-COLD_SEEDS: Final = 30  # fleets that a new service does not know yet
+COLD_SEEDS: Final = 30  # number of fleets that are unknown to a new service
 COLD_GAP_S: Final = 5.0
 
 

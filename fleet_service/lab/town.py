@@ -28,22 +28,20 @@ ROADS = 10
 LENGTH = 12
 CELLS: Final = ROADS * LENGTH
 STRETCH: Final = 4  # number of cells of one surface
+# surface: mean of μ, its spread, share of the roads
 SURFACES: Final = {
     "dry": (0.85, 0.08, 0.45),
     "wet": (0.55, 0.07, 0.25),
     "snow": (0.30, 0.04, 0.15),
     "ice": (0.15, 0.03, 0.15),
-}  # surface: mean, spread, share of the roads
+}
 # limits of the friction of any road
 LEAST = 0.08
 MOST = 1.10
-DRIFT: Final = 0.03  # per square root of an hour
-ZONE: Final = 6  # cells with equal EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
-EXCITEMENT: Final = (
-    (0.40, 0.2),
-    (0.08, 0.4),
-    (0.02, 0.4),
-)  # P(a pass is excited), share of such cells
+DRIFT: Final = 0.03  # standard deviation of μ after one hour
+ZONE: Final = 6  # cells with equal excitement: some 60 m, for braking from 50 km/h or a bend
+# probability that a pass is excited, and share of the cells that have it
+EXCITEMENT: Final = ((0.40, 0.2), (0.08, 0.4), (0.02, 0.4))
 CELL_M = 10.0
 FIX_STD_M = 1.5
 _NORTH = 57.70
@@ -111,7 +109,7 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
     classes, weights = zip(*EXCITEMENT, strict=True)
     excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
     mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
-    own = rng.spawn(1)[0]  # the towns are the same for all error models
+    own = rng.spawn(1)[0]  # a generator for errors only, so that each error model gets this town
     zones = CELLS // ZONE
     common = model.common * own.normal(size=(zones, 1)) + model.by_manoeuvre * own.normal(
         size=(zones, MANOEUVRES)

@@ -38,17 +38,17 @@ from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
 VEHICLES: Final = 60
 MINUTES: Final = 360
-BEGIN: Final = 90  # minute from which results count
-STEP: Final = 2  # minutes between two readings
+BEGIN: Final = 90  # [min] from which results count
+STEP: Final = 2  # [min] between two readings
 CHANGING: Final = 0.5  # share of roads whose surface changes
-# [g], by the excitement of the place in the town
+# [g] demand for grip, by the excitement of the place in the town
 DEMAND: Final = {0.40: 0.25, 0.08: 0.15, 0.02: 0.10}
 DEMAND_SPREAD: Final = 0.5  # standard deviation of the demand's logarithm
 GENTLE: Final = 0.6  # factor of the demand on gentle roads
 NARROW: Final = 0.3
-UNNOTICED_MOST: Final = 90.0  # minutes; also stands for a later warning or none
+UNNOTICED_MOST: Final = 90.0  # [min] limit, which also stands for no warning
 HOUR_S: Final = 3600.0
-CARS: Final = (5, 20)  # per hour and road
+CARS: Final = (5, 20)  # vehicles per hour and road
 SEEDS: Final = 3
 
 

@@ -20,7 +20,7 @@ class AlertMirror:
         self._stretches = Stretches()
         self._changed = False
         self.heard_count = 0  # number of received messages about alerts
-        self.heard = 0.0  # time of the last message [s since 1970]
+        self.heard = 0.0  # arrival time of the last message [s since 1970]
 
     def take_alert(self, alert: Alert, now: float) -> None:
         """Record that the alert of a cell was raised, repeated or cleared."""

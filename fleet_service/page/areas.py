@@ -15,7 +15,7 @@ from fleet_service.page.map_mirror import MapMirror
 from schemas import grid
 from schemas.thresholds import METRES_PER_DEGREE
 
-NEAR_M: Final = 30_000.0  # largest distance from a place whose name is given to the area
+NEAR_M: Final = 30_000.0  # [m] an area gets the name of the nearest place within this distance
 MOST: Final = 100
 
 

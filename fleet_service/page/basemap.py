@@ -19,7 +19,7 @@ from schemas.errors import InputError
 
 MBTILES = ".mbtiles"
 PMTILES = ".pmtiles"
-OWN: Final = "/base/{z}/{x}/{y}"  # address of tiles that this server reads from a file
+OWN: Final = "/base/{z}/{x}/{y}"  # URL path of tiles that this server reads from a file
 VECTOR: Final = "pbf"
 KINDS: Final = {
     "png": "image/png",
@@ -28,11 +28,13 @@ KINDS: Final = {
     "webp": "image/webp",
     VECTOR: "application/vnd.mapbox-vector-tile",
 }
-ZOOMS: Final = (0, 19)  # zooms of tiles at an address, as at public servers
+ZOOMS: Final = (0, 19)  # zoom levels of tiles at a URL, as at public servers
 DEEPEST: Final = 30
-MOST_BYTES: Final = 4 << 20  # largest tile
-STEP: Final = 10_000  # SQLite instructions between two checks
-MOST_STEPS: Final = 100  # checks; a tile that is found by index takes a fraction of one
+MOST_BYTES: Final = 4 << 20  # [bytes] largest tile
+# A query for a tile is stopped after MOST_STEPS times STEP instructions of SQLite. With an index it
+# needs fewer than STEP.
+STEP: Final = 10_000
+MOST_STEPS: Final = 100
 _TAG: Final = re.compile(r"<[^>]*>")
 
 
@@ -97,7 +99,7 @@ class TileFile:
             self._table.set_progress_handler(lambda: next(steps, None) is None, STEP)
             try:
                 found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
-            except sqlite3.Error:  # damaged, or a view whose query does not end
+            except sqlite3.Error:  # the file is damaged, or its view needs too many instructions
                 return None
         if found is None or not isinstance(found[0], bytes) or len(found[0]) > MOST_BYTES:
             return None

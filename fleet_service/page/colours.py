@@ -24,11 +24,11 @@ from schemas.runtime.palette import (
 )
 from schemas.thresholds import SLIPPERY_MU
 
-# width of the interval up to which four classes are distinguished: half of it is less than a class
+# Width of an interval up to which one of four classes is shown. Half of it is less than a class.
 NARROW: Final = 0.25
-MIDDLING: Final = 0.6  # the same for two classes
-EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # ice | snow | wet | dry (Pacejka 2012, ch. 1)
-KNOWN_SLIPPERY: Final = 0.5  # P(mu < SLIPPERY_MU) above which a place is never drawn as unknown
+MIDDLING: Final = 0.6  # width up to which one of two classes is shown
+EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # μ between ice, snow, wet and dry (Pacejka 2012, ch. 1)
+KNOWN_SLIPPERY: Final = 0.5  # P(μ < SLIPPERY_MU) above which a place is never shown as unknown
 ALERT: Final = "#c4003a"
 DARK_ALERT: Final = "#ff6b86"
 

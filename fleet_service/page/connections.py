@@ -18,7 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 log = logging.getLogger(__name__)
 HEAD_S: Final = 10.0
-MOST: Final = 800  # below the usual limit of 1024 files
+MOST: Final = 800  # connections; below the usual limit of 1024 open files per process
 LOG_S: Final = 60.0
 
 

@@ -24,7 +24,7 @@ CRS84: Final = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 CONFORMANCE: Final = tuple(
     f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "geojson")
 )
-# features in an answer: default, and maximum
+# number of features in an answer: default, and largest
 FEW = 1000
 MOST = 10_000
 TITLE: Final = "Grip of the road, measured by vehicles"

@@ -13,7 +13,7 @@ from typing import Any, Final
 from schemas.runtime.metrics import PREFIX
 
 READ_S: Final = 2.0
-# time [s] for which an answer is reused, so that many browsers cause one request
+# [s] Time for which an answer is reused, so that many browsers cause only one request.
 KEPT_S: Final = 2.0
 MOST_BYTES: Final = 1 << 20
 _LINE: Final = re.compile(rf'{PREFIX}(\w+?)(_total)?(?:\{{\w+="([^"]*)"\}})? (\S+)')

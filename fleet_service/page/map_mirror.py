@@ -50,7 +50,7 @@ class MapMirror:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._tiles: dict[int, MirroredTile] = {}
-        # tiles that changed since the last call of `changes`, as they were before
+        # tiles that changed since the last call of `changes`, in the state at that time
         self._before: dict[int, _Before] = {}
         self.recent = RecentMoments()
         self._heard = 0.0

@@ -66,7 +66,7 @@ class MapRoutes:
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
     def _borrowed_cells(self, tile: int) -> bytes:
-        # a page ignores cells of an older version than its own
+        # The page ignores an answer whose version is older than that of the tile it shows.
         version = self._of.world.version(tile)
         found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
         return b"".join(

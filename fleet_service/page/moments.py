@@ -28,7 +28,7 @@ from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
 KEPT: Final = 8  # number of snapshots in memory
-# maximum number of moments that the slider shows: four months of hourly snapshots
+# Largest number of moments that the slider shows: four months of hourly snapshots.
 MOST: Final = 3000
 HISTORY: Final = 200  # number of newest snapshots from which a history is read
 _COLUMNS: Final = (

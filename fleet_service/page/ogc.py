@@ -173,7 +173,7 @@ class FeatureRoutes:
         parameters = {}
         if question.bbox is not None:
             parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)
-        if question.at is not None:  # a single query, so that a past map is rebuilt only once
+        if question.at is not None:  # one query for all tiles, so a past map is rebuilt only once
             parameters["at"] = datetime.fromtimestamp(question.at / NS, UTC).isoformat()
             tables = dict(self._reader.ask(map_client.EVERYWHERE, parameters))
             yield from (tables[tile] for tile in sorted(tables))

@@ -28,10 +28,11 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
-AGAIN_S: Final = 5.0  # period of the queries to a service about which nothing is known
-# tiles are published when they change; wider intervals because of age must be queried
+AGAIN_S: Final = 5.0  # [s] period of attempts to query the map while no service is known
+# [s] Period in which tiles are queried again. Services publish a tile only after a change, but the
+# intervals of unchanged cells become wider with time.
 REFRESH_S: Final = 60.0
-# tiles per round: 40 per second, 2 400 per minute; with more tiles a renewal takes longer
+# Number of tiles per round of ROUND_S: 2,400 per minute. With more tiles, the period is longer.
 REFRESHED: Final = 20
 
 
@@ -69,9 +70,8 @@ class Reader:
                 )
             while not stop.is_set():
                 served = bool(self._sees_services())
-                if (
-                    served and not self._served
-                ):  # at the start, and after the return of a service: query what was missed
+                # At the start, and after a service has returned, query everything.
+                if served and not self._served:
                     self._ask_all(session)
                 elif served and time.monotonic() >= self._stood + REFRESH_S:
                     self._ask_standing(session)
@@ -174,9 +174,8 @@ class Reader:
             if found:
                 continue
             if self._regions.is_answered(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
-                self._world.take_tile(
-                    tile, tables.MAP_SCHEMA.empty_table(), now
-                )  # readers may not see cells with fewer vehicles
+                # The service has no cells for readers, for example because of too few vehicles.
+                self._world.take_tile(tile, tables.MAP_SCHEMA.empty_table(), now)
             else:
                 self._world.touch(tile, now)
 

@@ -12,8 +12,8 @@ from typing import Final
 from fleet_service.page.records import Records
 
 STEP_S: Final = 10
-MOST: Final = 180  # half an hour in steps of STEP_S
-THIN: Final = 60  # number of moments after which older ones are kept only in steps of THINNED_S
+MOST: Final = 180  # number of moments: half an hour in steps of STEP_S
+THIN: Final = 60  # number of newest moments that are kept in steps of STEP_S, others of THINNED_S
 THINNED_S: Final = 60
 
 

@@ -21,9 +21,9 @@ from schemas import grid
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 
-# last: newest observation [s since 1970]; place: cell within the tile · 4 + sector; mu, lower,
-# upper: in MU_STEPS a unit, 255 is 'no number'; slippery: P(mu < .4) in SHARE_STEPS; vehicles: 255
-# is '255 or more'; unknown: share of what is below a place that was not measured.
+# last: newest observation [s since 1970]. place: cell within the tile · 4 + sector. mu, lower,
+# upper: in units of 1/MU_STEPS; 255 means no number. slippery: P(μ < .4) in units of 1/SHARE_STEPS.
+# vehicles: 255 means 255 or more. unknown: share of the covered cells that were not measured.
 RECORD: Final = np.dtype(
     [
         ("last", "<u4"),
@@ -38,9 +38,8 @@ RECORD: Final = np.dtype(
     ]
 )
 Records = NDArray[np.void]
-HEAD: Final = struct.Struct(
-    "<4IB7xd"
-)  # tile, version, the version that this changes (0: none), cells, level, moment
+# tile, version, base version of changes (0: complete tile), number of cells, level, moment
+HEAD: Final = struct.Struct("<4IB7xd")
 MU_STEPS: Final = 200
 SHARE_STEPS: Final = 254
 NO_NUMBER: Final = 255
@@ -97,9 +96,9 @@ def of_table(table: pa.Table) -> Records:
     found["upper"] = _to_steps(np.ceil, table["mu_upper"], MU_STEPS)
     found["slippery"] = _to_steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
-    # lower bounds have no value to colour, whoever sent them
+    # A lower bound has no value to colour, although older services send one.
     found["mu"][basis == "bound"] = NO_NUMBER
-    # older snapshots mark known ice as a lower bound
+    # Snapshots of older versions mark known ice as a lower bound.
     known = (basis == "measured") | (
         (basis == "bound") & (found["slippery"] > KNOWN_SLIPPERY * SHARE_STEPS)
     )
@@ -146,9 +145,8 @@ def aggregate_worst(records: Records, level: int) -> Records:
     count = np.diff(np.append(first, len(records)))
     share = 1.0 - np.add.reduceat(known.astype(np.int64), first) / count
     some = np.repeat(share < 1.0, count)
-    spoken = (
-        known | ~some
-    )  # a cell with only a lower bound counts if no cell of the square was measured
+    # Cells with only a lower bound count if no cell of the square was measured.
+    spoken = known | ~some
     found = np.zeros(len(first), RECORD)
     found["place"] = place[first]
     for name in ("mu", "lower", "upper"):

@@ -16,7 +16,7 @@ from schemas import grid, query
 from schemas.config import nanoseconds
 from schemas.errors import InputError
 
-MOST_TILES: Final = 256  # maximum in one request
+MOST_TILES: Final = 256  # largest number of tiles in one request
 _OF_FEATURES: Final = ("bbox", "datetime", "limit", "after", "f")
 WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 

@@ -19,18 +19,14 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
-# cells between neighbours of a line, and between cells of one lane, without a report in between
+# Largest gap in cells without a report, along a line or between cells of one lane.
 AHEAD: Final = 3
-# window of the moving average [cells]: lanes and position errors make the unsmoothed line zigzag
+# Cells of the moving average. Without it, lanes and position errors would make the line zigzag.
 SMOOTHED: Final = 5
-LEAST_CELLS: Final = 3  # minimum number of cells of a derived line; fewer have no direction
+LEAST_CELLS: Final = 3  # fewer cells give no line, because they have no direction
 MOST_LINES: Final = 50_000
-_STEP: Final = (
-    (1, 0),
-    (0, -1),
-    (-1, 0),
-    (0, 1),
-)  # column and row of the next cell, by heading sector: east, north, …
+# column and row of the next cell, by heading sector: east, north, west, south
+_STEP: Final = ((1, 0), (0, -1), (-1, 0), (0, 1))
 
 
 class Line(NamedTuple):

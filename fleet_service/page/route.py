@@ -19,8 +19,8 @@ from schemas.errors import InputError
 from schemas.stopping import stopping_speed
 from schemas.thresholds import METRES_PER_DEGREE
 
-STEP_M: Final = 4.0  # much less than the side of a cell
-MOST_M: Final = 200_000.0  # longest route that can be displayed
+STEP_M: Final = 4.0  # [m] step along a route, much less than the side of a cell
+MOST_M: Final = 200_000.0  # [m] longest route that can be displayed
 UNKNOWN: Final = "unknown"
 SIGHTS_M: Final = (50, 100)
 Points = Sequence[tuple[float, float]]

@@ -14,7 +14,7 @@ from fleet_service.page.map_mirror import box_of
 from schemas import grid, keys, regions
 from schemas.runtime.presence import PresenceTracker
 
-MOST: Final = 256  # maximum number of watched regions
+MOST: Final = 256  # largest number of watched regions
 
 
 class ServedRegions:
@@ -25,7 +25,8 @@ class ServedRegions:
     def __init__(self) -> None:
         self._queriers: dict[int, Any] = {}
         self._away_since: dict[int, float] = {}
-        self._fallen: dict[str, float] = {}  # announced regions without a service, and since when
+        # regions whose announced service has ended, and the time of this [s since 1970]
+        self._fallen: dict[str, float] = {}
 
     def watch(self, session: zenoh.Session, tiles: Iterable[int], now: float) -> None:
         """Watch the regions of the given tiles too, and record at time `now` [s since 1970] for

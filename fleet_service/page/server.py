@@ -130,12 +130,12 @@ def update_publication(
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.is_served or (world.alerts.heard_count == seen and not file.is_due):
-            # without a service nothing is ended; the publication's time shows its age
+            # Without a service, no situation is ended. The publication time shows how old it is.
             continue
         seen = world.alerts.heard_count
         try:
             file.keep_up(world.alerts.stretches(), reader.is_heard)
-        except InputError as error:  # the publication is served nevertheless
+        except InputError as error:  # clients still get the last publication
             log.warning("%s", error)
 
 

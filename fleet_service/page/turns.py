@@ -18,7 +18,7 @@ from contextlib import asynccontextmanager
 from typing import Final
 
 RUNNING: Final = 4
-MOST_WAITING: Final = 2  # per client: one being answered, and one waiting
+MOST_WAITING: Final = 2  # requests per client: one that is being answered, and one that waits
 MOST_CLIENTS: Final = 32
 LONGEST_PAUSE_S: Final = 2.0
 

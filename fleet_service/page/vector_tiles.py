@@ -34,7 +34,7 @@ _NO_COMPRESSION = 1
 _GZIP_COMPRESSION = 2
 _MVT = 1
 _MOST_DIRECTORY: Final = 16 << 20
-MOST_UNPACKED: Final = 16 << 20  # maximum size of an unpacked tile or directory
+MOST_UNPACKED: Final = 16 << 20  # [bytes] largest unpacked tile or directory
 
 
 class TileShape(NamedTuple):
@@ -211,7 +211,7 @@ class PmtilesFile:
         return part
 
     def _read(self, offset: int, size: int) -> bytes:
-        # opened anew per call, so that threads do not share a file position
+        # Open the file for each call, so that threads do not share a file position.
         with self._path.open("rb") as file:
             file.seek(offset)
             return file.read(size)

@@ -21,10 +21,10 @@ from fleet_service.page.map_mirror import MapMirror, box_of
 from fleet_service.page.records import CELL_LEVEL, TileBlock
 from schemas import grid
 
-FLUSH_S: Final = 0.1  # changes within this time are sent as one event
+FLUSH_S: Final = 0.1  # [s] changes within this time are sent as one event
 BEAT_S: Final = 2.0
-WAITING: Final = 64  # events in a browser's queue: six seconds of a busy map
-MOST: Final = 400  # maximum number of watching browsers
+WAITING: Final = 64  # largest number of events in a browser's queue: six seconds of a busy map
+MOST: Final = 400  # largest number of watching browsers
 Box = tuple[float, float, float, float]
 _RELOAD: Final = b"event: reload\ndata: {}\n\n"
 
@@ -129,7 +129,7 @@ class Watchers:
 
     def push(self, changes: list[TileBlock]) -> None:
         """Send changed blocks (encoded cells of tiles) to the browsers whose view they touch."""
-        # by (tile, level), encoded once for all browsers that show it
+        # blocks by (tile, level), each encoded once for all browsers that show it
         lines: dict[tuple[int, int], bytes] = {}
         for watcher in list(self._watchers.values()):
             found = []

@@ -36,20 +36,22 @@ from fleet_service.fusion.weather import AIR_ABOVE_ROAD_C, FREEZING_C, STEADY_C
 from schemas.numeric import FloatArray
 from schemas.thresholds import SLIPPERY_MU
 
-LONGEST_S: Final = 3 * 3600  # after a longer time, more than one change may lie between two values
+# [s] Longest time between two compared values; within more time, a road may change repeatedly.
+LONGEST_S: Final = 3 * 3600
 BINS_PER_OCTAVE: Final = 1
 LEAST_DAYS: Final = 5
 DRAWS: Final = 200
 ENDS: Final = (5.0, 95.0)
-HOURS: Final = 6  # hours of the day in one class
-LEAST_PAIRS: Final = 50  # minimum number of pairs of a class for an answer
+HOURS: Final = 6  # length of a class of the time of day [h]
+LEAST_PAIRS: Final = 50  # a class with fewer pairs of values gets no answer
 UNKNOWN: Final = "unknown"
+# road temperature [°C], with the limits of `fusion.weather`
 BANDS: Final = (
     (f"below {FREEZING_C[0]:.0f}", -np.inf, FREEZING_C[0]),
     (f"{FREEZING_C[0]:.0f} to {FREEZING_C[1]:.0f}", *FREEZING_C),
     (f"{FREEZING_C[1]:.0f} to {STEADY_C:.0f}", FREEZING_C[1], STEADY_C),
     (f"above {STEADY_C:.0f}", STEADY_C, np.inf),
-)  # road temperature [°C], with the limits of the fusion's weather
+)
 
 
 def expression(t: Table) -> Table:
@@ -155,7 +157,7 @@ def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
     }
     days, day = np.unique(counted["day"].to_numpy(zero_copy_only=False), return_inverse=True)
     octaves, octave = np.unique(counted["octave"].to_numpy(), return_inverse=True)
-    cube = np.zeros((len(days), len(octaves), len(columns)))  # by day, bin of time, count
+    cube = np.zeros((len(days), len(octaves), len(columns)))  # axes: day, bin of time, count
     for k, column in enumerate(columns.values()):
         np.add.at(cube[..., k], (day, octave), column)
     pairs, unlike, slippery, seconds = cube.sum(axis=(0, 1)) if cube.size else np.zeros(4)

@@ -29,12 +29,13 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import Z_95
 
 SLOT_S: Final = 1800
-PIECE_M: Final = 50.0  # about the distance in which a sliding car stops in a town
-LEAST_SHARE: Final = 0.8  # minimum measured share of a link's length for the verdict "kept"
-# slots below the level that are farther apart count as two breaches: the road may have been salted
+PIECE_M: Final = 50.0  # [m] about the distance in which a sliding car stops in a town
+LEAST_SHARE: Final = 0.8  # least measured share of a link's length for the verdict "kept"
+# [s] Slots below the level that are farther apart count as two breaches, because the road may have
+# been salted in between.
 GAP_S: Final = 7200
-INTERVAL_STD: Final = 2.0 * Z_95  # standard deviations in a 90 % interval of a normal distribution
-# part of a vehicle's error that its interval does not cover: tyres, calibration
+INTERVAL_STD: Final = 2.0 * Z_95  # width of a 90 % interval in standard deviations
+# Standard deviation of a vehicle's error that its interval does not cover: tyres, calibration.
 LEAST_STD: Final = 0.05
 KEPT = "kept"
 BROKEN = "broken"

@@ -35,9 +35,8 @@ def expression(t: Table) -> Table:
         values=t.reported.count(),
         vehicles=t.vehicle.nunique(),
         utilised_max=t.used.max(),
-        all=t.reported.quantile(
-            list(PERCENTILES.values())
-        ),  # all in one query: a third faster than one by one
+        # One query for all percentiles is a third faster than one query for each.
+        all=t.reported.quantile(list(PERCENTILES.values())),
     )
     return found.mutate(**{name: found["all"][k] for k, name in enumerate(PERCENTILES)}).drop("all")
 

@@ -21,9 +21,9 @@ from schemas.errors import InputError
 from schemas.thresholds import NS
 from schemas.wire import Kind
 
-MOST_FRAMES: Final = 1500  # maximum of an answer: a day with one frame per minute
+MOST_FRAMES: Final = 1500  # largest number in an answer: one day with one frame per minute
 LEAST_STEP_S: Final = 1.0
-REPORT_ROWS: Final = 1_000_000  # rows between two lines of progress
+REPORT_ROWS: Final = 1_000_000  # number of rows between two progress messages
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:

@@ -46,7 +46,7 @@ def expression(t: Table) -> Table:
     )
 
 
-def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as all questions have it
+def ask(engine: QueryEngine, options: Options) -> pa.Table:  # noqa: ARG001 as for all questions
     """Return a table with one row per month: its friction, and the difference from the previous
     month. The difference is null if no cell has values of two vehicles in both months.
     """

@@ -20,9 +20,9 @@ from schemas.errors import InputError
 from schemas.thresholds import SLIPPERY_MU
 
 NEEDED: Final = ("station", "time", "latitude", "longitude", "temperature")
-BAND: Final = 2.0  # width of the temperature band of one row [°C]
+BAND: Final = 2.0  # [°C] width of the temperature band of one row
 _HOUR_S: Final = 3600
-_BITS: Final = 22  # bits of a cell number below its region: 2·(21 - 10)
+_BITS: Final = 22  # bits by which the number of a cell is longer than that of a region: 2·(21 - 10)
 
 
 def nearest_readings(t: Table, path: Path) -> Table:

@@ -18,7 +18,7 @@ from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
-# share of slippery values in a cell, for example a road that froze in one night of ten
+# Least share of slippery values in a cell: for example, a road that freezes in one night of ten.
 SHARE: Final = 0.1
 
 

@@ -23,14 +23,17 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
 
-# distance from a cell's centre to a road: half a cell, lanes beyond the drawn line, position error
+# [m] Largest distance from a cell's centre to a road: half a cell, lanes beyond the drawn line, and
+# the position error.
 REACH_M: Final = 25.0
-# cost per radian of heading difference: a parallel road one lane away must stay nearer
+# [m/rad] Cost of the angle between a road and the sector's axis. An angle of 45° costs as much as
+# 6 m, so a parallel road one lane away is preferred.
 TURN_M: Final = 8.0
-MOST_TURN: Final = np.radians(
-    60.0
-)  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both
-# penalty of service roads, because they have far less traffic than the street next to them
+# [rad] Largest heading difference: 45° to a sector's edge, and 15° beyond it, within which a
+# vehicle reports to both sectors.
+MOST_TURN: Final = np.radians(60.0)
+# [m] Additional cost of service roads, because they have far less traffic than the street next to
+# them.
 SERVICE_M: Final = 6.0
 STEP_M: Final = 2.0
 PIECE: Final = 4096  # number of cells that are processed at once
@@ -152,9 +155,8 @@ def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: fl
             metre = metres[fits]
             link = marks.link[mark]
             cost = metre + TURN_M * turn[fits] + service[link]
-            each = _first_of(
-                np.lexsort((cost, link, row)), row, link
-            )  # the best mark of each cell and link
+            # the best mark of each cell and link
+            each = _first_of(np.lexsort((cost, link, row)), row, link)
             row, link, mark, metre, cost = (
                 column[each] for column in (row, link, mark, metre, cost)
             )
@@ -164,7 +166,8 @@ def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: fl
             goes_on = (end[link] == start[link[best]]) | (end[link[best]] == start[link])
             mine = link == link[best]
             more = cost - cost[best]
-            kept = mine | (goes_on & (more <= side / 2.0))  # the next link begins within the cell
+            # Also keep a link that continues the best one, if it begins within the cell.
+            kept = mine | (goes_on & (more <= side / 2.0))
             other = np.full(len(piece), np.inf)
             np.minimum.at(other, row, np.where(kept, np.inf, more))
             other[np.isinf(other)] = np.nan

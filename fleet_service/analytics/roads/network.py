@@ -141,7 +141,7 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
         frame: Any = (
             geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
         )
-    except Exception as error:  # each reader raises errors of its own
+    except Exception as error:  # each reader has exceptions of its own
         problem = (
             f"{path.name} cannot be read "
             f"({(str(error) or 'no reason given').splitlines()[0][:100]})"

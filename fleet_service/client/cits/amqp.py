@@ -23,7 +23,7 @@ except ImportError as _missing:
 
 CREDIT: Final = 200  # messages that the other side may send in advance
 HEARTBEAT_S: Final = 10.0
-RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)  # pauses between attempts to connect
+RETRY_S: Final = (0.5, 1.0, 2.0, 5.0)  # [s] pauses between attempts to connect
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +106,8 @@ class _AmqpEvents(MessagingHandler):
                 parcel.name,
                 event.delivery.remote.condition,
             )
-            self._link.on_accepted(parcel.name)  # a refused message would be refused again
+            # Treat the message as done, because the interchange would refuse it again.
+            self._link.on_accepted(parcel.name)
 
     def on_released(self, event: Any) -> None:  # noqa: ANN401
         parcel = self._flying.pop(event.delivery, None)

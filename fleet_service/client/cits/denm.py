@@ -16,23 +16,23 @@ from schemas.errors import InputError
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 PROTOCOL_VERSION: Final = 2
-MESSAGE_ID: Final = 1  # of a DENM
-ADHESION: Final = 6  # adverse weather condition: adhesion
-# sub-causes of adhesion
+MESSAGE_ID: Final = 1  # number of the message type DENM
+ADHESION: Final = 6  # cause code "adverse weather condition: adhesion"
+# sub-cause codes of adhesion
 UNKNOWN_SLIPPERY = 0
 HEAVY_FROST = 1
 SNOW = 4
 ICE = 5
 BLACK_ICE = 6
 SALTED = 10
-ROADSIDE: Final = 15  # station type of an infrastructure that has no vehicle
+ROADSIDE: Final = 15  # station type "roadside unit", for a sender that is no vehicle
 VALIDITY_DEFAULT_S: Final = 600
-POINTS: Final = 23  # most events of a history
+POINTS: Final = 23  # largest number of events of a history
 REACH: Final = 131_071  # [0.1 µdeg] farthest point of a history or a trace from the event
-UNITS: Final = 1e7  # per degree
-# Half axis of the ellipse in which 95 % of positions lie, in standard deviations of each axis.
+UNITS: Final = 1e7  # units of latitude and longitude per degree
+# Half axis of the ellipse that contains 95 % of positions, in standard deviations along an axis.
 AXIS: Final = math.sqrt(-2.0 * math.log(0.05))
-# Time counts milliseconds since 2004 by TAI; five leap seconds were added to UTC since then.
+# Time is counted in milliseconds of TAI since 2004. UTC has had five leap seconds since then.
 EPOCH_NS: Final = 1_072_915_200 * NS
 LEAP_MS: Final = 5000
 UNAVAILABLE: Final = {
@@ -41,13 +41,14 @@ UNAVAILABLE: Final = {
     "heading": 3601,
     "axis": 4095,
 }
-LEAST: Final = {  # of integers whose range begins below 0
+# smallest value of integers whose range begins below 0
+LEAST: Final = {
     "latitude": -900_000_000,
     "longitude": -1_800_000_000,
     "altitude": -100_000,
     "height": -12_700,
 }
-DELTA_BITS: Final = 18 + 18 + 15  # north, east, height
+DELTA_BITS: Final = 18 + 18 + 15  # bits of a position difference: north, east, height
 TRACES: Final = 7
 TRACE_POINTS: Final = 40
 # positions in the enumerations of `denm.asn`
@@ -114,7 +115,7 @@ def encode_denm(denm: Denm) -> bytes:
     out.write(PROTOCOL_VERSION, 8)
     out.write(MESSAGE_ID, 8)
     out.write(denm.sender, 32)
-    out.write(0b110 if lasts else 0, 3)  # situation, location, alacarte
+    out.write(0b110 if lasts else 0, 3)  # presence bits: situation, location, alacarte
     _write_management(out, denm)
     if lasts:
         _write_situation(out, denm)
@@ -169,7 +170,8 @@ def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
 
 def _write_management(out: BitWriter, denm: Denm) -> None:
     has_validity = denm.validity_s != VALIDITY_DEFAULT_S
-    # extension; termination, relevance distance and direction, validity, transmission interval
+    # Bits: extension; presence of termination, relevance distance, relevance direction, validity,
+    # transmission interval.
     out.write(0b001100 | (denm.termination is not None) << 4 | has_validity << 1, 6)
     out.write(denm.station, 32)
     out.write(denm.sequence, 16)
@@ -180,9 +182,9 @@ def _write_management(out: BitWriter, denm: Denm) -> None:
     out.write(round(UNITS * denm.position[0]) - LEAST["latitude"], 31)
     out.write(round(UNITS * denm.position[1]) - LEAST["longitude"], 32)
     axis = min(max(round(100.0 * AXIS * denm.position_std), 1), 4094)  # [cm]
-    out.write(axis << 24 | axis << 12, 36)  # half axes, and orientation 0
-    out.write(800_001 - LEAST["altitude"], 20)  # unavailable
-    out.write(15, 4)  # so is its confidence
+    out.write(axis << 24 | axis << 12, 36)  # two half axes, and orientation 0
+    out.write(800_001 - LEAST["altitude"], 20)  # altitude: unavailable
+    out.write(15, 4)  # confidence of the altitude: unavailable
     out.write(LESS_THAN_5_KM, 3)
     one_way = denm.heading is not None and not denm.both_ways
     out.write(UPSTREAM if one_way else ALL_DIRECTIONS, 2)
@@ -193,30 +195,30 @@ def _write_management(out: BitWriter, denm: Denm) -> None:
 
 def _write_situation(out: BitWriter, denm: Denm) -> None:
     deltas = _encode_deltas(denm.position, denm.history)[:POINTS]
-    out.write(bool(deltas), 3)  # extension; linked cause, history
+    out.write(bool(deltas), 3)  # bits: extension; presence of linked cause, history
     out.write(denm.quality, 3)
-    out.write(0, 1)  # extension of the cause
+    out.write(0, 1)  # extension bit of the cause
     out.write(denm.cause, 8)
     out.write(denm.sub_cause, 8)
     if deltas:
         out.write(len(deltas) - 1, 5)
     for delta in deltas:
-        out.write(delta, 1 + DELTA_BITS)  # without a time
+        out.write(delta, 1 + DELTA_BITS)  # the first bit says that there is no time
         out.write(denm.quality, 3)
 
 
 def _write_location(out: BitWriter, denm: Denm) -> None:
-    out.write((denm.heading is not None) << 1, 4)  # extension; speed, heading, road type
+    out.write((denm.heading is not None) << 1, 4)  # bits: extension; speed, heading, road type
     if denm.heading is not None:
         out.write(round(10.0 * (denm.heading % 360.0)) % 3600, 12)
-        out.write(126 - 1, 7)  # unavailable confidence
+        out.write(126 - 1, 7)  # confidence of the heading: unavailable
     traces = denm.traces[:TRACES] or ((),)
     out.write(len(traces) - 1, 3)
     for trace in traces:
         deltas = _encode_deltas(denm.position, trace)[:TRACE_POINTS]
         out.write(len(deltas), 6)
         for delta in deltas:
-            out.write(delta, 1 + DELTA_BITS)  # without a time
+            out.write(delta, 1 + DELTA_BITS)  # the first bit says that there is no time
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:

@@ -18,13 +18,14 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import NS
 
-VALID_NS: Final = 1800 * NS  # the time for which the service keeps an alert without confirmation
+VALID_NS: Final = 1800 * NS  # [ns] as long as the service keeps an alert without confirmation
 RENEW_NS: Final = VALID_NS // 2
-ICE_MU: Final = 0.2  # friction below which the only road material in a DENM is ice
+ICE_MU: Final = 0.2  # below this friction, a DENM names ice
 SEQUENCES: Final = 1 << 16
-SURE: Final = 0.97  # P(slippery) that raises the quality of the information by one
+SURE: Final = 0.97  # P(slippery) from which the DENM's information quality is one level higher
 CELL_STD: Final = 5.0  # [m] position error within a cell
-TERMINATED_NS: Final = VALID_NS  # time for which the number of an ended event is not used again
+# [ns] Time for which the number of an ended event is not used again.
+TERMINATED_NS: Final = VALID_NS
 
 
 @dataclass(frozen=True)

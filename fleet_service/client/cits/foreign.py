@@ -17,9 +17,9 @@ from fleet_service.client.cits.denm import ADHESION, BLACK_ICE, HEAVY_FROST, ICE
 from schemas import grid, keys
 from schemas.thresholds import NS
 
-# Friction that a sub-cause means: middle and bounds. Snow and ice have the ranges of
-# `thresholds.SURFACES`, by which our own DENM name them; frost and unknown causes are wider. A
-# salted road is no warning of low friction.
+# Median and bounds of the friction that a sub-cause stands for. Snow and ice have the ranges of
+# `thresholds.SURFACES`, as in our own DENM. Frost and unknown causes have wider ones. A salted road
+# is no warning of low friction.
 GRIP: Final = {
     HEAVY_FROST: (0.3, 0.15, 0.45),
     SNOW: (0.3, 0.2, 0.45),
@@ -27,9 +27,9 @@ GRIP: Final = {
     BLACK_ICE: (0.12, 0.05, 0.2),
 }
 UNKNOWN: Final = (0.35, 0.15, 0.6)
-USED: Final = 0.6  # share of the middle; with less, a report would be only a lower bound
+USED: Final = 0.6  # assumed use as a share of the median; with less, the report would be a bound
 WORST_STD: Final = 12.0  # [m] largest position error with which a cell can be identified
-MOST_CELLS: Final = 24  # with both directions they fit into one batch
+MOST_CELLS: Final = 24  # limit of cells, so that both directions fit into one batch
 QUARTERS: Final = (0.0, 90.0, 180.0, 270.0)  # [deg] headings of the four sectors
 POSITION_STD: Final = 10.0  # [m] used if the message states no accuracy
 
@@ -61,7 +61,7 @@ def encode_reports(
             "vehicle": name,
             "boot": str(boot),
             "seq": str(seq),
-            # The numbers of one start are shared by all regions, and nothing is sent again.
+            # All regions share the numbers of one start. No batch is sent again, so none is held.
             "first_held": str(seq),
             "enter_time": [str(min(denm.referenced, now))] * count,
             "latitude": [row[0] for row in rows],

@@ -20,7 +20,7 @@ from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
 
-CHECK_S: Final = 10.0  # period of the checks for events whose validity must be renewed
+CHECK_S: Final = 10.0  # [s] period of the checks for events whose validity must be renewed
 
 
 class DenmOutput:

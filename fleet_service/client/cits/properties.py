@@ -12,7 +12,7 @@ from fleet_service.client.cits.denm import Denm, its_time
 from schemas import grid
 from schemas.errors import InputError
 
-QUAD_ZOOM: Final = 18  # longest key that interchanges index
+QUAD_ZOOM: Final = 18  # length of the longest quadtree key that interchanges index
 PROTOCOL: Final = "DENM:1.3.1"
 
 
