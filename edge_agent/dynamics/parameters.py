@@ -29,7 +29,7 @@ class Parameter(IntEnum):
     SLOPE_X = 9  # [1] longitudinal slip stiffness per wheel load
     SLOPE_Y = 10  # [1/rad] cornering stiffness per wheel load
     DRIVE_FRONT = 11  # [1] share of the driving force on the front axle; NaN if unknown
-    # The next three select the stiffness of printed papers; 0, 0 and 1 have no effect.
+    # The next three change the stiffness as in the papers' tyre models; 0, 0 and 1 change nothing.
     PROPORTIONAL = 12  # 1 if stiffness is proportional to friction (000, 003, 004 as printed)
     # [1] e of K = slope*F_z*(1 + e - e*F_z/F_0), the polynomial (14) of 001; F_0 = m*g/4
     QUADRATIC = 13

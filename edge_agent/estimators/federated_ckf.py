@@ -74,8 +74,8 @@ ROWS = 3
 RULE = cubature_rule(WHEELS)
 XI = RULE.xi
 WEIGHT = RULE.w_cov
-# [m/s^2, m/s^2, rad/s] errors of a_x, a_y and r according to the tyre model, for one independent
-# measurement
+# [m/s^2, m/s^2, rad/s] errors of a_x, a_y and r according to the tyre model, for one measurement
+# per INDEPENDENT_S
 NOISE_STD = np.array([0.15, 0.15, 0.004])
 AY_SHARE = 0.05  # [1] relative error of a_y according to the tyre model
 

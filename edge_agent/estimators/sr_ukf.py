@@ -87,7 +87,7 @@ DRIFT = np.array([0.05, 0.05, 0.1])
 FIRST_RATE_STD = 0.1  # [rad/s] error of the yaw rate at the first sample
 RATE_STD = 0.003  # [rad/s] error of the measured yaw rate
 SLOWEST_SLIP_M_S = 1.0  # [m/s] smallest speed by which wheel-speed noise is divided
-# Error of a_y according to the tyre model, for one independent measurement
+# Error of a_y according to the tyre model, for one measurement per INDEPENDENT_S
 AY_STD = 0.15  # [m/s^2]
 AY_SHARE = 0.05  # [1] relative
 # Error of the longitudinal force

@@ -19,7 +19,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 FORGET_M = 190.0  # [m] distance constant of forgetting: one road change per 190 m (errata)
-INDEPENDENT_S = 0.2  # [s] time between independent measurements of the tyre (errata)
+# [s] time within which errors of the tyre model are correlated, so that all samples within it count
+# as one measurement (errata)
+INDEPENDENT_S = 0.2
 DEMAND_HALF = 0.15  # [1] force over load at which the evidence on friction counts by half (errata)
 # [1] correlation of friction between both sides, which are mostly on the same surface
 SIDE_CORRELATION = 0.9

@@ -307,8 +307,8 @@ class Constants(NamedTuple):
     guard_std: float = 0.03
 
     # --- Strain (`trust.py`) ---
-    # [1] degrees of freedom of the initial strain of 1. A few measurements do not determine the
-    # strain yet.
+    # [1] weight, in degrees of freedom, of the initial strain of 1, because a few measurements do
+    # not determine the strain yet
     strain_prior: float = 2.0
     # [1] strain at which R of the axles has its stated value: .2 to .5 on level drives, .5 to 2 on
     # rough ones

@@ -105,10 +105,10 @@ class NodeWorkspace:
     axle_mu: Annotated[LaneArray, 2]  # mean over an axle's wheels by load
     per_axle_mu: Annotated[LaneArray, 2]
     point: Annotated[LaneArray, STATES]  # states at which the residuals are evaluated
-    slip: NodeSlip  # at the mean
-    moved_slip: NodeSlip  # at another point
-    forces: NodeForces  # at the mean
-    moved_forces: NodeForces  # at another point
+    slip: NodeSlip  # at the mean of the states
+    moved_slip: NodeSlip  # at another state
+    forces: NodeForces  # at the mean of the states
+    moved_forces: NodeForces  # at another state
     # [1] difference of force over load if the tyre is sharper by one standard deviation
     shape_force: Annotated[LaneArray, ROWS]
     # Residual at the mean, then its mean over the cubature points, then the innovation
