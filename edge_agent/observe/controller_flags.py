@@ -33,8 +33,8 @@ STANDING_S: Final = 5.0
 # [1] largest plausible share of active time. A long icy road reaches less, an average winter drive
 # far less.
 MOST_ACTIVE: Final = 0.3
-# [s] A flag that was on for less is not too often on: braking from 30 m/s to rest on ice of
-# friction .1 takes as long.
+# [s] shortest active time after which a flag can count as on too often. Braking from 30 m/s to rest
+# on ice of friction .1 takes this long.
 LEAST_ACTIVE_S: Final = 30.0
 MEMORY_S: Final = 600.0  # [s] time constant of forgetting in the share of active time
 MOST_STEP_S: Final = 0.5  # [s] a longer step between two samples counts as this

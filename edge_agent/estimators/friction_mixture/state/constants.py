@@ -229,8 +229,8 @@ class Constants(NamedTuple):
     drift: float = 0.02
     # [rad/s] white noise of a wheel speed sample (vehicle)
     omega_noise: float = 0.03
-    # [rad/s] other errors of the wheel speeds: undetected resolution steps, sensor teeth, wobbling
-    # tyres
+    # [rad/s] error of wheel speeds besides white noise: undetected resolution steps, sensor teeth,
+    # wobbling tyres
     step_noise: float = 0.06
     # [1] share of a sudden change of slip that counts as noise. A tyre builds up force over .3 m,
     # and a bump changes the rolling radius.
