@@ -41,7 +41,7 @@ INVENTORY_S: Final = 300.0
 FOLLOW_S: Final = 30.0
 DAY_S: Final = 86_400.0
 ASKED_S: Final = 2.0  # [s] period of the checks for a requested erasure or hand-over
-# [s] A job runs for the first time at most this long after the start, not only after its period.
+# [s] Longest wait for the first run of a job, and for a repetition after a failure.
 SOON_S: Final = 60.0
 # [s] A job that runs for longer counts as hanging. Compaction of a day's backlog takes minutes.
 HANGS_S: Final = 1800.0

@@ -12,7 +12,8 @@ from schemas.errors import InputError
 from schemas.runtime.installing import install_command
 
 LONGEST_DAYS = 36525.0  # a century; later dates may not be representable
-# So many names may be revoked without a question. An incomplete list must not revoke a whole fleet.
+# Largest number of names that are revoked without a question. An incomplete list must not revoke a
+# whole fleet.
 ASKED = 3
 SHOWN = 8  # number of names shown of each kind
 

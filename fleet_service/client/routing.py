@@ -22,7 +22,7 @@ from schemas.thresholds import METRES_PER_DEGREE
 
 STEP_M: Final = 5.0  # [m] step along a link
 # The cost factor of a road is (GOOD_GRIP/μ)^POWER, because braking distance grows with 1/μ. With
-# the square, a detour of a fifth is worth it at μ = .45, and one of ten times the length at
+# the square, a detour may be a fifth longer than a road of μ = .45, and ten times as long as one of
 # μ = .16.
 GOOD_GRIP: Final = 0.5  # lower bound of μ on a wet road, with factor 1
 POWER: Final = 2.0

@@ -73,8 +73,9 @@ SHAPE_DOUBT: Final = 0.1
 # Prior mean and standard deviation of the slope. The prior weighs as much as about 20 comparisons.
 SHAPE_PRIOR: Final = 0.15
 SHAPE_STD: Final = 0.15
-# Sum of weights (squared difference of use over variance) per vehicle above which all earlier
-# comparisons count half; almost seven times the weight of the prior.
+# A comparison weighs as much as its squared difference in grip used, divided by its variance. When
+# a vehicle's weights exceed this sum, all its comparisons so far count half. The sum is almost
+# seven times the weight of the prior.
 SHAPE_MEMORY: Final = 300.0
 # A value from gentle driving gets at least the square of this as its weight in the cell's means.
 SHARED_LEAST: Final = 0.25

@@ -30,7 +30,8 @@ from schemas.numeric import ByteArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
-# [ns] Age to which late visits are limited. After this time, the road has probably changed.
+# [ns] A late visit is fused only if it is at most this much older than the checkpoint. After this
+# time, the road has probably changed.
 LATE_MOST_NS: Final = int(c.CHANGE_S) * NS
 # [ns] Interval directly after the checkpoint in which late visits get their times.
 _PLACES_NS: Final = NS

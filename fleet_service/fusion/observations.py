@@ -21,7 +21,7 @@ from schemas.signals import FLAGS
 from schemas.thresholds import SLIPPERY_MU
 
 SmallArray = NDArray[np.int8]
-# Larger than the number of rows of a batch. Batch number and row become one number in this way.
+# Factor that joins the numbers of batch and row to one number. No batch has as many rows.
 ROWS_PER_SEQ: Final = 64
 # Share of its value that a vehicle is assumed to have used if it does not report the grip used. It
 # is below EXCITED_SHARE, so the assumption is cautious.

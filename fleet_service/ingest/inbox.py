@@ -394,8 +394,8 @@ class BatchIntake:
         return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
-        # By the rule "vehicle", name and stream in the batch do not belong to the sender. A
-        # rejection would then stop the batches of another vehicle.
+        # A batch that breaks the rule "vehicle" names another vehicle than its sender. A rejection
+        # would stop the batches of that vehicle.
         if refusal.rule != "vehicle":
             self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)

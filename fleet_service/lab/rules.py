@@ -138,7 +138,8 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
     rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
     pair = v.place[rows] * (int(v.vehicle.max(initial=0)) + 1) + v.vehicle[rows]
-    _, last = np.unique(pair[::-1], return_index=True)  # the newest visit, as they are sorted
+    # Visits are in order of time, so the first one in reverse order is the newest.
+    _, last = np.unique(pair[::-1], return_index=True)
     rows = rows[::-1][last]
     mean = np.full(CELLS, PRIOR_MEAN)
     std = np.full(CELLS, PRIOR_VAR**0.5)

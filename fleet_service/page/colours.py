@@ -24,9 +24,10 @@ from schemas.runtime.palette import (
 )
 from schemas.thresholds import SLIPPERY_MU
 
-# Width of an interval up to which one of four classes is shown. Half of it is less than a class.
+# Largest width of an interval for which a place is shown as ice, snow, wet or dry. Half of this
+# width is less than the width of a class.
 NARROW: Final = 0.25
-MIDDLING: Final = 0.6  # width up to which one of two classes is shown
+MIDDLING: Final = 0.6  # largest width for which it is shown as one of two classes
 EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # μ between ice, snow, wet and dry (Pacejka 2012, ch. 1)
 KNOWN_SLIPPERY: Final = 0.5  # P(μ < SLIPPERY_MU) above which a place is never shown as unknown
 ALERT: Final = "#c4003a"

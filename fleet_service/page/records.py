@@ -96,7 +96,7 @@ def of_table(table: pa.Table) -> Records:
     found["upper"] = _to_steps(np.ceil, table["mu_upper"], MU_STEPS)
     found["slippery"] = _to_steps(np.ceil, table["p_slippery"], SHARE_STEPS)
     basis = table["basis"].to_numpy()
-    # A lower bound has no value to colour, although older services send one.
+    # A lower bound has no value to colour, although older versions state one.
     found["mu"][basis == "bound"] = NO_NUMBER
     # Snapshots of older versions mark known ice as a lower bound.
     known = (basis == "measured") | (

@@ -25,7 +25,7 @@ class ServedRegions:
     def __init__(self) -> None:
         self._queriers: dict[int, Any] = {}
         self._away_since: dict[int, float] = {}
-        # regions whose announced service has ended, and the time of this [s since 1970]
+        # regions that no service announces any more, and since when [s since 1970]
         self._fallen: dict[str, float] = {}
 
     def watch(self, session: zenoh.Session, tiles: Iterable[int], now: float) -> None:

@@ -18,7 +18,7 @@ from fleet_service.page.reader import Reader
 from fleet_service.page.roads import RoadMap
 from fleet_service.page.watchers import Watchers
 
-Handlers = dict[str, Callable[[Request], Awaitable[Response]]]  # by URL path
+Handlers = dict[str, Callable[[Request], Awaitable[Response]]]  # request handlers by URL path
 
 
 class Sources(NamedTuple):

@@ -200,7 +200,7 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
     cells = set[int]()
     with hold_compaction_lock(root):
         drop_checkpoints(root)  # because they contain the vehicle's reports
-        for damaged in files:  # because it is unknown which reports they contain
+        for damaged in files:  # because they may contain the vehicle's reports
             damaged.unlink()
         for kind in Kind:
             theirs = [
