@@ -30,7 +30,7 @@ class Column(IntEnum):
     MU_LOWER = 9  # [1] 5 % quantile
     MU_UPPER = 10  # [1] 95 % quantile
     MU_UTILISED = 11  # [1] largest grip used by any wheel in the last second
-    INNOVATION_NIS = 12  # normalised squared innovation, mean over the measurements
+    INNOVATION_NIS = 12  # normalised squared innovation, mean over the measurements; 1 is expected
     ADAPTATION = 13  # [1] largest factor on R
     INNOVATION_LOG_LIKELIHOOD = 14  # [nat] of the sample's measurements, 0 without measurements
     HEALTH = 15  # schemas.signals.Health
