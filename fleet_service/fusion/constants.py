@@ -59,8 +59,8 @@ COMMON_ALWAYS: Final = 0.02
 # Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share.
 COMMON_MANOEUVRE: Final = 0.05
 
-# Share of a road's grip below which the assumed tyre curve matters: a value measured with less grip
-# may be too low. This error widens intervals upwards and corrects no value.
+# If a vehicle uses less than this share of a road's grip, its value may be too low, because it
+# depends on the assumed tyre curve. This error widens intervals upwards and corrects no value.
 SHARED_SHARE: Final = 0.8
 # Largest relative standard deviation of the tyre-curve error. Of 60 tuning fleets on winter tyres
 # that drove gently through a wet curve, 8 raised a false alert with .25, 3 with .275, 2 with .3.
@@ -81,7 +81,7 @@ SHAPE_MEMORY: Final = 300.0
 SHARED_LEAST: Final = 0.25
 # Relative shared error σ_s at which a value has half the weight of a value without such an error.
 SHARED_WIDE: Final = 0.1
-# Share of the variance stated by a vehicle that all vehicles in a place have in common.
+# Share of a vehicle's stated variance that is an error common to all vehicles in a place.
 SHARED_PART: Final = 0.1
 # Share of the variance σ_s² that other manoeuvres do not average out. On three rough tuning drives,
 # errors in one place had a correlation of .6 for the same kind of manoeuvre, .1 to .5 for others.

@@ -27,7 +27,7 @@ START: Final = 1_800_000_000 * NS
 ROADS = 10
 LENGTH = 12
 CELLS: Final = ROADS * LENGTH
-STRETCH: Final = 4  # number of cells of one surface
+STRETCH: Final = 4  # length of a stretch with one surface, in cells
 # surface: mean of μ, its spread, share of the roads
 SURFACES: Final = {
     "dry": (0.85, 0.08, 0.45),
