@@ -92,6 +92,6 @@ class Health(IntFlag):
     OUTLIER = 64  # at least one reading was rejected
     SLIDING = 128  # a wheel is locked or spins: its slip is beyond the tyre's force peak
     RESET = 256  # the filter was reset
-    # No friction value explains the measurements. The estimate is the prior and its likelihood
+    # No friction value explains the measurements. The estimate is the prior, and the likelihood is
     # flat.
     CONTRADICTION = 512

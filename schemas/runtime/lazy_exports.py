@@ -20,7 +20,7 @@ def lazy_exports(
     """
     face = sorted(names)
 
-    def look_up(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
+    def look_up(name: str) -> Any:  # noqa: ANN401 an export may be any object
         if name not in names:
             raise AttributeError(
                 f"{package} has no {name!r}; its public names are {', '.join(face)}"

@@ -71,7 +71,7 @@ class NativeKernel:
         """Return the Numba version of the kernel; Numba compiles it at its first call."""
         return self._compile()
 
-    def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 differs by kernel
+    def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 the type depends on the kernel
         """Run the kernel, and return its result: None or an integer."""
         words = [0, 0]
         try:
@@ -100,7 +100,7 @@ class NativeIntrinsic:
         self._load = load
 
     @functools.cached_property
-    def numba_intrinsic(self) -> Any:  # noqa: ANN401 the types are Numba's own
+    def numba_intrinsic(self) -> Any:  # noqa: ANN401 Numba has no types
         """Return the Numba intrinsic itself, and load it if necessary."""
         return self._load()
 
@@ -113,7 +113,7 @@ def symbol_of(name: str, types: str) -> str:
     return f"gripmap_{digest.hexdigest()}"
 
 
-def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 whatever a kernel takes
+def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argument of a kernel
     """Return the type of a kernel's argument as text, and append the 64-bit words that represent
     the argument to `words`.
 

@@ -82,7 +82,7 @@ def make_kernel(
 class _Cache(FunctionCache):
     """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
 
-    def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
+    def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 Numba has no types
         """Return the cache key; for a closure it contains the names of the enclosed objects.
         Numba's own key for a closure differs in each process.
         """

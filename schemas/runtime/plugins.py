@@ -33,7 +33,7 @@ def entry_points_of(group: str) -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=group)}
 
 
-def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
+def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 may be any object
     """Import the object that an entry point refers to.
 
     Raises:

@@ -161,6 +161,6 @@ class _Formatter(logging.Formatter):
         return _make_record(level, event=event, message=record.getMessage(), **self._who, **raised)
 
 
-def _make_record(level: str, **values: Any) -> str:  # noqa: ANN401 whatever JSON takes
+def _make_record(level: str, **values: Any) -> str:  # noqa: ANN401 any JSON value
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     return json.dumps({"time": now, "level": level, "pid": os.getpid(), **values}, default=str)

@@ -108,14 +108,14 @@ def record_type(kind: type) -> np.dtype[np.void]:
     )
 
 
-def _number_type(held: Any) -> Any:  # noqa: ANN401 the annotation of a field
+def _number_type(held: Any) -> Any:  # noqa: ANN401 a field's annotation
     if held is LaneArray:
         return np.dtype("f8")
     return np.dtype(KINDS[held]) if held in KINDS else record_type(held)
 
 
 @cache
-def _alignment(held: Any) -> int:  # noqa: ANN401 the annotation of a field
+def _alignment(held: Any) -> int:  # noqa: ANN401 a field's annotation
     """Return the alignment of a record's field: its offset must be a multiple of this number of
     bytes.
     """

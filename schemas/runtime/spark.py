@@ -30,7 +30,7 @@ SETTINGS: Final = {
 }
 
 
-def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without types
+def session(*, progress: bool = False) -> Any:  # noqa: ANN401 pyspark has no types
     """Return the Spark session of this process. It uses the cluster that spark-submit or Spark's
     settings name, or else this machine.
 
@@ -56,7 +56,7 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without
 
 
 def spread(
-    session: Any,  # noqa: ANN401 pyspark is an extra
+    session: Any,  # noqa: ANN401 pyspark has no types
     tasks: Sequence[_Task],
     work: Callable[[_Task], _Outcome],
 ) -> list[_Outcome]:
@@ -113,7 +113,7 @@ def spread(
     return [outcomes[number] for number in range(len(tasks))]
 
 
-def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
+def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an Arrow array
     """Yield pairs from a column of pickled bytes: the number of a task, and the unpickled task or
     outcome of this task.
     """

@@ -313,5 +313,5 @@ def decode_standing(payload: bytes) -> list[Alert]:
     return [_alert_of_message(alert) for alert in message.alerts]
 
 
-def _alert_of_message(message: Any) -> Alert:  # noqa: ANN401 protobuf messages are untyped
+def _alert_of_message(message: Any) -> Alert:  # noqa: ANN401 protobuf has no types
     return Alert(**{name: getattr(message, name) for name in Alert.__dataclass_fields__})

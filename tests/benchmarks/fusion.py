@@ -142,13 +142,13 @@ def table_vs_dict() -> float:
 
 
 @njit
-def _fill_dict(known: Any, keys: IntArray) -> None:  # noqa: ANN401 numba's own type
+def _fill_dict(known: Any, keys: IntArray) -> None:  # noqa: ANN401 Numba has no types
     for slot in range(len(keys)):
         known[keys[slot]] = slot
 
 
 @njit
-def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 numba's own type
+def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 Numba has no types
     out = np.empty(len(keys), np.int64)
     for i in range(len(keys)):
         out[i] = known.get(keys[i], -1)

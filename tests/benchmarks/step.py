@@ -164,7 +164,7 @@ def bank() -> list[Figure]:
         t, signals, readings = drive.repeat_samples(samples, vehicles)
         fleet = [drive.vehicle] * vehicles
         ours, threaded = time_in_turn(
-            # The loop variables are safe: the function runs before the next iteration (B023).
+            # The lambdas run within this iteration, so the loop variables are safe (B023).
             lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023
             lambda: make_limit(
                 Limit,

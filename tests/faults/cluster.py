@@ -53,7 +53,7 @@ LEASE_S: Final = ServiceConfig().lease_s
 PROCESSES = 2
 VEHICLES = 6
 RATE = 25.0
-EVERY: Final = 8  # failovers per group; a hand-over follows in the middle and at the end of a group
+EVERY: Final = 8  # failovers per group, with a hand-over in its middle and at its end
 HOLD_S: Final = (1.0, 5.0)  # undisturbed time between two failovers
 # These jobs run often, so that each happens in the few seconds for which a service lives. A
 # snapshot costs a second.

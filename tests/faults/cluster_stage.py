@@ -48,7 +48,7 @@ AMID_S: Final = 0.3  # latest time of a kill after a compaction or an upload has
 # In lease times: if no takeover happened by then, the frozen service resumed in time.
 WOKE: Final = 3.0
 SETTLED_S: Final = 2.0  # after this time all sent rows are in a segment
-PATIENCE_S: Final = 600.0  # long, so that a slow takeover is measured and not an error
+PATIENCE_S: Final = 600.0  # long, so that a slow takeover is measured instead of failing the run
 
 
 def write_town_archive(root: Path) -> str:

@@ -87,8 +87,8 @@ def run(site: Site) -> list[Figure]:
     answers = 0
     mutants = Mutants(site.seed, began)
     engine = Engine(ServiceConfig(), site.folder / "archive")
-    # Number of historical maps to compute. Each takes a process and a second.
     honest = 0
+    # Number of historical maps to compute. Each takes a process and a second.
     pasts = site.choose_amount(50, 3)
     for turn in range(count // TURN):
         messages = []

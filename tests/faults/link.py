@@ -42,7 +42,9 @@ MOBILE: Final = LinkTerms(delay_s=0.04)
 UPLINK: Final = LinkTerms(delay_s=0.04, bytes_per_s=2_000_000.0)
 TILE_BYTES: Final = 40_000
 TILES_PER_S: Final = 10.0
-ALERTS_PER_S: Final = 7.3  # no divisor of the tiles' rate, so that their phases vary
+ALERTS_PER_S: Final = (
+    7.3  # not a divisor of the tiles' rate, so that alerts and tiles meet in all phases
+)
 QUIET_S: Final = 0.5  # wait after the last message, for messages in transit
 START_S: Final = 30.0
 TILE: Final = int(grid.tile_of(int(grid.cell_of(LATITUDE, LONGITUDE))))

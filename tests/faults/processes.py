@@ -20,7 +20,7 @@ from pathlib import Path
 
 from tests.waiting import until
 
-START_S = 120.0  # the first start compiles the kernels
+START_S = 120.0  # time for a start; the first one compiles the kernels
 STOP_S = 30.0  # a stopped process needs 3 s on an idle machine
 
 

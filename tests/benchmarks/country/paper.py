@@ -15,7 +15,7 @@ from tests.benchmarks.country.replayed import ROWS
 VEHICLES: Final = 1_000_000
 # Ratio of this country's vehicles, messages and cells to those of the measured country.
 FACTOR: Final = 10
-USED: Final = 0.6  # largest share of a core, so that a service catches up after an outage
+USED: Final = 0.6  # largest used share of a core; the rest lets a service catch up after an outage
 DAY_S: Final = 86_400.0
 
 

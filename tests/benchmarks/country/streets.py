@@ -25,10 +25,10 @@ from tests.benchmarks.sumo import Sumo
 
 HELSINKI: Final = Origin(60.17, 24.94)
 STEP_S: Final = 0.5
-TRIPS: Final = ("--intermediate", "3")  # intermediate places: trips of 3 km or more
-CHANGE_S: Final = ("--lanechange.duration", "3")  # SUMO's default is an instantaneous lane change
+TRIPS: Final = ("--intermediate", "3")  # intermediate places, which make trips of at least 3 km
+CHANGE_S: Final = ("--lanechange.duration", "3")  # [s] SUMO's default is instantaneous
 LEAP_M: Final = 20.0  # a longer step means that SUMO moved the vehicle out of a jam
-SMOOTH_M: Final = 13  # length over which a path is smoothed
+SMOOTH_M: Final = 13  # [m] length over which a path is smoothed
 # [m/s^2] median acceleration limit of the simulated drivers; such a driver keeps SUMO's speed.
 USUAL_Q: Final = 5.0
 WET_AREAS = 4

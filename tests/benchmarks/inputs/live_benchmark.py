@@ -31,7 +31,7 @@ RATE_HZ: Final = 100.0
 MULTICAST: Final = "239.74.163.2"
 COUNTED: Final = ("can", "ros2", "vss")
 PATIENCE_S: Final = 60.0
-START_S: Final = 300.0  # includes the compilation of kernels
+START_S: Final = 300.0  # time for a start, including the compilation of kernels
 SETTLED_S: Final = 2.0  # wait after the last sample: rows are delayed by design
 KILLS: Final = 3  # kills of each source while an agent runs
 

@@ -23,7 +23,7 @@ def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
     """
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 60.0, 0.01)
-    # Height, one value each 5 cm.
+    # Height of the road, one value every 5 cm.
     road = np.convolve(rng.normal(0.0, 1.0, 30_000), np.ones(12) / 12.0, "same")
     signals = np.full((len(t), len(CHANNELS)), np.nan)
     for wheel in range(4):

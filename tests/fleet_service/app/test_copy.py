@@ -150,7 +150,7 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
             1,
             0,
         )
-        take(engine, sent)  # repeated batches are recognised, and not acknowledged early
+        take(engine, sent)  # repeated batches are recognised, but not yet acknowledged
         assert engine.settlement.flush() == []
         assert engine.state.fusion.size > 0  # the map is updated all the same
         bucket.start()

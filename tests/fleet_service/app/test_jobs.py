@@ -53,7 +53,7 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
     )
     with running(router, tmp_path) as again:
         assert again.service.engine.state.fusion.live.visits[0] == 30
-        # The command runs next to the service.
+        # The command runs while the service is running.
         assert main(["compact", "--archive", str(tmp_path)]) == 0
 
 

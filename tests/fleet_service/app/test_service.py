@@ -87,7 +87,7 @@ class Fleet:
     def _record_alert(self, sample: zenoh.Sample) -> None:
         alert = wire.decode_alert(sample.payload.to_bytes())
         if self._last.get((alert.cell, alert.sector)) == alert:
-            self.repeated += 1  # the same alert, published again
+            self.repeated += 1  # the service has published this alert again
         else:
             self._last[alert.cell, alert.sector] = alert
             self.alerts.put(alert)

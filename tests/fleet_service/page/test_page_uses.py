@@ -77,7 +77,7 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
         seen.page.evaluate("gripmap.timeline.load()")
         seen.page.locator("#play").click()
         assert seen.page.locator("#play").inner_text() != "play"
-        # The playback shows a new moment each 0.7 s.
+        # The playback shows a new moment every 0.7 s.
         until(lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0)
         played: list[list[str]] = seen.page.evaluate("played")
         moments = [int(at) for at, _ in played[:-1]]
@@ -100,7 +100,7 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
         silent.wait_for_selector("body[data-ready]", state="attached")
         for one in (seen.page, silent):
             one.evaluate(_HEARD)
-            # the function runs before the next iteration (B023)
+            # The lambda runs within this iteration, so the loop variable is safe (B023).
             until(lambda: one.evaluate("gripmap.state.hasAlerts"))  # noqa: B023
         seen.page.locator("#tab-alerts").click()
         assert not seen.page.locator("#sound").is_checked()

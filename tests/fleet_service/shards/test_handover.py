@@ -154,6 +154,6 @@ def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
     assert two.wait(threading.Event(), print, lambda: 0, None)
     assert two.former_holders == ("one",)
     two.release("one")
-    # At the end every service may take over.
+    # The release reserves the lease for "one" for some time. After that, any service may take it.
     assert three.wait(threading.Event(), print, lambda: 0, None)
     assert three.former_holders == ("one", "two")
