@@ -56,12 +56,12 @@ class Move(NamedTuple):
 
 LESS = 1.0 / 3.0
 MOVES = {
-    # Number and independence of the measurements.
+    # Group: number and independence of the measurements.
     "block_time": Move("updates", "acceleration", 0.4),
     "correlation_time": Move("vy_std", "constant-radius", 1.4),
     # R adapts faster to the spinning wheels.
     "window": Move("adaptation", "acceleration", 2.0, LESS),
-    # The road.
+    # Group: road.
     "hazard": Move("least probabilities", "j-turn", 1.5),
     # Ice is expected after a longer distance without grip demand.
     "patch_length": Move("lower", "slalom", 1.015),
@@ -70,7 +70,7 @@ MOVES = {
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
     # The split nodes wake later.
     "split_asymmetry": Move("split probability", "split-braking", 0.997),
-    # Evidence that a block gives.
+    # Group: evidence of a block.
     # Evidence below the demand threshold becomes a penalty of more nodes.
     "demand_half": Move("least probabilities", "braking", 0.3),
     # With a steep threshold, all above it is evidence and nothing becomes a penalty.
@@ -87,15 +87,15 @@ MOVES = {
     "sliding_penalty": Move("lower", "constant-radius", 1.025),
     # Saturated nodes, which have low friction, gain.
     "axle_penalty": Move("upper", "constant-radius", 0.85),
-    # Limits.
+    # Group: limits.
     # Tighter limits keep the nodes away from states that cost a penalty.
     "farthest": Move("penalty", "braking", 0.5, LESS),
     # R adapts less to innovations beyond a smaller limit.
     "huber": Move("nis", "stopping", 3.0, LESS),
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
-    # Tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the state
-    # SHAPE.
+    # Group: tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the
+    # state SHAPE.
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
     "curve_e": Move("sharpness", "j-turn", 0.95),
     "shape_std": Move("std SHAPE", "gaining-slalom", 2.0),
@@ -112,13 +112,13 @@ MOVES = {
     # Learned values are forgotten sooner.
     "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),
     "spin_share": Move("nis", "braking", 0.9),
-    # Sliding wheels.
+    # Group: sliding wheels.
     # After the start of a slide, other friction values become possible sooner.
     "slip_change": Move("least probabilities", "acceleration", 1.1),
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     "rear_unlike": Move("adaptation", "acceleration", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
-    # Sensors.
+    # Group: sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
     "leak_x": Move("vx_std", "braking without torque", 1.02),
@@ -134,7 +134,7 @@ MOVES = {
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.15),
-    # Noise. Larger assumed noise makes the normalised innovations (nis) smaller.
+    # Group: noise. Larger assumed noise makes the normalised innovations (nis) smaller.
     "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.985),
@@ -147,7 +147,7 @@ MOVES = {
     "lag": Move("nis", "pulses", 0.85),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.91),
-    # Wheels that show the velocity without a tyre model.
+    # Group: wheels that show the velocity without a tyre model.
     "standing_time": Move("stands", "stopping", 0.5),
     "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
     "agreeing_width": Move("v_x told by wheels", "pulses", 0.8, LESS),
@@ -157,10 +157,10 @@ MOVES = {
     "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
     "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),
-    # Guard against a friction below the grip in use.
+    # Group: guard against a friction below the grip in use.
     "guard_margin": Move("least probabilities", "braking", 1.4),
     "guard_std": Move("least probabilities", "acceleration", 1.25),
-    # Contradiction between the car and the vehicle model.
+    # Group: contradiction between the car and the vehicle model.
     # More data are needed to learn the strain of a car.
     "strain_prior": Move("strain", "turn and straight", 1.1),
     "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are trusted more
