@@ -37,6 +37,7 @@ CHANNELS: Final = tuple(UNITS)
 
 # Context: flags and values that cars report in addition to the estimators' channels. A context
 # block is a float array (T, N, len(CONTEXT)); NaN means unknown. Every value is optional.
+
 # Flags of slip controllers: anti-lock brakes, stability control, traction control.
 FLAGS: Final = (
     "abs_active",

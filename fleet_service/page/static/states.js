@@ -2,7 +2,7 @@
 import { byId, make } from "./elements.js";
 import { say } from "./texts.js";
 
-const SILENT_MS = 6000, SLOW_MS = 800;  // a page that starts quickly shows no loading message before SLOW_MS
+const SILENT_MS = 6000, SLOW_MS = 800;  // silence that counts as an error; time after which a starting page shows "loading"
 
 export function stateOf({ live, state: { now }, map: { asked } }) {
   if (!asked) return performance.now() > SLOW_MS ? "loading" : null;

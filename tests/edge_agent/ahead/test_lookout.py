@@ -281,8 +281,8 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
         assert outlook.here[0] == pytest.approx(0.625, abs=0.02)
 
         def is_informed(seen: Outlook) -> bool:
-            # The estimator calls this for each block; `believe` does not wait for the thread that
-            # looks ahead.
+            # As in the agent, `believe` is called for each block. It skips the map while another
+            # thread has locked it.
             car.lookout.believe(here, flat)
             return bool(seen.here[0] < 0.3)
 

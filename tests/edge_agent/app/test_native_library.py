@@ -53,8 +53,8 @@ for column in last.columns.values():
     digest.update(column.tobytes())
 print(digest.hexdigest(), records + len(last.vehicle))
 """
-# Use only the folder of the wheel's libraries. Another folder has a library of other sources, which
-# would crash.
+# Replace the folder of the wheel's libraries by one that contains a library for other sources.
+# Loading that library would crash.
 NATIVE = """
 from pathlib import Path
 from edge_agent.app import native_library

@@ -71,8 +71,7 @@ MOVES = {
     # The split nodes wake later.
     "split_asymmetry": Move("split probability", "split-braking", 0.997),
     # Group: evidence of a block.
-    # Evidence below the demand threshold becomes a penalty of more nodes.
-    "demand_half": Move("least probabilities", "braking", 0.3),
+    "demand_half": Move("least probabilities", "braking", 0.3),  # weak evidence becomes a penalty
     # With a steep threshold, all above it is evidence and nothing becomes a penalty.
     "demand_power": Move("penalty", "acceleration", 0.5),
     "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
@@ -161,8 +160,7 @@ MOVES = {
     "guard_margin": Move("least probabilities", "braking", 1.4),
     "guard_std": Move("least probabilities", "acceleration", 1.25),
     # Group: contradiction between the car and the vehicle model.
-    # More data are needed to learn the strain of a car.
-    "strain_prior": Move("strain", "turn and straight", 1.1),
+    "strain_prior": Move("strain", "turn and straight", 1.1),  # the strain is learned more slowly
     "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are trusted more
     # Axles of a car with little strain are trusted less.
     "strain_power": Move("vy_std", "braking", 1.1, LESS),

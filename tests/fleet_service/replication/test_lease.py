@@ -75,7 +75,8 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         if how == "frozen":
             one.part.send_signal(signal.SIGCONT)
         one.to_router.restore()
-        # A service that is cut off from the bucket learns of its successor by the token.
+        # A service that still runs must end. If it is cut off from the bucket, it learns of its
+        # successor by the token.
         if how not in {
             "killed",
             "stopped",
@@ -213,8 +214,8 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(
     assert not acknowledges(one)
     before = rows_in(two.root, Kind.OBSERVATION)
     assert len(before) == 15
-    # The frozen service resumes in the middle of its work: it writes a segment, compacts, uploads
-    # the result and deletes the compacted files.
+    # The frozen service resumes in the middle of its work: it writes a segment, compacts, and tries
+    # to upload the result and to delete the compacted files.
     one.write(3)
     assert not acknowledges(one)
     compact(one.root)

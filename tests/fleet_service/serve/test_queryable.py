@@ -134,7 +134,7 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     matched(querier)
     heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
     assert texts(session, key) == ["a tile"]
-    # Query without a time limit: the operator must see that the service hangs.
+    # An answer has no time limit, so the operator must see that the service hangs.
     until(lambda: replies.hangs_s > 0.0)
     light_came.set()
     assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
