@@ -33,7 +33,7 @@ export function fitTo({ map }, points) {
 
 /** Show all cells, including new ones, until the user moves the map. */
 export async function showAll({ map, state }) {
-  // Repeat this, because the first rounds may know only tiles or squares instead of cells.
+  // Several rounds, because the first ones may know only tiles or squares instead of cells.
   for (let zoom = null, k = 0; k < ROUNDS && zoom !== map.view.zoom; k++) {
     zoom = map.view.zoom;
     const { extent } = state.cells;

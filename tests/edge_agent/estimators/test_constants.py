@@ -86,10 +86,9 @@ MOVES = {
     "sliding_penalty": Move("lower", "constant-radius", 1.025),
     # Saturated nodes, which have low friction, gain.
     "axle_penalty": Move("upper", "constant-radius", 0.85),
-    # Group: limits.
-    # Tighter limits keep the nodes away from states that cost a penalty.
+    # Group: limits. Tighter limits keep the nodes away from states that cost a penalty.
     "farthest": Move("penalty", "braking", 0.5, LESS),
-    # R adapts less to innovations beyond a smaller limit.
+    # With a smaller limit, R adapts less to large innovations.
     "huber": Move("nis", "stopping", 3.0, LESS),
     "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
     "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
