@@ -4,7 +4,7 @@ import { BORROWED } from "./blocks.js";
 import { HOLLOW, fills, groundColour, inks } from "./colours.js";
 
 const LEAST_PX = 3, DASH_PX = 2;
-const TIE = 1e-4;  // [px] neighbours, also of two tiles, round their common edge to the same side
+const TIE = 1e-4;  // [px] shift with which neighbouring squares, also of two tiles, round their common edge alike
 
 const word = colour => {  // colour "#rrggbb" as the four bytes of a pixel
   const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
