@@ -114,6 +114,8 @@ MOVES = {
     # After the start of a slide, other friction values become possible sooner.
     "slip_change": Move("least probabilities", "acceleration", 1.1),
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
+    # More force is needed before the road counts as changed.
+    "carried_share": Move("least probabilities", "braking without torque", 0.8),
     "rear_unlike": Move("adaptation", "acceleration", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
     # Group: sensors.

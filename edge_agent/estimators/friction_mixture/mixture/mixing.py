@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.common.arrays import copy_vector
 from edge_agent.estimators.friction_mixture.mixture.trust import used_evidence_share
 from edge_agent.estimators.friction_mixture.node.covariance import mix_states
@@ -117,6 +118,7 @@ def apply_road_change(
     doubt = 1.0 - used_evidence_share(memory.trust, constants)
     forgotten = 1.0 - math.exp(-(doubt**BRINK) * scratch.features.duration / FORGOTTEN_S)
     ended = max(memory.slip.ended, memory.slip.axle_ended)
+    ended *= carried_degree(memory, constants, scratch.features.demand)
     slid = 1.0 - math.exp(-metres * constants.slip_hazard * ended)
     hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
@@ -134,6 +136,24 @@ def apply_road_change(
         scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0) if j < count else 1.0
         memory.penalty[j] *= 1.0 - scratch.mixing[j]
     share_weights(memory, scratch)
+
+
+@compiled
+def carried_degree(memory: MixtureMemory, constants: Constants, demand: float) -> float:
+    """Return the fuzzy degree, 0 to 1, to which the tyres carry as much force as the slippery road
+    allows.
+
+    A wheel that grips again after a slide shows another road only if it carries such a force. If
+    the driver has released the brake or the accelerator, the wheel grips on the slippery road too.
+
+    Args:
+        memory: state of the filter; its friction is that of the road before.
+        constants: with `carried_share`, where the degree begins; it is 1 at twice this share.
+        demand: larger force over load of the two axles [1].
+    """
+    slippery = min(memory.friction_left.median, memory.friction_right.median)
+    share = demand / max(slippery, TINY)
+    return min(max(share / constants.carried_share - 1.0, 0.0), 1.0)
 
 
 @compiled

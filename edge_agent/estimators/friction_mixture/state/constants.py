@@ -270,9 +270,12 @@ class Constants(NamedTuple):
     # --- Road changes where wheels slide ---
     # [1] probability of a road change where a wheel begins to slide
     slip_change: float = 0.3
-    # [1/m] rate of road changes where a wheel has slid and grips again, because ice comes in
-    # patches
-    slip_hazard: float = 0.044
+    # [1/m] rate of road changes where a wheel has slid and grips again under load, because ice
+    # comes in patches
+    slip_hazard: float = 0.06
+    # [1] tyre force over that of the slippery road from which gripping again shows a road change.
+    # With less force (the driver has released the brake) a wheel grips on ice too.
+    carried_share: float = 0.4
     # [1] factor on R of the rear axle until it reaches the place where a front wheel began to slide
     rear_unlike: float = 10.0
 
