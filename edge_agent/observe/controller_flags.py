@@ -16,6 +16,7 @@ of the samples into blocks gives the same result.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -40,14 +41,19 @@ MEMORY_S: Final = 600.0  # [s] time constant of forgetting in the share of activ
 MOST_STEP_S: Final = 0.5  # [s] a longer step between two samples counts as this
 STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (about .3 m/s)
 
-# Reasons why a flag is implausible, as bits that are added
-NEVER_OFF = 1
-STANDING = 2
-TOO_OFTEN = 4
+
+class Doubt(IntEnum):
+    """Reason why a flag is implausible; reasons are added."""
+
+    NEVER_OFF = 1
+    STANDING = 2
+    TOO_OFTEN = 4
+
+
 REASONS: Final = {
-    NEVER_OFF: "has been on since the start",
-    STANDING: "is on while the vehicle stands",
-    TOO_OFTEN: "is on too often",
+    Doubt.NEVER_OFF: "has been on since the start",
+    Doubt.STANDING: "is on while the vehicle stands",
+    Doubt.TOO_OFTEN: "is on too often",
 }
 
 
@@ -63,7 +69,7 @@ class FlagRecord:
     known: float  # [s] time for which it was known, with the same forgetting
     standing: float  # [s] time for which it was on at standstill, since it was last off for OFF_S
     was_off: bool  # True once it was off for OFF_S without interruption
-    doubt: int  # sum of the reasons why it is implausible, such as NEVER_OFF; 0 if plausible
+    doubt: int  # sum of the reasons why it is implausible (`Doubt`); 0 if plausible
 
 
 def new_flag_records(vehicles: int) -> RecordArray:
@@ -169,8 +175,8 @@ def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None
             record.standing = 0.0
     record.doubt = 0
     if on and not record.was_off:
-        record.doubt += NEVER_OFF
+        record.doubt += Doubt.NEVER_OFF
     if record.standing >= STANDING_S:
-        record.doubt += STANDING
+        record.doubt += Doubt.STANDING
     if record.active >= LEAST_ACTIVE_S and record.active > MOST_ACTIVE * record.known:
-        record.doubt += TOO_OFTEN
+        record.doubt += Doubt.TOO_OFTEN

@@ -14,7 +14,7 @@ from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import NOBODY, NONE, Rows
+from fleet_service.fusion.store.records import NOBODY, NONE, Rows, Side
 from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Weather
@@ -129,20 +129,20 @@ class BeliefMap:
         index = self.store.known(np.array([vehicle]))
         return np.where(index < 0, self.store.vehicles, index)
 
-    def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
+    def sources(self, slots: IntArray, side: Side, since: IntArray | int) -> IntArray:
         """Return the report times [ns] of the vehicles that corroborate ice or grip in each slot
         (cell and heading sector), (k, SOURCES), newest first.
 
-        Only vehicles count that are still trusted and reported `side` (GRIP or ICE) after `since`
+        Only vehicles count that are still trusted and reported `side` (grip or ice) after `since`
         [ns]. At most SOURCES vehicles per slot are stored; time 0 means no vehicle.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
 
     def find_sources(
-        self, slots: IntArray, side: int, since: IntArray | int
+        self, slots: IntArray, side: Side, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that corroborate `side` (GRIP or ICE) in the slots (one per cell and
+        """Return the vehicles that corroborate `side` (grip or ice) in the slots (one per cell and
         heading sector), as two arrays (k, SOURCES): index of the vehicle, and time of its report
         [ns]. The time is 0 if the vehicle does not count (see `sources`).
         """

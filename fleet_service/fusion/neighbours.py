@@ -49,11 +49,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import SLIPPERY_SHARE, Bins, forget, unpack_belief
+from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road
 from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
 from fleet_service.fusion.store.table import find_row
-from fleet_service.fusion.votes import PADDED, SCRATCH, P
+from fleet_service.fusion.votes import ScratchRow
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import Float32Array, FloatArray, IntArray
@@ -163,7 +163,7 @@ def road_beliefs(
     parts = MapParts(live, table, weather, rule)
     out = np.empty((len(slots), _BINS))
     buffers = Buffers(
-        np.empty((3, SCRATCH)),
+        np.empty((3, PADDED)),
         np.empty(_BINS),
         np.empty(_BINS),
         np.empty(_BINS),
@@ -171,7 +171,7 @@ def road_beliefs(
     )
     for k in range(len(slots)):
         prior = _age_belief(live, weather, slots[k], now[k], buffers.scratch)
-        buffers.product[:] = buffers.scratch[P, :_BINS]
+        buffers.product[:] = buffers.scratch[ScratchRow.BELIEF, :_BINS]
         buffers.quiet[:] = buffers.product
         read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
         slippery = _slippery_probability(out[k])
@@ -232,7 +232,7 @@ def _choose_message(
         if kept < _ASKED:
             continue
         _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
-        read_road(parts.rule.kernels, cells, row, buffers.scratch[P], buffers.road)
+        read_road(parts.rule.kernels, cells, row, buffers.scratch[ScratchRow.BELIEF], buffers.road)
         slippery = _slippery_probability(buffers.road)
         kept_surface = _KEPT[1 if side == _ACROSS else step]
         weight = kept_surface * (slippery - asked.unknown) / (1.0 - asked.unknown)
@@ -342,10 +342,10 @@ def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins
     `scratch`. Return the row number of the prior that the weather of the cell's region gives.
     """
     cells = live.cells
-    p = scratch[P]
+    p = scratch[ScratchRow.BELIEF]
     unpack_belief(live.belief, slot, p)
     seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
     drift, change, prior = road_time(weather, cells[slot].key, now - int(seconds * NS), now)
     if now > cells[slot].time:
-        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
+        forget(p, drift, change, weather.prior[prior], scratch[ScratchRow.PADDED])
     return int(prior)

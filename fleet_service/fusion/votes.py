@@ -5,6 +5,7 @@ much of a vote is new information, and updates the cell. Compiled.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import (
     BOUND,
+    PADDED,
     REACH,
     SLIPPERY_SHARE,
     VALUE,
@@ -31,14 +33,13 @@ from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade_weights, note_value
 from fleet_service.fusion.store.records import (
     AGED,
     FINE,
-    GRIP,
     HEEDED,
-    ICE,
     NONE,
     SOURCES,
     UNTRUSTED,
     USED,
     Rows,
+    Side,
 )
 from fleet_service.fusion.store.settled import oldest_remembered, returning_bit
 from fleet_service.fusion.weather import Weather, road_time
@@ -48,12 +49,15 @@ from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
-# Rows of the scratch memory (3, SCRATCH), single precision: belief; padded copy for `forget` and
-# `convolve_bias`; likelihood.
-P = 0
-PADDED = 1
-LIKELIHOOD = 2
-SCRATCH: Final = mugrid.BINS + 2 * REACH
+
+class ScratchRow(IntEnum):
+    """Row of the scratch memory (3, PADDED), single precision."""
+
+    BELIEF = 0
+    PADDED = 1  # padded copy for `forget` and `convolve_bias`
+    LIKELIHOOD = 2
+
+
 # A bound is a source of grip if its mean under the uniform prior is at least this, the mean of "μ
 # is at least EXCITED_SHARE". Only dry road allows so much grip to be used. On the best roads values
 # are cut off at the end of the grid and become bounds, so bounds must count.
@@ -73,7 +77,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     report, even if only a part of its likelihood is used.
     """
     evidence = entries[entry].evidence
-    likelihood = scratch[LIKELIHOOD]
+    likelihood = scratch[ScratchRow.LIKELIHOOD]
     known = not math.isnan(reported[0])
     kind = VALUE if known else kind_of(evidence)
     entries[entry].kind = kind
@@ -99,14 +103,16 @@ def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """
     _clear_padding(scratch)
     this = entries[entry]
-    convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
+    convolve_bias(
+        this.evidence, int(this.kind), scratch[ScratchRow.PADDED], scratch[ScratchRow.LIKELIHOOD]
+    )
 
 
 @refcount_free_inlined
 def _clear_padding(scratch: Bins) -> None:
     for i in range(REACH):
-        scratch[PADDED, i] = 0.0
-        scratch[PADDED, SCRATCH - 1 - i] = 0.0
+        scratch[ScratchRow.PADDED, i] = 0.0
+        scratch[ScratchRow.PADDED, PADDED - 1 - i] = 0.0
 
 
 @refcount_free_inlined
@@ -218,7 +224,7 @@ def update(
     time = entries[entry].time
     kind = int(entries[entry].kind)
     key = cells[row].key
-    p = scratch[P]
+    p = scratch[ScratchRow.BELIEF]
     seconds = 0.0
     passed = 0.0
     unpack_belief(belief, row, p)
@@ -237,7 +243,7 @@ def update(
     cells[row].aged = _remembered_parts(seconds)
     if seconds >= c.FORGET_S:
         drift, change, prior = road_time(weather, key, time - int(seconds * NS), time)
-        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
+        forget(p, drift, change, weather.prior[prior], scratch[ScratchRow.PADDED])
         cells[row].aged = np.uint16(0)
     weight = float(entries[entry].weight)
     if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0:
@@ -248,11 +254,13 @@ def update(
     if kind == VALUE:
         apply_vote(
             p,
-            scratch[LIKELIHOOD],
+            scratch[ScratchRow.LIKELIHOOD],
             min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST),
         )
     else:
-        apply_vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
+        apply_vote(
+            p, scratch[ScratchRow.LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
+        )
         if entries[entry].limited == 0:
             noticed = float(cells[row].values) / (float(cells[row].visits) + c.FIRST_VISITS)
             note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
@@ -265,9 +273,9 @@ def update(
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
         if is_ice_source(entries, entry):
-            _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
+            _note_source(rows.reporters, sources, Side.ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
-            _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
+            _note_source(rows.reporters, sources, Side.GRIP, entries[entry].vehicle, time)
 
 
 @refcount_free_inlined
@@ -397,7 +405,7 @@ def _untrusted_weight(
 
 
 @refcount_free
-def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
+def _note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time: int) -> None:
     """Record that a vehicle reported ice or grip (`side`) in a cell at the time `time` [ns]. The
     record replaces the vehicle's earlier one, or else the oldest one in the cell's list.
     """

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion.belief import VALUE, Bins
+from fleet_service.fusion.belief import PADDED, VALUE, Bins
 from fleet_service.fusion.store.cells import copy_row, copy_sources
 from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pair, pair_of
 from fleet_service.fusion.store.records import (
@@ -36,7 +36,6 @@ from fleet_service.fusion.store.settled import guess_row
 from fleet_service.fusion.store.table import AHEAD, first_place
 from fleet_service.fusion.trust import compare_reports, judge_flag
 from fleet_service.fusion.votes import (
-    SCRATCH,
     CellPlace,
     describe_vote,
     discount_vote,
@@ -109,7 +108,7 @@ def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Vote
     n = len(arrivals.time)
     k = len(votes.row)
     marks = Marks(np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.empty(k, np.int32))
-    scratch = np.zeros((3, SCRATCH), np.float32)
+    scratch = np.zeros((3, PADDED), np.float32)
     waiting = _absorb_votes(state, weather, arrivals, votes, marks, scratch)
     _recompute_beliefs(state, weather, marks.stale[:waiting], scratch)
     return marks.left_out
@@ -308,7 +307,7 @@ def commit_windows(
     windows (k,), one after the other. Older observations are moved from the window into the base,
     the cell's final state.
     """
-    scratch = np.zeros((3, SCRATCH), np.float32)
+    scratch = np.zeros((3, PADDED), np.float32)
     _commit_windows(state, weather, vehicles, due_windows, before, scratch)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet_service.fusion.fuse import Fusion
 from fleet_service.fusion.neighbours import stretches
-from fleet_service.fusion.store.records import ICE, NONE, SOURCES
+from fleet_service.fusion.store.records import NONE, SOURCES, Side
 from schemas.numeric import BoolArray, IntArray
 
 
@@ -43,7 +43,9 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
     """
     along = stretch_slots(fusion, slots)
     places = along.shape[1]
-    who, when = fusion.find_sources(np.maximum(along, 0).ravel(), ICE, np.repeat(since, places))
+    who, when = fusion.find_sources(
+        np.maximum(along, 0).ravel(), Side.ICE, np.repeat(since, places)
+    )
     when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places, SOURCES)
     found = when.max(axis=2) > 0
     middle = 1 + places // 2

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
-from fleet_service.fusion.store.records import GRIP, ICE, NONE, SOURCES
+from fleet_service.fusion.store.records import NONE, SOURCES, Side
 from fleet_service.fusion.witnesses import stretch_slots, stretch_sources, witnesses_of
 from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
 from fleet_service.serve.view import LOWER, UPPER, coarse_counts
@@ -144,12 +144,12 @@ class Alerts:
         reports, or it lies between two cells with sources.
         """
         fusion = self._fusion
-        slots = slots[self._own_sources(slots, ICE)[:, 0] > 0]
+        slots = slots[self._own_sources(slots, Side.ICE)[:, 0] > 0]
         near = np.unique(stretch_slots(fusion, slots))
         near = near[near != NONE]
         near = near[~np.isin(near, np.fromiter(self._standing, np.int64, len(self._standing)))]
-        own = self._own_sources(near, ICE)
-        against = self._own_sources(near, GRIP)
+        own = self._own_sources(near, Side.ICE)
+        against = self._own_sources(near, Side.GRIP)
         opposed = against[:, 0] > own[:, 1] - FRESH_NS
         needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
         enough = (own > 0).sum(axis=1) >= needed
@@ -159,7 +159,7 @@ class Alerts:
         accused = (own[:, 0] > 0) & (fusion.slippery(near) > LIKELY)
         return np.asarray(near[enough & (accused | along.around)])
 
-    def _own_sources(self, slots: IntArray, side: int) -> IntArray:
+    def _own_sources(self, slots: IntArray, side: Side) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
         each slot (cell and heading sector), (k, SOURCES). Only reports within the hour before the
         slot's last report count.
@@ -172,8 +172,8 @@ class Alerts:
         reported grip than ice. The map remembers at most SOURCES vehicles per cell and side, so
         SOURCES reports of grip are always enough.
         """
-        grip = (self._own_sources(slots, GRIP) > 0).sum(axis=1)
-        ice = (self._own_sources(slots, ICE) > 0).sum(axis=1)
+        grip = (self._own_sources(slots, Side.GRIP) > 0).sum(axis=1)
+        ice = (self._own_sources(slots, Side.ICE) > 0).sum(axis=1)
         return np.asarray(grip >= np.minimum(ice + 2, SOURCES))
 
     def expire(self, now: int) -> list[Alert]:
@@ -181,7 +181,7 @@ class Alerts:
         less likely than not and no vehicle has confirmed it for QUIET_NS.
         """
         slots = np.array(sorted(self._standing), np.int64)
-        forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0
+        forgotten = self._fusion.sources(slots, Side.ICE, now - QUIET_NS)[:, 0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten
         reason = "no recent visit has confirmed the alert"
         return [self._clear(int(slot), now, reason) for slot in slots[faded]]

@@ -11,6 +11,7 @@ speed stays NaN, and that wheel is assumed to roll freely.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Annotated
 
 from edge_agent.dynamics.loads import wheel_loads
@@ -30,10 +31,13 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# Result of `take_sample_in` for a sample
-REFUSED = 0
-BEGUN = 1
-STEPPED = 2
+
+class SampleUse(IntEnum):
+    """Result of `take_sample_in`: the filter skips a sample, starts at it or advances to it."""
+
+    REFUSED = 0
+    BEGUN = 1
+    STEPPED = 2
 
 
 class InputTrack:
@@ -56,13 +60,13 @@ def take_sample_in(
 ) -> tuple[int, int, float]:
     """Process sample (18,) of a vehicle at `time` [s].
 
-    Return three items: health flags; REFUSED, BEGUN or STEPPED (the filter must skip the sample,
-    start at it or step to it); seconds since the previous sample.
+    Return three items: health flags; the use of the sample (`SampleUse`); seconds
+    since the previous sample.
     """
     begins = not track.started
     dt = time - track.time
     if not math.isfinite(time) or not (begins or dt > 0.0):
-        return flags.TIME_GAP, REFUSED, 0.0
+        return flags.TIME_GAP, SampleUse.REFUSED, 0.0
     silent = not begins and dt > GAP_S
     if begins:
         _reset_track(track)
@@ -75,8 +79,8 @@ def take_sample_in(
     note_excitation(track.excitation, time, _grip_used(track, row))
     if begins or silent:
         _store_inputs(track)
-        return health | flags.RESET | (flags.TIME_GAP if silent else 0), BEGUN, 0.0
-    return health, STEPPED, dt
+        return health | flags.RESET | (flags.TIME_GAP if silent else 0), SampleUse.BEGUN, 0.0
+    return health, SampleUse.STEPPED, dt
 
 
 @compiled

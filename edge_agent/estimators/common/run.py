@@ -14,7 +14,7 @@ from typing import Annotated, TypeVar
 from edge_agent.dynamics.parameters import Parameter, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import Kernel, Part
-from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take_sample_in
+from edge_agent.estimators.common.inputs import InputTrack, SampleUse, take_sample_in
 from edge_agent.estimators.common.motion import sliding_flag
 from edge_agent.estimators.common.output import write_quality, write_unknown
 from edge_agent.estimators.common.tyre_option import TyreOption, fit_tyres
@@ -73,10 +73,10 @@ def kernel_of(
                 output = outputs[k, n]
                 memory.log_likelihood = 0.0
                 health, kind, dt = take_sample_in(memory.track, memory.row, t[k, n], signals[k, n])
-                if kind == STEPPED and not step(memory, context, dt):
+                if kind == SampleUse.STEPPED and not step(memory, context, dt):
                     health = health | flags.RESET
-                    kind = BEGUN
-                if kind == BEGUN:
+                    kind = SampleUse.BEGUN
+                if kind == SampleUse.BEGUN:
                     memory.nis = 0.0
                     memory.log_likelihood = 0.0
                     memory.adaptation = 1.0

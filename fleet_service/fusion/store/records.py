@@ -21,6 +21,7 @@ the number times FINE, rounded. The same holds for USED, SHARED and others.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
@@ -34,9 +35,15 @@ from schemas.runtime.records import RecordArray, record_type
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
-# side of a report: grip or ice
-GRIP = 0
-ICE = 1
+
+
+class Side(IntEnum):
+    """Kind of road that a source (a vehicle with a clear report) supports."""
+
+    GRIP = 0
+    ICE = 1
+
+
 # Number of vehicles remembered per slot that reported grip, and per slot that reported ice. An
 # alert never needs more.
 SOURCES: Final = 5

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.estimators.common.excitation import SLOT_S
-from edge_agent.estimators.common.inputs import BEGUN, STEPPED, take_sample_in
+from edge_agent.estimators.common.inputs import SampleUse, take_sample_in
 from edge_agent.estimators.common.run import PaperMemory, new_filters
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS, S
@@ -29,7 +29,7 @@ def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: f
         time = -1.0 + k * every_s
         sample[S.AY] = 8.0 * rng.random() ** 3 * (0.2 if k > 300 else 1.0)
         _, kind, _ = take_sample_in(memory["track"], memory["row"], time, sample)
-        assert kind == (BEGUN if k == 0 else STEPPED)
+        assert kind == (SampleUse.BEGUN if k == 0 else SampleUse.STEPPED)
         used = sample[S.AY] / GRAVITY
         if time - slots[-1][0] < SLOT_S:
             slots[-1] = (slots[-1][0], max(slots[-1][1], used))

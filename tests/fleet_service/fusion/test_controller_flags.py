@@ -11,7 +11,7 @@ import pytest
 
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.observations import find_limited
-from fleet_service.fusion.store.records import ICE
+from fleet_service.fusion.store.records import Side
 from fleet_service.serve.alerts import Alerts
 from schemas.numeric import BoolArray, FloatArray
 from tests.fleet_service.examples import CELL, at_least, belief, observations, value
@@ -72,7 +72,7 @@ def test_flags_alone_raise_no_alert_and_move_no_belief() -> None:
         o = observations(10.0 * who, who, at_least(np.full(8, 0.1)))
         updated = fusion.update(flags(o, np.full(8, limited), np.full(8, 0.1)))
         assert not Alerts(fusion).update(updated.slots)
-        assert (fusion.sources(updated.slots, ICE, 0) > 0).any() == limited
+        assert (fusion.sources(updated.slots, Side.ICE, 0) > 0).any() == limited
         beliefs.append(belief(fusion))
     assert np.array_equal(beliefs[0], beliefs[1])
 
@@ -81,7 +81,7 @@ def test_value_of_grip_is_not_overruled_by_its_own_flag() -> None:
     fusion = Fusion(120.0)
     o = observations(np.zeros(1), np.zeros(1, np.int64), value(np.array([0.8]), 0.04))
     updated = fusion.update(flags(o, np.array([True]), np.array([0.2])))
-    assert not (fusion.sources(updated.slots, ICE, 0) > 0).any()
+    assert not (fusion.sources(updated.slots, Side.ICE, 0) > 0).any()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.store import store
 from fleet_service.fusion.store.growth import settle_pairs
-from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
+from fleet_service.fusion.store.records import NONE, PAIRS, REPORTERS_USED, VEHICLE, Side
 from fleet_service.fusion.store.table import PAIRS_MOST, fill_table, rows_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
@@ -57,7 +57,7 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
     cells = CELL + np.arange(40)
     fusion.update(observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells))
     slots = fusion.slots_of(cells, np.zeros(40, np.int64))
-    assert (fusion.sources(slots, ICE, START - 1) > 0).sum(axis=1).tolist() == [1] * 40
+    assert (fusion.sources(slots, Side.ICE, START - 1) > 0).sum(axis=1).tolist() == [1] * 40
     fusion.update(observations([4 * HOUR], [1], value([0.8]), CELL))
     # Only the reporter in the time window has a record.
     assert fusion.store.state.used[REPORTERS_USED] == 1
@@ -66,8 +66,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
         observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7)
     )
     assert fusion.store.state.used[REPORTERS_USED] == 2
-    assert (fusion.sources(slots[7:8], GRIP, START - 1) > 0).sum() == 2
-    assert (fusion.sources(slots[8:9], GRIP, START - 1) > 0).sum() == 0
+    assert (fusion.sources(slots[7:8], Side.GRIP, START - 1) > 0).sum() == 2
+    assert (fusion.sources(slots[8:9], Side.GRIP, START - 1) > 0).sum() == 0
     assert not np.allclose(belief(fusion, CELL + 7), before)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from fleet_service.fusion import Fusion, shared
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.store.records import ICE
+from fleet_service.fusion.store.records import Side
 from fleet_service.fusion.trust import shape_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
@@ -151,4 +151,4 @@ def count_witnesses(mu: float, used: float, tail: float) -> int:
     o = observations([0.0], [1], tailed)
     fusion.update(dataclasses.replace(o, used=np.array([used], np.float32)))
     slot = fusion.slots_of(o.cell, o.sector)
-    return int((fusion.sources(slot, ICE, 0)[0] > 0).sum())
+    return int((fusion.sources(slot, Side.ICE, 0)[0] > 0).sum())

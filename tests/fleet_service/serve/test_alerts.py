@@ -9,7 +9,7 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
-from fleet_service.fusion.store.records import ICE
+from fleet_service.fusion.store.records import Side
 from fleet_service.serve.alerts import LIKELY, RAISE_ABOVE, Alerts
 from schemas import grid
 from tests.fleet_service.examples import (
@@ -237,14 +237,14 @@ def test_one_vehicle_along_a_stretch_raises_no_alert() -> None:
 def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
     fusion, _ = report_in_turn(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
-    assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
+    assert (fusion.sources(slot, Side.ICE, 0) > 0).sum() == 4
     rng = np.random.default_rng(3)
     for cell in range(40):  # elsewhere the first two vehicles report ice as dry
         who = rng.permutation(12)
         mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
         fusion.update(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))
     assert fusion.trust(0) < 0.5 < fusion.trust(2)
-    assert (fusion.sources(slot, ICE, 0) > 0).sum() == 2
+    assert (fusion.sources(slot, Side.ICE, 0) > 0).sum() == 2
 
 
 def test_an_alert_ends_only_when_grip_is_sure() -> None:
