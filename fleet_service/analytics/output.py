@@ -33,8 +33,8 @@ TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
 def format_text(table: pa.Table, question: Question) -> str:
-    """Return the first rows of an answer, in the question's order, as a text table for the
-    terminal.
+    """Return the first rows of an answer, in the order that the question defines, as a text table
+    for the terminal.
     """
     shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
     names = [
@@ -62,8 +62,8 @@ def format_text(table: pa.Table, question: Question) -> str:
 
 
 def format_json_lines(table: pa.Table, question: Question) -> str:
-    """Return all rows of an answer, in the question's order, as lines of JSON; times are ISO 8601,
-    UTC.
+    """Return all rows of an answer, in the order that the question defines, as lines of JSON; times
+    are ISO 8601, UTC.
     """
     return "\n".join(
         json.dumps({name: _json_value(name, v) for name, v in row.items()}, allow_nan=False)

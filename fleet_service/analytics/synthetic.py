@@ -181,8 +181,8 @@ def _draw_positions(
 
 
 def night_factor(seconds: FloatArray) -> FloatArray:
-    """Return a factor for each time `seconds` (n,): 1 at four in the morning, falling to 0 at ten
-    in the evening and at ten in the morning, and 0 by day.
+    """Return the degree of night cold at each time `seconds` (n,), from 0 to 1: 1 at four in the
+    morning, falling to 0 at ten in the evening and at ten in the morning, and 0 by day.
     """
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 

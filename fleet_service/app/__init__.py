@@ -1,5 +1,5 @@
-"""The running service: engine (service without its network), Zenoh sessions, background jobs,
-metrics.
+"""The running service: engine (the parts of the service without its network), Zenoh sessions,
+background jobs, metrics.
 """
 
 from typing import Final

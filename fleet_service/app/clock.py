@@ -30,11 +30,11 @@ class TimeNow(NamedTuple):
     """Time of the service and how certain it is; all values in ns.
 
     Attributes:
-        now: the time.
+        now: time of the service.
         slack: how much later than `now` the time of a report may be, because the archive already
             contains reports with such times.
-        doubt: how much later than `now` + `slack` it may be without rejection. Such a report is
-            ignored for now; its sender repeats it.
+        doubt: how much later than `now` + `slack` the time of a report may be without rejection.
+            Such a report is ignored for now; its sender repeats it.
         least: lower bound of the true time.
         sure: True if active alerts may end only because time has passed; False while the clock may
             be wrong.
@@ -51,7 +51,8 @@ class SteadyClock:
     """Clock of the service [ns UTC], which follows no jumps of the wall clock.
 
     Args:
-        seen: latest time of a report before this start; 0 if there was none.
+        seen: latest time in a report that the archive contained at this start of the service; 0 if
+            there was none.
         wall, steady: functions that return the system's clocks [ns]; `steady` never jumps, and its
             zero is arbitrary.
     """
@@ -75,8 +76,8 @@ class SteadyClock:
         self._votes: dict[str, bool] = {}
 
     def now(self) -> int:
-        """Return the service's time [ns UTC]. It follows small forward steps of the wall clock at
-        once, and larger steps only when reports confirm them.
+        """Return the service's time [ns UTC]. This time follows small forward steps of the wall
+        clock at once, and larger steps only when reports confirm them.
         """
         even = self._zero + self._steady()
         wall = self._wall()

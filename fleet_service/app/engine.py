@@ -1,9 +1,9 @@
-"""Core of the service without its network. Inputs are messages; outputs are alerts, map tiles,
-acknowledgements, and answers to queries.
+"""Core of the service without its network. Its inputs are messages from vehicles. Its outputs are
+alerts, map tiles, acknowledgements, and answers to queries.
 
-The parts share one state (`app.state`). One worker thread uses `intake`, `settlement` and `alerts`.
-Other threads read the map with `queries`, or let the worker do something with
-`run_between_segments`.
+The parts of the service share one state (`app.state`). One worker thread uses `intake`,
+`settlement` and `alerts`. Other threads read the map with `queries`, or let the worker run a
+function with `run_between_segments`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Engine:
     Args:
         config: settings.
         root: folder of the archive; it is locked while the engine is open.
-        holding: ownership of the archive, which is closed with the engine; None to open the archive
-            now, without a lease (ownership limited in time).
+        holding: ownership of the archive, which the engine releases when it is closed; None to open
+            the archive now, without a lease (ownership limited in time).
 
     Raises:
         InputError: another service has the archive.
@@ -92,15 +92,15 @@ class Engine:
 
     @property
     def state(self) -> ServiceState:
-        """Return the current state of the service: map, alerts and admitted batches (messages with
-        records).
+        """Return the current state of the service: map, alerts, and record of the admitted batches
+        (messages with records).
         """
         return self._shared.state
 
     def reload_state(self, before: Callable[[], None]) -> None:
-        """Call `before`, which may change the archive. Then load map, alerts and admitted batches
-        from the archive again, and use them as the state. Use this only in a function that
-        `run_between_segments` calls.
+        """Call the function `before`, which may change the archive. Then load the map, the alerts
+        and the record of admitted batches from the archive again, and use them as the state. Use
+        this only in a function that `run_between_segments` calls.
 
         Raises:
             OSError: the archive cannot be read; the state stays unchanged.
@@ -115,16 +115,16 @@ class Engine:
 
     def drop_old(self) -> int:
         """Drop old cells whose belief has returned to the prior (the belief before any
-        measurement); return their number. Use this only in a function that `run_between_segments`
-        calls.
+        measurement); return the number of dropped cells. Use this only in a function that
+        `run_between_segments` calls.
         """
         with self._shared.guard:
             return self.state.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
         """Return the content of a checkpoint (for a fast restart): a copy of the state, and the
-        name of the last segment (file of new rows) that it includes. Return None if `stop` is set
-        meanwhile.
+        name of the last segment (file of new rows) that it includes. Return None if the event
+        `stop` is set before the copy is made.
 
         Another thread calls this. The worker (the thread that processes messages) makes the copy
         directly after a segment was written, when all rows in the state are on disk.
@@ -142,7 +142,7 @@ class Engine:
         checkpoints.mark_survived(self._root)
 
     def close(self) -> None:
-        """Close all parts of the service and release the archive."""
+        """Stop all parts of the service and release the archive."""
         self.queries.close()
         self.mark_survived()
         self.settlement.close()

@@ -69,9 +69,9 @@ def handle_requests(
 
 
 def _erase_in_copy(copy: BucketReplica) -> str | None:
-    """Remove the erased data from the archive's copy in a bucket (object store) too. Return None,
-    or the reason why the copy still contains some of the data; a background job then removes them
-    later.
+    """Remove the erased data from the archive's copy in a bucket (object store) too. Return None on
+    success, else the reason why the copy still contains some of the data; a background job then
+    removes them later.
     """
     try:
         copy.sync()
@@ -87,7 +87,7 @@ def _run_erasure(
     the end.
 
     Raises:
-        InputError: there is no such month, or a file is damaged.
+        InputError: the archive has no key for the month of the request, or a file is damaged.
         OSError: a file cannot be read or written; the erasure is tried again later.
     """
     key_of(root, wanted.month)
@@ -123,8 +123,9 @@ def _run_erasure(
 def _reload_service(
     engine: Engine, before: Callable[[], None], stop: threading.Event
 ) -> bool | None:
-    """Call `before`, then load the service's state again. This happens between two segments (files
-    of new rows), so all accepted rows are on disk. Return True, or None if the service stops first.
+    """Call the function `before`, which changes the archive, then load the service's state again.
+    This happens between two segments (files of new rows), so all accepted rows are on disk. Return
+    True, or None if the service stops first.
     """
 
     def work() -> bool:
@@ -138,7 +139,7 @@ def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     """Carry out the part of an erasure that runs in the separate process; return its result.
 
     Raises:
-        InputError, OSError: as for `retention.forget_vehicle`.
+        InputError, OSError: a file is damaged, or cannot be read or written.
     """
     # A file that arrives after this call is read twice, which does not change the result.
     known = weather.weather_files(root)

@@ -63,8 +63,8 @@ class PastQuery(NamedTuple):
 
 
 class HistoricalMaps:
-    """Answers to queries about past maps. They are computed in a separate process. Starting it
-    takes a second, so an idle process is kept for IDLE_S.
+    """Answers to queries about past maps. They are computed in a separate process. Starting a
+    process takes a second, so an idle one is kept for IDLE_S [s].
 
     Args:
         root: folder of the archive.

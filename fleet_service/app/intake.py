@@ -46,7 +46,7 @@ class Intake:
 
     Attributes:
         acks: acknowledgements to send.
-        batches: admission of batches; replaced by `reset`.
+        batches: admission of batches (messages with records); `reset` replaces it.
         now: time of the last `ingest` [ns].
         report_lag_s: shortest time [s], among the rows of the last `ingest`, from the end of a
             visit (a vehicle's passage through a cell) to the arrival of its report.
@@ -77,8 +77,8 @@ class Intake:
             )
 
     def reset(self) -> None:
-        """Continue the intake with a replaced state of the service. The recorded paths of vehicles
-        and their limits on new cells belong to the old state and are discarded.
+        """Continue the intake with a newly loaded state of the service. The recorded paths of
+        vehicles and their limits on new cells belong to the old state and are discarded.
         """
         self._paths = VehiclePaths()
         self._places = NewCells()
@@ -88,7 +88,8 @@ class Intake:
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
         """Check messages, and update the map with the admitted messages; return the alerts that are
-        raised or cleared. `at` is the time; a plain number [ns] is taken as certain.
+        raised or cleared. `at` is the service's time with its bounds; a plain number [ns] means a
+        time without uncertainty.
         """
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         ahead = int(self._config.clock_ahead_s * NS) + at.slack

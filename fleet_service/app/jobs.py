@@ -49,8 +49,8 @@ _NICE: Final = 10  # scheduling priority of the jobs' thread: lower than that of
 
 
 class Job(NamedTuple):
-    """Job that is repeated every `every_s` seconds; 0 means never. `work` does the job once and
-    returns a line for the operator, or None.
+    """Background job that is repeated every `every_s` seconds; 0 means never. The function `work`
+    does the job once and returns a line for the operator, or None.
     """
 
     name: str
@@ -114,8 +114,8 @@ def archive_jobs(
     def with_disk_space(
         work: Callable[[threading.Event], str | None],
     ) -> Callable[[threading.Event], str | None]:
-        """Return a function that runs `work`. If the disk is full, it releases the reserved disk
-        space and runs `work` again.
+        """Return a function that runs the background job `work`. If the disk is full, it releases
+        the reserved disk space and runs `work` again.
         """
 
         def run_job(stop: threading.Event) -> str | None:

@@ -55,7 +55,8 @@ class Pulse(NamedTuple):
         queued: number of messages that wait.
         routers: number of connected routers.
         clock_lag_s: how far the wall clock is behind the service's time [s].
-        answer_s: time for which the current tile of an answer has been in progress [s].
+        answer_s: time since the service began to compute the current tile of an expensive answer
+            [s].
     """
 
     turn_age_s: float

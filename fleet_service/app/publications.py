@@ -32,5 +32,7 @@ def publish_tile(session: zenoh.Session, tile: int, stream: bytes) -> None:
 
 
 def _publish_message(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
-    """Publish a message with the quality of service of its key's topic."""
+    """Publish a message with the quality of service (such as priority) that is defined for the
+    topic of its key.
+    """
     session.put(key, payload, encoding=encoding, **zenoh_session.quality_of(keys.parse(key).topic))

@@ -53,8 +53,8 @@ class Queries:
         return state.map.take_dirty()
 
     def whole_map(self, now: int) -> pa.Table:
-        """Return all cells that readers may see, as a table. The lock is held for a few cells at a
-        time, so that ingest continues.
+        """Return all cells that readers may see, as a table. The lock of the map is held for a few
+        cells at a time, so that ingest continues.
         """
         tables = []
         shared = self._shared
@@ -69,7 +69,8 @@ class Queries:
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
         """Yield the tile number and the payload of every reply to a query, computed on demand.
-        `serve.query.answer_query` explains the parameters.
+        `wanted` returns True for tiles that match the query's key, and `only` is the tile if the
+        key names exactly one. `now` is the service's time [ns].
 
         Raises:
             InputError: the route is too long, the time is in the future, or the archive cannot be
@@ -88,9 +89,9 @@ class Queries:
     def measure_answer(
         self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
     ) -> AnswerSize:
-        """Return an upper bound of an answer's size, as number of cells and number of tiles.
-        `wanted` returns True for tiles that match the query's key, and `only` is the tile if the
-        key names exactly one.
+        """Return an upper bound of the size of the answer to a query, as number of cells and number
+        of tiles. `wanted` returns True for tiles that match the query's key, and `only` is the tile
+        if the key names exactly one.
         """
         return size_asked(self._shared.tiles, query, wanted, only)
 

@@ -289,8 +289,8 @@ class Service:
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
-    """Let the engine (service without network) process messages now, and pass their times to the
-    clock; return the alerts that are raised or cleared.
+    """Let the engine (service without network) process messages now, and pass the times in the
+    reports to the clock; return the alerts that are raised or cleared.
     """
     alerts = engine.intake.ingest(messages, clock.moment())
     clock.record_reports(engine.intake.times)

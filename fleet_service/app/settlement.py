@@ -85,9 +85,9 @@ class Settlement:
         return self._log.hangs_s
 
     def until_early_s(self, now_s: float) -> float:
-        """Return the time [s] until the waiting rows should be written early, that is, before the
-        regular period ends; `now_s` is the monotonic time [s]. Infinite if no rows wait, if a write
-        is running, or if the last write failed.
+        """Return the time [s] until the waiting rows should be written to disk early, that is,
+        before the regular period ends; `now_s` is the monotonic time [s]. Infinite if no rows wait,
+        if a write is running, or if the last write failed.
         """
         if self.failing or not self._log.can_begin:
             return math.inf
@@ -97,14 +97,14 @@ class Settlement:
         )
 
     def call_when_written(self, wake: Callable[[], None]) -> None:
-        """Call `wake`, in another thread, whenever the writing of a segment (file of new rows) has
-        ended.
+        """Register the function `wake`. Another thread calls it whenever the writing of a segment
+        (file of new rows) has ended.
         """
         self._log.on_written = wake
 
     @property
     def newest_segment(self) -> Cut:
-        """Return the position of the last written segment (file of new rows)."""
+        """Return the position (epoch and number) of the last written segment (file of new rows)."""
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:

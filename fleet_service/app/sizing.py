@@ -161,7 +161,9 @@ def cells_of_roads(road_km: float, latitude: float) -> float:
 
 
 def split_memory(content: MemoryContent, costs: Costs = COSTS) -> dict[str, float]:
-    """Return the memory [bytes] for each part of a service's content, without the empty process."""
+    """Return the memory [bytes] for each part of a service's content, without the memory of a
+    process that has no data.
+    """
     return {
         "vehicles": content.vehicles * costs.vehicle_bytes,
         "cells": content.cells * costs.cell_bytes,

@@ -73,8 +73,8 @@ class StandingAlerts:
         return out
 
     def end_erased(self, before: Iterable[Alert]) -> None:
-        """End the alerts that were active before an erasure (`before`) and no longer are. The
-        caller must hold the lock of the shared state.
+        """End the alerts in `before`, the alerts that were active before an erasure, if they are no
+        longer active. The caller must hold the lock of the shared state.
         """
         still = {(alert.cell, alert.sector) for alert in self.all}
         ended = [alert for alert in before if (alert.cell, alert.sector) not in still]

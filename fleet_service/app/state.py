@@ -56,7 +56,7 @@ class ServiceState(NamedTuple):
     Attributes:
         fusion, map, alerts: beliefs about the friction of all cells; the map and the active alerts
             made from them.
-        streams: record of the batches that were admitted.
+        streams: record of the batches (messages with records) that were admitted.
         weather: all weather reports used.
         refused: number of checkpoints (saved states) that could not be loaded.
         public: cells that readers may see; None if they may see all cells.

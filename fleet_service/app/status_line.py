@@ -30,7 +30,9 @@ class StatusLine:
         self._reported = 0
 
     def is_due(self, now: float) -> bool:
-        """Return True if the last line is STATUS_S old; `now` is the monotonic time [s]."""
+        """Return True if the last status line is at least STATUS_S [s] old; `now` is the monotonic
+        time [s].
+        """
         return now - self._reported_at >= STATUS_S
 
     def write_line(self, now: float) -> None:

@@ -89,11 +89,12 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
 
 
 def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
-    """Erase the data, in the archive's copy too. If a service is running on the archive, let the
-    service do this.
+    """Erase the requested data in the archive and in its copy. If a service is running on the
+    archive, let the service do this.
 
     Raises:
-        InputError: there is no such month, a file is damaged, or the copy cannot be reached.
+        InputError: the archive has no key for the month, a file is damaged, or the copy cannot be
+            reached.
         OSError: a file cannot be read or written.
     """
     from fleet_service.archive.format.files import is_served

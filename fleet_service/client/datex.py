@@ -264,9 +264,9 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the id of that situation (hazard) of the previous publication which has a cell in
-    common with the stretch of road of `alert`; None if there is none. Cells are compared instead of
-    names, because a client gives the same stretch another name after a restart.
+    """Return the id of the situation (hazard) in the previous publication that has a cell in common
+    with the stretch of road of `alert`; None if there is none. Cells are compared instead of names,
+    because a client gives the same stretch another name after a restart.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

@@ -33,7 +33,7 @@ class DatexFile:
     Args:
         supplier: supplier of the publication.
         path: path of the file.
-        say: called with a line of text when the content changes.
+        say: called with a line of text for the operator when the content changes.
 
     Raises:
         InputError: the file has other content.

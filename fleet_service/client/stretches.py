@@ -112,7 +112,8 @@ class Stretches:
 
     def replace_alerts(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
         """Replace the active alerts with the alerts in `standing`. Alerts that are not in it end
-        only if `is_heard` says that a service answers for their place.
+        only if the function `is_heard` returns True for their place, that is, if a service answers
+        for it.
         """
         present = {(alert.cell, alert.sector): alert for alert in standing}
         self._standing = {

@@ -209,8 +209,8 @@ class Webhook:
 
     def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
         """Send the oldest alert message of the queue to the webhook's receiver. Return None if the
-        queue is empty, "" if the message was delivered or refused for good, else the reason of the
-        failure.
+        queue is empty, "" if the receiver accepted the message or refused it for good, else the
+        reason of the failure.
         """
         try:
             first = self._queue.read_first()

@@ -20,8 +20,8 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """Acknowledgements that have not been sent yet, by stream (batches of one vehicle, start, kind
-    and region).
+    """Collected acknowledgements that have not been sent yet, grouped by stream (batches of one
+    vehicle, start, kind and region).
     """
 
     def __init__(self) -> None:
@@ -41,8 +41,8 @@ class Acks:
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
         """Record that batches (messages with records) arrived too late for the map to use them in
-        order of time. The acknowledgement that the batches are durable tells their sender about
-        this.
+        order of time. Their senders learn this from the acknowledgement which states that the
+        batches are durable.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)

@@ -39,8 +39,9 @@ from schemas.wire.batches import (
 
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
-    """Decode messages with batches of one kind (observations or states), given as pairs of payload
-    and encoding.
+    """Return the columns of all messages with batches of one kind (observations or states), decoded
+    together, and the errors of undecodable messages. Each message is given as a pair of payload and
+    encoding.
     """
     errors: list[tuple[int, WireError]] = []
     usual = {ENCODING[kind], *PLAIN}

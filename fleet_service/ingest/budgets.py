@@ -1,5 +1,5 @@
-"""Limits per vehicle in addition to the byte rate: number of new cells and number of streams
-(batches of one vehicle, start, kind and region). Pure except for the counts.
+"""Limits per vehicle, in addition to the limit on its bytes per second: number of new cells, and
+number of streams (batches of one vehicle, start, kind and region). Pure except for the counts.
 
 A row beyond its vehicle's limit is archived and acknowledged like any other, but does not reach the
 map. So no data are lost and nothing is sent again, but a single car cannot fill the service's

@@ -77,8 +77,8 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Record sequence numbers of accepted batches (messages with records) of this stream
-        (vehicle, start, kind, region), given in ascending order.
+        """Mark sequence numbers of batches (messages with records) of this stream (vehicle, start,
+        kind, region), given in ascending order, as accepted.
         """
         # the most frequent case: consecutive numbers
         if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:

@@ -204,7 +204,8 @@ class BatchIntake:
         """Return the permanent number by which the map knows a sender.
 
         Raises:
-            OSError: the key can neither be read nor written.
+            OSError: the file that contains the secret key of these numbers can neither be read nor
+                written.
         """
         return self._witnesses.number_of(name)
 
@@ -333,8 +334,9 @@ class BatchIntake:
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
         """Return the stream (record of accepted batches) of a (vehicle, start, region, day). Return
-        None if a key cannot be read, or if the vehicle opens too many streams. The vehicle then
-        keeps its batch until the disk works again, or until the next hour.
+        None if the key for the vehicle's pseudonym cannot be read, or if the vehicle opens too many
+        streams. The vehicle then keeps its batch until the disk works again, or until the next
+        hour.
         """
         vehicle, boot, region, _ = name
         try:
@@ -432,8 +434,8 @@ class BatchIntake:
 
 
 def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
-    """Return the newest time of each batch (k,) [ns], rounded as in the archive, so that a restart
-    computes the same times.
+    """Return the time of the newest record of each batch (k,) [ns], rounded as in the archive, so
+    that a restart computes the same times.
     """
     newest = np.maximum.reduceat(time, np.cumsum(sizes) - sizes)
     return np.asarray(newest // US_STEP * US_STEP)

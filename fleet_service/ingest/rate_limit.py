@@ -30,7 +30,7 @@ class RateLimiter:
         rate: long-term rate of a vehicle [bytes/s].
         burst: amount that a vehicle may send at once [bytes].
         known: enrolled names; None to accept any name.
-        counts: counters; `limited` and `refused.unknown` are used.
+        counts: counters; `limited` and `refused.unknown` are increased.
         clock: function that returns the time [s].
     """
 
@@ -77,8 +77,9 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop the token buckets (allowances) that are full (vehicles that have not sent recently),
-        at most once per refill time. Return True if there is room for another bucket.
+        """Drop the token buckets (allowances) that are full, that is, those of vehicles that have
+        not sent recently, at most once per refill time. Return True if there is room for another
+        bucket.
         """
         rate = self._rate
         burst = self._burst

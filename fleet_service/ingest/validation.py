@@ -67,11 +67,12 @@ class Clock(NamedTuple):
     all in ns.
 
     Attributes:
-        now: the time.
+        now: time of the service.
         ahead: how much later than `now` the time of an accepted record may be.
-        oldest: how much earlier than `now` (or `least`, if that is earlier) it may be.
-        doubt: how much later than `now` + `ahead` it may be without refusal. Such a record is
-            neither accepted nor refused; its sender repeats it.
+        oldest: how much earlier than `now` (or `least`, if that is earlier) the time of an accepted
+            record may be.
+        doubt: how much later than `now` + `ahead` the time of a record may be without refusal. Such
+            a record is neither accepted nor refused; its sender repeats it.
         least: lower bound of the true time; None if it is `now`.
     """
 

@@ -59,7 +59,7 @@ class WeatherMessage(NamedTuple):
 
 
 class WeatherInbox:
-    """Input of weather reports for one fusion (beliefs about all cells).
+    """Receiver of weather reports for one fusion (beliefs about all cells).
 
     Args:
         root: folder of the archive.

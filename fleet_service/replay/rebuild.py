@@ -133,7 +133,7 @@ class Since(NamedTuple):
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of the batches before the start; they are left out, because a compacted
+        known: record of the batches before the start. Their rows are left out, because a compacted
             (sorted) file may also contain older batches.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
@@ -178,7 +178,9 @@ Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Return a context that does nothing; it is the default listener of a replay."""
+    """Return a context that does nothing; a replay uses this function if its caller follows no
+    observations.
+    """
     return nullcontext()
 
 
@@ -289,8 +291,8 @@ def replay(
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
-    """Return lateness (True if late) and vote weight (trust in the vehicle) of archived rows, as
-    the service recorded them when it first processed these rows.
+    """Return two arrays (n,) for archived rows: lateness (True if late) and vote weight (trust in
+    the vehicle), as the service recorded them when it first processed these rows.
     """
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 

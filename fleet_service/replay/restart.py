@@ -31,10 +31,10 @@ class Restart(NamedTuple):
     """Initial state of a service, from a checkpoint.
 
     Attributes:
-        fusion: fusion of the checkpoint, or a new one.
+        fusion: fusion (beliefs about all cells) of the checkpoint, or a new one.
         streams: record of the batches (messages with records) that were accepted when the
             checkpoint was taken.
-        standing: alerts that were active when the checkpoint was taken.
+        standing: alerts that were active ("standing") when the checkpoint was taken.
         cut: position of the last segment (file of new rows) that is included; None without a
             checkpoint.
         weather: names of the weather files that are included.

@@ -31,8 +31,8 @@ _TEXT: Final = 160  # longest error text [characters]; the server's XML may cont
 
 
 class CopyError(OSError):
-    """Error of the bucket (object store): it does not accept or return an object. The request may
-    be repeated.
+    """Error of the bucket (object store): the bucket does not accept or return an object. The
+    caller may repeat the request.
     """
 
 

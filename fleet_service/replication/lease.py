@@ -144,7 +144,8 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """Lease of one archive's copy: `wait` for it, then call `start_renewal`, and finally `release`.
+    """Lease (ownership limited in time) of one archive's copy: `wait` for it, then call
+    `start_renewal`, and finally `release`.
 
     Args:
         holder: identity of this folder, see `holder_of`. This process has locked the folder, so no
@@ -440,7 +441,7 @@ def forget_holder(root: Path) -> None:
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
     """Raise InputError if the lease's live holder (record `found`) uses another lease time than
-    `lease_s` [s]: it could then still acknowledge data after a take-over.
+    `lease_s` [s]: such a holder could still acknowledge data after a take-over.
     """
     if found.lease_s not in (0.0, lease_s):
         problem = (

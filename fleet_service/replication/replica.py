@@ -2,10 +2,10 @@
 
 Files on which an acknowledgement depends are segments (files of new rows), keys and vehicle
 identities. They are uploaded before the acknowledgement (`upload_segments`). All other files follow
-later (`sync`). Uploads come first and deletions last, so that the copy contains every row at least
-once at any time. At start (`sync_without_lease`), files that only the bucket has are downloaded
-(all files, if the disk is empty), and files that only the folder has are uploaded. An object is
-deleted only if the upload journal (list of own uploads) contains it.
+later (`sync`). Uploads come first and deletions last, so that the bucket contains every row at
+least once at any time. At start (`sync_without_lease`), files that only the bucket has are
+downloaded (all files, if the disk is empty), and files that only the folder has are uploaded. An
+object is deleted only if the upload journal (list of own uploads) contains it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _AT_ONCE: Final = 8  # number of concurrent requests
 
 
 class BucketReplica:
-    """Copy of one archive; call `upload_segments` from one thread and `sync` from another.
+    """Copy of one archive in a bucket (object store); call `upload_segments` from one thread and
+    `sync` from another.
 
     Args:
         root: folder of the archive.
@@ -139,8 +140,8 @@ class BucketReplica:
         self._transfer.download_missing(self.bucket.list_valid())
 
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
-        """Remove the files that differ from the valid objects `there` (names and sizes), and the
-        entries in the journal (list of uploaded files) of files that do not exist.
+        """Remove the archive's files that differ from the valid objects `there` (names and sizes),
+        and the entries in the journal (list of uploaded files) of files that do not exist.
         """
         for name, stamp in self._files.list_files().items():
             if there.get(name) != stamp.size:
@@ -259,7 +260,9 @@ def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
     and synchronise it with the folder `root`; return None if the configuration names no replica.
 
     Raises:
-        InputError, OSError: as for `BucketReplica` and its `sync_without_lease`.
+        InputError: the address or an option cannot be used, or the bucket cannot be reached or
+            belongs to another service.
+        OSError: the folder or the journal (list of uploaded files) cannot be read or written.
     """
     wanted = config.archive
     if wanted.second is None:

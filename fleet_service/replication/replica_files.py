@@ -1,4 +1,4 @@
-"""Names and paths of those files of an archive that belong into its bucket replica."""
+"""Names and paths of those files of an archive that are copied to its bucket replica."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _PRIVATE: Final = ("tried",)  # files that concern only this disk and are not up
 
 
 class ReplicaFiles:
-    """Files below the folder `root` of an archive that belong into its replica. Objects in the
-    bucket have the names of the files, relative to the folder.
+    """Files below the folder `root` of an archive that are copied to its bucket replica. Objects in
+    the bucket have the names of the files, relative to the folder.
     """
 
     def __init__(self, root: Path) -> None:
@@ -52,8 +52,8 @@ class ReplicaFiles:
         return self.root / f"{name}{BAD}"
 
     def list_files(self, folders: Iterable[str] = FOLDERS) -> dict[str, Stamp]:
-        """Return names and stamps (size and time) of the archive's files, in the order of the
-        folders.
+        """Return name and stamp (size and time of the last write) of each file that is copied to
+        the bucket, in the order of the folders.
         """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self.root / one).rglob("*")))
@@ -67,8 +67,8 @@ class ReplicaFiles:
 
 
 def is_copied(name: str) -> bool:
-    """Return True if a file of this name belongs into the archive's copy; drafts and damaged files
-    do not.
+    """Return True if a file of this name is copied to the archive's bucket replica; unfinished,
+    damaged and private files are not.
     """
     folder, *rest = name.split("/")
     hidden = any(part.startswith(".") for part in rest)

@@ -1,4 +1,4 @@
-"""Pauses between failing uploads of data on which acknowledgements depend."""
+"""Pauses between repeated uploads to a bucket (object store) that fail."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """Journal of uploads: records which files of an archive are in its bucket copy, with their size and
 time at the upload.
 
-    ARCHIVE/copied      {"copy": URL}, then a line for each put, [name, bytes, time], and for each
-                        delete, [name]
+    ARCHIVE/copied      {"copy": URL}, then a line for each uploaded file, [name, bytes, time], and
+                        for each deleted file, [name]
 
-A lost line is harmless: a file is uploaded once more, or a file that was deleted locally is
-downloaded and deleted again. No file is deleted because of a lost line.
+A line that is lost in a power failure is harmless: a file is uploaded once more, or a file that was
+deleted locally is downloaded and deleted again. No file is deleted because of a lost line.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def stamp_of(path: Path) -> Stamp:
 
 
 class UploadJournal:
-    """Upload journal (list of uploaded files) of one archive and one copy; an existing journal
-    about another copy is ignored.
+    """Upload journal (list of uploaded files) of one archive and its bucket copy at `url`. A
+    journal that the archive has for another copy is replaced by an empty one.
 
     Args:
         root: folder of the archive.
-        url: URL of the copy.
+        url: URL of the bucket copy.
 
     Raises:
         OSError: the journal can neither be read nor written.
@@ -70,7 +70,7 @@ class UploadJournal:
 
     def copy_stamps(self) -> dict[str, Stamp]:
         """Return the stamp (size and time) at the upload of each file in the archive's copy, by
-        name. The result does not change with later uploads.
+        name. Later uploads do not change the returned dictionary.
         """
         with self._guard:
             return dict(self._stamps)
@@ -103,7 +103,9 @@ class UploadJournal:
 
 
 def last_copy_url(root: Path) -> str | None:
-    """Return the URL of the last copy of an archive; None if it had none."""
+    """Return the URL of the bucket to which an archive was last copied; None if there is no
+    readable upload journal.
+    """
     with suppress(OSError, ValueError, KeyError, TypeError), (root / NAME).open() as file:
         return str(json.loads(file.readline())["copy"])
     return None

@@ -55,8 +55,8 @@ class Alerts:
 
     Args:
         fusion: owner of the cells, that is, the beliefs about the friction of all cells.
-        idle_roads: limit on alerts on roads where no vehicle drives except those that report the
-            ice; None for no limit, in simulations.
+        idle_roads: rule that limits in how many places a vehicle may support alerts on roads
+            without other traffic; None for no limit, in simulations.
         is_private: True if times and numbers of vehicles are rounded for privacy.
     """
 
@@ -79,7 +79,7 @@ class Alerts:
         return list(self._standing.values())
 
     def resume(self, standing: Sequence[Alert]) -> None:
-        """Continue with alerts that were active before a restart."""
+        """Take over the alerts that were active before a restart of the service."""
         slots = self._fusion.slots_of(
             np.array([a.cell for a in standing], np.int64),
             np.array([a.sector for a in standing], np.int64),
@@ -122,9 +122,9 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return True if an alert may be raised under the limit for idle roads. On a road where
-        only the vehicles that report the ice drive, it may not be raised if these vehicles have
-        recently supported alerts in too many other places.
+        """Return True if an alert may be raised under the limit for idle roads (roads that no third
+        vehicle has reported). On such a road an alert may not be raised if the vehicles that report
+        the ice have recently supported alerts in too many other places.
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -177,8 +177,8 @@ class Alerts:
         return np.asarray(grip >= np.minimum(ice + 2, SOURCES))
 
     def expire(self, now: int) -> list[Alert]:
-        """Return the end messages of alerts that expire by `now` [ns], because a slippery road is
-        less likely than not and no vehicle has confirmed it for QUIET_NS.
+        """Return the end messages of alerts that expire by `now` [ns], because the road is slippery
+        with a probability below one half and no vehicle has confirmed ice for QUIET_NS.
         """
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, Side.ICE, now - QUIET_NS)[:, 0] == 0

@@ -36,8 +36,8 @@ class IdleRoads:
         self._areas: dict[int, list[tuple[int, FloatArray]]] = {}
 
     def admit(self, cell: int, witnesses: Sequence[int], time: int, needed: int) -> bool:
-        """Return True if an alert may be raised; in this case, record the area for its supporting
-        vehicles.
+        """Return True if an alert on an idle road may be raised; in this case, record the area for
+        its supporting vehicles.
 
         Args:
             cell: cell of the alert.

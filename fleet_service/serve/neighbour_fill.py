@@ -1,5 +1,5 @@
-"""Estimates for unvisited cells from visited neighbours ("borrowed" values): wider, and marked as
-such. Pure (no I/O).
+"""Estimates for unvisited cells from visited neighbours ("borrowed" values): they have wider
+intervals and are marked as estimated. Pure (no I/O).
 
 A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
 estimated belief is the prior (belief before any measurement). Along a route the order of cells is

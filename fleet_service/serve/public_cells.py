@@ -136,8 +136,8 @@ class PublicCells:
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots (row numbers, one per cell and heading sector) that were published since
-        the last call.
+        """Return the slots (row numbers, one per cell and heading sector) that were copied for
+        readers since the last call.
         """
         found = np.concatenate([np.zeros(0, np.int64), *self._published])
         self._published.clear()
@@ -183,7 +183,7 @@ class PublicCells:
     def columns(self) -> dict[str, dict[str, IntArray]]:
         """Return the state as tables of integer columns for a checkpoint (saved state). They
         contain the cells whose public copy differs from the true beliefs, and the recent vehicles
-        of each tile. The visitors are not included.
+        of each tile. The tables do not include the counts of `visitors`.
         """
         self._add_slots()
         used = slice(self._size)

@@ -8,8 +8,8 @@ cost instead:
   (`_QueuedQuery.rank`). So a small query overtakes a large earlier one, but a stream of small
   queries cannot starve a large one.
 - If too many queries wait, the most expensive one gets an error that asks the client to retry.
-- Cheap answers together take at most LIGHT_PER_S. Beyond that they are queued as expensive ones,
-  smallest first.
+- Cheap answers together may cost at most LIGHT_PER_S per second. Further cheap queries are queued
+  as expensive ones, smallest first.
 - After each tile of an expensive answer, the thread rests as long as the tile took.
 - A query beyond the size limit gets an error with a hint.
 - One past map is rebuilt at a time, in a separate process. A few such queries wait for their turn;

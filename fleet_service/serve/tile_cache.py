@@ -38,14 +38,14 @@ class ShownTile(NamedTuple):
 
     Attributes:
         cells: cells in the schema of the map.
-        columns: the columns SELECTED_BY as arrays (k,).
+        columns: the columns by which a query selects cells (SELECTED_BY), as arrays (k,).
         payload: all cells as an Arrow stream, from south to north, which shares memory with
             `cells`; empty if the cells have another order and are used for one query only.
-        least: smallest number of vehicles among the cells.
+        least: smallest number of vehicles that visited any of the cells.
         common: box (west, south, east, north) that all cells touch, if the cells are ordered from
             south to north.
-        made: time of creation [ns].
-        change: number of the last change of the map that is included.
+        made: time at which this tile was made [ns].
+        change: number of the newest change of the map that this tile includes.
     """
 
     cells: pa.RecordBatch
@@ -83,8 +83,8 @@ class TileCache:
         self._acknowledged = 0  # number of the newest change that each reader must see
 
     def acknowledge(self) -> None:
-        """Record that everything in the map has been acknowledged or alerted. Cached tiles made
-        before this are no longer shown.
+        """Record that the service has sent acknowledgements or alerts for its newest data. Tiles
+        that were cached before these data reached the map are no longer shown.
         """
         self._acknowledged = self.state.change
 

@@ -36,7 +36,7 @@ class CellView(NamedTuple):
     """State of cells at one moment: columns (k,) and beliefs (k, 32).
 
     Attributes:
-        cell, sector: place and direction.
+        cell, sector: map cell and heading sector.
         belief: belief about the friction of the road.
         values: number of reports with a value of μ (not only a lower bound).
         vehicles, observations: number of vehicles and of observations.

@@ -1,5 +1,5 @@
-"""Number of distinct vehicles that were recently in a cell: a lower bound, in sixteen bytes per
-cell. Pure (no I/O).
+"""Estimate of the number of distinct vehicles that were recently in a cell. It is never too large,
+and takes sixteen bytes per cell. Pure (no I/O).
 
 This number decides whether readers may see a cell, because a single vehicle is hidden only among
 several recent vehicles. If a cell stayed public for ever, a single car at night would be visible in
@@ -28,7 +28,7 @@ _SHIFT: Final = np.uint64(58)
 
 class Visitors:
     """Recent vehicles of each slot (cell and heading sector) of a fusion (beliefs about all cells).
-    The time window is divided into parts; in each part, a vehicle that visited is one bit of 64.
+    The time window is divided into parts; in each part, a visiting vehicle sets one of 64 bits.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -66,8 +66,8 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the slots (storage of cells with heading sectors) were
-        renumbered; `place` contains the new numbers, -1 for removed slots.
+        """Update the slot numbers of the counted visitors after the slots (storage of cells with
+        heading sectors) were renumbered; `place` contains the new numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)
@@ -75,8 +75,8 @@ class Visitors:
         self._bits = longer[stay]
 
     def columns(self) -> dict[str, IntArray]:
-        """Return the counted visitors as columns for a checkpoint (saved state), from which `of`
-        restores this object.
+        """Return the counted visitors as columns for a checkpoint (saved state), from which the
+        method `of` restores this object.
         """
         self._grow()
         return {

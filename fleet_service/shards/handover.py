@@ -40,8 +40,8 @@ class HandoverResult(NamedTuple):
 
 
 def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
-    """Answer a hand-over request; return the name of the standby (the waiting service that takes
-    over), or None if the hand-over is impossible.
+    """Answer a hand-over request; return the name of the standby (the waiting service that will
+    take over), or None if the hand-over is impossible.
 
     Args:
         query: request as sent by `hand_over`.

@@ -27,8 +27,10 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return a table with one row: number of cells, vehicles and values, the means of both periods,
-    and the sums from which the difference and its standard deviation are computed.
+    """Return a table with one row, from which the difference and its standard deviation are
+    computed. Its columns are the numbers of cells, vehicles and values, and four sums. The sums are
+    those of the cells' weights, of their weighted means before and after the given time, and of the
+    vehicles' squared influences.
     """
     t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
@@ -62,8 +64,9 @@ def expression(t: Table, at_s: int) -> Table:
 
 def find_difference(row: dict[str, Any]) -> dict[str, float]:
     """Return the change of the mean friction (`difference`) with its 90 % interval (`lower`,
-    `upper`), and the number of cells (`cells`), computed from the row of `expression`. Return an
-    empty dictionary if fewer than two vehicles measured in both periods.
+    `upper`), and the number of cells (`cells`), computed from the row that `expression` defines.
+    Return an empty dictionary if fewer than two vehicles measured the cells that have values in
+    both periods.
     """
     if not row["cells"] or row["vehicles"] < 2:
         return {}

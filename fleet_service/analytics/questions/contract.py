@@ -135,13 +135,14 @@ def longest_breach(
     level: float,
     span: tuple[int, int],
 ) -> tuple[int, int, int, int]:
-    """Return four numbers [s] for one link: the durations of the longest breach according to the
-    means, of the longest certain breach and of the longest possible breach, and the begin of the
-    longest breach according to the means (0 if there is none).
+    """Return four numbers [s] for one piece of a road link. The first three are durations: of the
+    longest breach according to the means, of the longest certain breach, and of the longest
+    possible breach. The fourth is the begin of the longest breach according to the means (0 if
+    there is none).
 
     Args:
         slot: (n,) numbers of time slots, ascending.
-        lower, mu, upper: (n,) interval and mean of each slot.
+        lower, mu, upper: (n,) 90 % interval and mean of the friction in each slot.
         level: friction that the maintenance contract requires.
         span: begin and end [s] of all measurements. Nothing is known outside this time, so the
             parts of slots outside it are not counted.

@@ -94,8 +94,8 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
     """Return the lower 95 % confidence bound (Wilson 1927) of a share. The share is `hits` / `of`,
-    (n,) each: `of` is the number of observations, and `hits` the number of them that have a
-    property.
+    (n,) each: `of` is the number of observations, and `hits` the number of them that count as hits,
+    for example slippery ones.
     """
     n = np.maximum(of, 1.0)
     p = hits / n

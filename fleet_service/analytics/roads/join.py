@@ -78,7 +78,8 @@ class _Joined(NamedTuple):
         cell, sector: map cell and heading sector.
         mark: index of the nearest mark (point on a road link), which also gives the link.
         distance: distance from the cell's centre to this mark [m].
-        ambiguous: by how much the next best link fits worse [m]; NaN if there is no other link.
+        ambiguous: by how much another link fits worse than the best one, as additional distance
+            [m]; NaN if there is no other link.
         second: True if the cell also belongs to a link that fits better and adjoins this link.
     """
 
@@ -131,7 +132,8 @@ def join_roads(network: RoadNetwork) -> pa.Table:
 def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: float) -> _Joined:
     """Assign the cells near road links to the links with a matching heading.
 
-    `scale` (marks,) is the cosine of the latitude, and `side` the width of a cell [m].
+    `scale` (marks,) is the cosine of the latitude of each mark (point on a link), and `side` the
+    width of a cell [m].
     """
     tree = cKDTree(_to_mercator(marks.latitude, marks.longitude))
     reach = REACH_M / scale.min()
@@ -270,7 +272,7 @@ def _angle_between(yaw: FloatArray, axis: float) -> FloatArray:
 
 def add_road_names(found: pa.Table, roads: pa.Table) -> pa.Table:
     """Return an answer with a column `road`: the name of the road at each cell, null if no named
-    road is near. `roads` is a table of `read_roads`.
+    road is near. `roads` is a table that `read_roads` has returned.
     """
     network = roads.sort_by("distance_m")
     nearest: dict[Any, str] = {}

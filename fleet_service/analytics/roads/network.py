@@ -57,7 +57,9 @@ class DirectedLink(NamedTuple):
 
 
 class RoadNetwork(NamedTuple):
-    """Links of a file, and information about the file: name, digest, date and licence."""
+    """Road links that were read from a file, and information about the file: name, digest, date and
+    licence.
+    """
 
     links: list[DirectedLink]
     source: dict[str, str]

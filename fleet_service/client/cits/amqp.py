@@ -39,8 +39,8 @@ class Parcel(NamedTuple):
 
 
 class _AmqpEvents(MessagingHandler):
-    """Handler of events of the AMQP connection; all methods run on the thread of the AMQP
-    container.
+    """Handler of events of the AMQP connection; all methods run on the thread of the AMQP library's
+    event loop (its "container").
     """
 
     def __init__(self, link: AmqpLink) -> None:

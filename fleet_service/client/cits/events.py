@@ -2,8 +2,8 @@
 stretch of road with an active alert, and the messages that must be sent. Pure (no I/O).
 
 A stretch is one event from its first alert until the alerts of all its cells are over. The events
-are saved to a file, so a restart does not change this. An event is sent when it begins, when it
-changes, before its validity ends, and once more when it is over.
+are saved to a file, so a restart of the program neither ends nor duplicates an event. An event is
+sent when it begins, when it changes, before its validity ends, and once more when it is over.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ class EventBook:
 
     Args:
         station: identifier of the originating station.
-        content: saved value of the property `content`; None for a station without events.
+        content: value of the property `content` that was saved before a restart; None for a station
+            without events.
 
     Raises:
         InputError: the content belongs to another station or is not valid.
@@ -198,8 +199,8 @@ class EventBook:
 
 
 def _reported_state(alert: StretchAlert) -> tuple[float, ...]:
-    """Return the properties of an alert whose change is reported to receivers: size, True for ice,
-    and number of vehicles.
+    """Return the properties of an alert for which a change is reported to receivers: number of
+    cells, length [m], 1 for ice (0 for another slippery road), and number of vehicles (at most 6).
     """
     return (
         float(alert.cells),

@@ -43,7 +43,7 @@ def encode_reports(
     Args:
         denm: received message.
         name: vehicle name for the reports.
-        boot: random number of this start.
+        boot: random number that identifies this start of the gateway.
         first_seq: sequence number of the first batch.
         now: current time [ns UTC].
     """

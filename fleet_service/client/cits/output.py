@@ -24,7 +24,7 @@ CHECK_S: Final = 10.0  # [s] period of the checks for events whose validity must
 
 
 class DenmOutput:
-    """Output that keeps an interchange up to date with the active alerts.
+    """Output that sends the active alerts to an interchange and keeps them up to date there.
 
     Args:
         station: identifier of the originating station.
