@@ -45,8 +45,8 @@ def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> floa
 
 
 class FactorLimits(NamedTuple):
-    """Limits of a factor on the measurement noise R: `pace` multiplies each change of ln R; `least`
-    and `largest` bound the factor.
+    """Limits of a factor on the measurement noise R: the share `pace` multiplies each change of ln
+    R; `least` and `largest` bound the factor.
     """
 
     pace: float
@@ -59,8 +59,9 @@ def adapted_factor(
     factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray
 ) -> float:
     """Return the next factor on the measurement noise R: factor*exp(infer_step(actual/theoretical -
-    1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `actual` and `theoretical` are variances of the
-    innovations (measurement minus prediction); `inputs` and `outputs` are those of `infer_step`.
+    1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `factor` is the present factor. `actual` and
+    `theoretical` are variances of the innovations (measurement minus prediction). `inputs` (5,) are
+    the peaks of the fuzzy sets, and `outputs` (5,) the change of ln R for each set.
     """
     limits = FactorLimits(1.0, LEAST_FACTOR, LARGEST_FACTOR)
     return adapted_within(factor, actual, theoretical, inputs, outputs, limits)
@@ -75,8 +76,8 @@ def adapted_within(
     outputs: FloatArray,
     limits: FactorLimits,
 ) -> float:
-    """Return the next factor on the measurement noise R like `adapted_factor`, but with the given
-    limits.
+    """Return the next factor on the measurement noise R like `adapted_factor`, but with the speed
+    and the range of change given by `limits`.
     """
     if not theoretical > 0.0:
         return factor

@@ -14,8 +14,9 @@ Rules of the default estimator (`rule_base.py`): `far` is a ramp (foot, peak), t
 consequents of rules.
 
     far         mismatches at which the membership in FAR (beyond theory) begins and is complete [1]
-    consequents ln of the axles' R while steering is WIDE [nat]; rate at which offsets, slope and
-                bank return to their prior while the mismatch of the wheels is FAR [1/s]
+    consequents ln of the factor on the axles' R while steering is WIDE [nat]; rate at which
+                offsets, slope and bank return to their prior while the mismatch of the
+                wheels is FAR [1/s]
     shares      ln of the share of a block's evidence on friction that is used, in the order: a
                 wheel slides (no, yes), demand (low, middle, high), forces (as before, new) [nat]
                 (12,)

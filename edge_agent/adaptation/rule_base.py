@@ -10,11 +10,13 @@ share of the evidence on friction that it uses, and the rate at which it forgets
 
 Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1). The
 first row is implemented in `fuzzy.py`. The other sets are ramps from a foot (membership 0) to a
-peak (membership 1); feet, peaks and consequents are `Memberships`. Inputs come from the block (0.05
-s of samples) that has just ended, so no rule has its own effect as input.
+peak (membership 1); feet, peaks and consequents are `Memberships`. Demand is the force over load of
+an axle. Forces are new if they differ from their recent averages. Strain is the deviation of the
+estimated states of car and sensors from their prior. Inputs come from the block (0.05 s of samples)
+that has just ended, so no rule has its own effect as input.
 
 `plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
-changes. It is the baseline for the evaluation of the rules (`fuzzy.worth`).
+changes. It is the baseline with which the evaluation compares the rules (figure `fuzzy.worth`).
 """
 
 from __future__ import annotations
@@ -76,9 +78,9 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return a rule base without fuzzy sets. The used share of the evidence on friction is then
-    `plain_share` with these arguments, and neither the measurement noise R nor forgetting is
-    adapted.
+    """Return a rule base without fuzzy sets. The share of the evidence on friction that the filter
+    uses is then `plain_share` with `half`, `power` and `steady`, and neither the measurement noise
+    R nor forgetting is adapted.
     """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
@@ -114,7 +116,7 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 def plain_share(plain: FloatArray, demand: float, new: float) -> float:
     """Return ln of the share of the evidence on friction from a block (0.05 s) that is used if
     there are no fuzzy rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1)
-    to which the forces are new.
+    to which the forces differ from their recent averages.
 
     The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
     steady).
@@ -138,7 +140,7 @@ def evidence_share(
         rules: the consequents, `shares` (12,) and `strained` (2,) [nat].
         slides: fuzzy degree of "a wheel slides", 0 to 1.
         demand: the larger force over load of the two axles [1].
-        new: fuzzy degree of "the forces are new", 0 to 1.
+        new: fuzzy degree of "the forces differ from their recent averages", 0 to 1.
         strain: deviation of the estimated states of car and sensors from their prior, as chi-square
             over degrees of freedom [1].
     """

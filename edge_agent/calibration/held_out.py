@@ -46,7 +46,8 @@ class Prediction(NamedTuple):
 
 class HeldOut(NamedTuple):
     """Result of a validated calibration: the calibration to write, the groups of quantities left
-    out of it, and the mean predictions of held-out drives without (`before`) and with it (`after`).
+    out of it, and the mean prediction scores on held-out drives without the calibration (`before`)
+    and with it (`after`).
     """
 
     calibration: Calibration
@@ -62,7 +63,8 @@ Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
 
 def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
     """Learn a calibration from all drives. Keep only those groups of quantities with which an
-    estimator predicts held-out drives at least as well as without.
+    estimator predicts held-out drives at least as well as without them. `judge` replays a drive
+    with a vehicle and returns the prediction score.
 
     Raises:
         InputError: no drive has enough excitation, or there is only one drive and it is too short

@@ -179,7 +179,7 @@ def _posterior_of(
 
     `bias` is the standard deviation of errors common to all drives, and `unknown` the smallest
     standard deviation that a drive states. If `unknown` is not 0, the estimates already include the
-    prior; then their median is not moved towards the prior mean again.
+    prior; in that case the function does not move their median towards the prior mean again.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
@@ -275,12 +275,12 @@ def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
 
 
 def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    """Return the ratio of the measured wheel torque to the torque that accelerates the mass of the
-    vehicle file.
+    """Return the ratio of the measured wheel torque to the torque that would accelerate a car with
+    the mass stated in the vehicle file.
 
-    The acceleration comes from the wheel speeds, because an accelerometer pitches with the body.
-    Slope, air and rolling resistance do not vary with acceleration. Therefore the fit represents
-    them by one constant term.
+    The acceleration comes from the wheel speeds, because an accelerometer tilts when the body
+    pitches. Slope, air and rolling resistance do not vary with acceleration. Therefore the fit
+    represents their forces by one constant term.
     """
     rows = (drive.moving > 0) & np.isfinite(drive.torque) & np.isfinite(drive.v_dot)
     if np.sum(rows & (np.abs(drive.v_dot) > PULLED)) < LEAST_S * RATE_HZ:
@@ -291,8 +291,9 @@ def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
 
 
 def _wheel_slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:
-    """Return, for n samples, the slip of each wheel minus the mean slip of the four wheels, (n, 4).
-    Slip is computed from the driving force and the rolling resistance of each axle.
+    """Return the slip of each wheel minus the mean slip of the four wheels, (n, 4), for the n
+    samples that the mask `rows` selects. Slip is computed from the driving force and the rolling
+    resistance of each axle.
 
     The driving force comes from the accelerometer, which measures tyre force minus air drag, also
     on slopes. The offset of the accelerometer is estimated as the difference between its reading

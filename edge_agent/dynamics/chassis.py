@@ -26,7 +26,8 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
     """Return an array (4, 3): cosine and sine of the steering angles (4,) [rad], and wheel speeds
     (4,) [rad/s].
 
-    They are computed once, because many states share them.
+    The caller computes this array once and uses it for all states (sigma points) with these angles
+    and speeds.
     """
     out = np.empty((4, 3))
     for wheel in range(4):
@@ -45,8 +46,8 @@ def _wheel_slips(
     """Return the (longitudinal, lateral) slips of a wheel.
 
     `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes; `cos` and `sin` are
-    cosine and sine of the steering angle. A wheel with unknown speed (NaN) has no longitudinal
-    slip.
+    cosine and sine of the steering angle. If the wheel speed `omega` is unknown (NaN), the returned
+    longitudinal slip is 0.
     """
     along = cos * ahead + sin * aside
     across = cos * aside - sin * ahead
@@ -60,8 +61,8 @@ def stiffness(body: Body, load: float, mu: float, rear: bool) -> tuple[float, fl
     friction `mu`.
 
     The stiffness is proportional to the load. Three parameters in `body` change this: PROPORTIONAL
-    makes it proportional to friction too, QUADRATIC reduces it per load under high load, and
-    REAR_SLOPE is a factor for the rear axle.
+    makes the stiffness proportional to friction too, QUADRATIC reduces the stiffness per load under
+    high load, and REAR_SLOPE is a factor for the rear axle.
     """
     by_load = 1.0 + body.quadratic - body.quadratic * load * (4.0 / (body.mass * GRAVITY))
     share = (1.0 + body.proportional * (mu - 1.0)) * by_load
@@ -82,8 +83,9 @@ def tyre_forces(
     wheels' axes, at motion (5,): velocities v_x, v_y, yaw rate, and accelerations a_x, a_y. The
     accelerations determine the loads.
 
-    wheels: result (4, 3) of `wheel_inputs`; a wheel with speed NaN rolls freely; mu (4,); shape:
-    shape factor c of the Magic Formula (with curvature 0), or DUGOFF.
+    row: vehicle parameters; wheels: result (4, 3) of `wheel_inputs`, where a wheel with speed NaN
+    rolls freely; mu (4,): friction at the wheels; shape: shape factor c of the Magic Formula (with
+    curvature 0), or DUGOFF.
     """
     parameters = body_of(row)
     loads = wheel_loads(parameters, motion[3], motion[4])
@@ -134,7 +136,7 @@ def planar_response(
     """Return the accelerations (a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the body that the
     forces of four Dugoff tyres cause.
 
-    The code is written out per wheel with scalars instead of arrays, because the papers' filters
+    For speed, the code is written out per wheel with scalars instead of arrays: the papers' filters
     spend most of their time here.
     """
     vx, vy, rate, ax, ay = motion

@@ -9,8 +9,8 @@ J_w inertia of a wheel, R radius.
 
 The paper uses the larger of the two wheel speeds as midpoint speed. In a turn that is the speed of
 the outer wheel, not of the midpoint; therefore the mean is used here. The signals are torques at
-the wheels, so T_m*i_t*eta_t is the sum of an axle's two torques. The paper does not give i_t and
-eta_t.
+the wheels, so T_m*i_t*eta_t is the sum of an axle's two torques. The paper gives no values of i_t
+and eta_t.
 """
 
 from __future__ import annotations
@@ -33,16 +33,18 @@ def midpoint_speed(left: float, right: float) -> float:
 
 @inlined
 def axle_force(torque: float, turning: float, inertia: float, radius: float) -> float:
-    """Return the longitudinal force F_x [N] of an axle from the sum of its wheel torques, `torque`
-    [N m], and from the rotational acceleration at its midpoint, `turning` [rad/s^2].
+    """Return the longitudinal force F_x [N] of an axle: (torque - 2*inertia*turning)/radius.
+    `torque` [N m] is the sum of the axle's wheel torques, and `turning` [rad/s^2] the rotational
+    acceleration at its midpoint. `inertia` [kg m^2] and `radius` [m] are those of one wheel.
     """
     return (torque - 2.0 * inertia * turning) / radius
 
 
 @inlined
 def motor_torque(torque: float, ratio: float, efficiency: float) -> float:
-    """Return the motor torque T_m [N m] from the sum of an axle's wheel torques. While the motor
-    brakes, the losses reduce its torque.
+    """Return the motor torque T_m [N m] from `torque` [N m], the sum of an axle's wheel torques.
+    `ratio` [1] is the transmission ratio and `efficiency` [1] that of the transmission. While the
+    motor brakes, the transmission losses brake too, so the motor needs less torque.
     """
     share = efficiency if torque >= 0.0 else 1.0 / efficiency
     return torque / (ratio * share)

@@ -83,7 +83,7 @@ def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
 
 class Body(NamedTuple):
     """Parameters of the vehicle that the equations of body and tyres use. They are scalars instead
-    of an array, because compiled code is then faster; see `inlined`.
+    of an array, because compiled code handles scalars faster.
     """
 
     mass: float

@@ -38,7 +38,9 @@ def factorize_column(a: FloatArray, j: int, least: float) -> None:
 
 @compiled
 def variance(sqrt_cov: FloatArray, i: int) -> float:
-    """Return the variance of state i from the factor sqrt_cov (n, n) of a covariance."""
+    """Return the variance of state i: its diagonal element in the covariance whose lower-triangular
+    factor is `sqrt_cov` (n, n).
+    """
     total = 0.0
     for j in range(i + 1):
         total += sqrt_cov[i, j] * sqrt_cov[i, j]

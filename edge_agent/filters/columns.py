@@ -38,8 +38,8 @@ def gather_points(
     points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatArray, sqrt_cov: FloatArray
 ) -> None:
     """Compute mean (n,) and sqrt_cov (n, n), the root of the covariance, from propagated points (n,
-    2n), and add process noise with the standard deviations pace*noise_std. Afterwards `points`
-    contains the deviations from the mean.
+    2n), and add process noise with the standard deviations pace*noise_std, where `pace` is a
+    factor. Afterwards `points` contains the deviations from the mean.
 
     The mean is the first point plus the mean deviation from it, so that large offsets lose no
     digits. The covariance is summed and factorised, at half the cost of an orthogonal

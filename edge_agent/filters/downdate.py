@@ -22,8 +22,8 @@ def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> boo
     """Change a lower-triangular factor L (`sqrt_cov`, (n, n)) of a covariance to that of the
     smaller covariance L*L' - column*column', with column (n,). Return True.
 
-    If the result is not a covariance, return False and change nothing. `white` (n,) is scratch
-    memory.
+    If the result would not be a covariance, return False and leave L unchanged. `white` (n,) is
+    scratch memory.
     """
     n = column.shape[0]
     square = 0.0

@@ -24,7 +24,8 @@ def carlson_update(
     variance: float,
     gain: FloatArray,
 ) -> tuple[float, float]:
-    """Update the filter with a `reading` of state i itself with noise `variance` > 0.
+    """Update the filter in place with a `reading`: a direct measurement of state i whose noise has
+    the `variance` > 0.
 
     Return (squared innovation divided by a, a), where a is the variance of the innovation
     (measurement minus prediction). L stays triangular (Carlson 1973): its rows are rotated by 2 x 2

@@ -1,3 +1,3 @@
-"""The laboratory: simulation, evaluation and tuning of the estimators. The code that is evaluated
-never imports it.
+"""The laboratory: simulation, evaluation and tuning of the estimators. The estimators and the agent
+never import the laboratory.
 """

@@ -143,7 +143,7 @@ def collect_metrics(
 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:
-    """Return all metrics of a standby (a service that waits for the ownership of the archive)."""
+    """Return all metrics of a standby (a service that waits for the lease)."""
     return [_serves_metric(config, 0.0)]
 
 

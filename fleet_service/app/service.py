@@ -1,5 +1,4 @@
-"""The running service. One worker thread connects Zenoh and the engine (the parts of the service
-without its network).
+"""The running service. One worker thread connects Zenoh and the engine.
 
 subscribers ─► inbox ─► worker: ingest ─► alerts at once
                                 flush ─► thread: rows on disk ─► acknowledgements

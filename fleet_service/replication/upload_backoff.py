@@ -1,4 +1,4 @@
-"""Pauses after failed uploads to a bucket (object store), which grow with each further failure."""
+"""Pauses between repeated uploads to a bucket (object store) that fail."""
 
 from __future__ import annotations
 

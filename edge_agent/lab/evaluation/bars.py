@@ -45,24 +45,25 @@ def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[
 
 
 def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns one measure in an experiment
-    of paper 004, under the paper's conditions: the mean over all seeds.
+    """Return a function that takes the campaign's results and returns one measure of the paper's
+    tuned filter in an experiment of paper 004, under the paper's conditions: the mean over all
+    seeds.
     """
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
     """Return a function that takes the campaign's results and returns the figure (number) called
-    `name` of the default estimator. It comes from `real_world`: towns with inaccurate cars, or cars
-    that stand on a slope.
+    `name` of the default estimator from the realistic evaluation (`real_world`): inaccurate cars in
+    towns, or cars that stand on a slope.
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns the ratio called `name`. It
-    compares two interval scores of friction, for example the score with fuzzy sets divided by the
-    score without them.
+    """Return a function that takes the campaign's results and returns the ratio called `name`: one
+    filter variant's interval score of friction divided by that of another. An example is the score
+    with fuzzy sets divided by the score without them.
     """
     return lambda results: worth.ratio(results.worth, name)
 

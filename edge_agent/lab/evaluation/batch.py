@@ -70,15 +70,15 @@ class DriveSet:
         return np.asarray(self.mu_wheel.mean(axis=-1))
 
     def last(self, seconds: float) -> slice:
-        """Return the slice of sample indices that covers the last `seconds` of the drives."""
+        """Return the slice of sample indices that covers the last `seconds` [s] of the drives."""
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
 def realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
-    """Simulate one drive per seed with ordinary sensors. The vehicle file that the estimators get
-    has errors of a few per cent.
+    """Simulate one drive of the scenario per seed with the given sensors, by default ordinary ones.
+    The vehicle file that the estimators get has errors of a few per cent.
     """
     return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
@@ -148,5 +148,7 @@ def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
 
 
 def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
-    """Return the estimates that an estimator bank computes from the signals of the drives."""
+    """Return the estimates of motion and friction that an estimator bank (one filter per drive)
+    computes from the signals of the drives.
+    """
     return bank.advance(batch.t, batch.signals)

@@ -76,8 +76,8 @@ class Results:
 
 
 def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
-    """Run every scenario of the evaluation and return all measures (such as errors); `log_line`
-    receives lines with the progress.
+    """Run every scenario of the evaluation and return all measures (such as errors). `log_line` is
+    a function that receives each line of text about the progress.
     """
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
@@ -123,8 +123,9 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return an estimator bank (one filter per drive) for drives under a paper's own conditions. An
-    estimator that does not estimate friction gets the true friction at the start of the drives.
+    """Return an estimator bank (one filter per drive) for drives under a paper's own conditions. If
+    the estimator does not estimate friction, it assumes the true friction at the start of the
+    drives.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

@@ -3,14 +3,14 @@ where there is no ice?
 
 Towns are drawn randomly by seed; cars are inaccurate ("rough", ROUGH_FLEET) or accurate ("plain").
 "short" drives last 120 s, and "long" ones 900 s, because some faults that stop a car's reports
-appear only after a long time. A figure for one kind of cars pools the samples of all towns with
-such cars. A visit is the passage of one map cell, with its likelihood of friction.
+appear only after a long time. A figure (reported number) for one kind of cars pools the samples of
+all towns with such cars. A visit is the passage of one map cell, with its likelihood of friction.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
     value       visit: it has value if its log-likelihood at the largest friction is VALUE_NATS or
-                more below its maximum, which is evidence against full grip
+                more below the likelihood's maximum, which is evidence against full grip
     favoured    visit: it favours a slippery road, max ln L(μ < .4) - max ln L(μ >= .4) >=
                 FAVOURED_NATS
     on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
@@ -93,9 +93,7 @@ class DetectionTally:
         self.count[name] = self.count.get(name, 0) + int(np.size(values))
 
     def add_case(self, name: str, *, holds: bool) -> None:
-        """Count one case in the share called `name`, the share of cases in which `holds` is
-        True.
-        """
+        """Count one case for the measure `name`, which is the share of cases with `holds` True."""
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
@@ -111,7 +109,7 @@ class DetectionTally:
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
     def rate(self, over: str, under: str) -> float:
-        """Return the sum stored under the name `over` divided by the sum stored under the name
+        """Return the sum of the measure named `over` divided by the sum of the measure named
         `under`; NaN if the divisor is zero or missing.
         """
         return (
@@ -159,9 +157,10 @@ def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretche
 
 
 def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
-    """Return the cause of a slide, from the mean accelerations of car n in the samples `first` to
-    `end`. It is "cornering" if the lateral acceleration is larger. Otherwise the sign of the
-    longitudinal acceleration decides between "braking" and "driving".
+    """Return the cause of a slide of car n, from the car's mean accelerations in the samples from
+    `first` to before `end`. The cause is "cornering" if the lateral acceleration is larger than the
+    longitudinal one. Otherwise the sign of the longitudinal acceleration decides between "braking"
+    and "driving".
     """
     along = float(drive.ax[first:end, n].mean())
     across = float(drive.ay[first:end, n].mean())
@@ -266,16 +265,18 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
 
 
 def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) -> None:
-    """Add the time until detection of a slide, `wait` [s], to the list `key` for all slides, and to
-    the list for slides with the same cause (`activity`).
+    """Add the time until detection of a slide, `wait` [s], to two lists of the tally: the list
+    `key` for all slides, and the list for slides with the same cause `activity` (such as
+    "braking").
     """
     tally.seconds.setdefault(key, []).append(wait)
     tally.seconds.setdefault(f"{key}.{activity}", []).append(wait)
 
 
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count the slides of car n on slippery road during which, or at most TOLD_AFTER_S after which,
-    the estimator reports the road as slippery.
+    """Count the slides of car n on slippery road, and among them the found slides. A slide is found
+    if the estimator reports a slippery road during the slide or at most TOLD_AFTER_S [s] after it.
+    Add both counts to the tally (sums of the evaluation).
     """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
@@ -292,8 +293,8 @@ def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
     """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins,
-    separately for slides on slippery road and for all other times. For both, also add the time [s]
-    without this flag.
+    separately for slides on slippery road and for times without a slide. For both, also add the
+    time [s] in which the flag is not set. The sums go to the tally (sums of the evaluation).
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -314,9 +315,10 @@ def _judge_contradictions(
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
-    """Count false reports of slippery road, at least SETTLED_S after snow and ice. They are counted
-    for the estimator, for its friction belief at each threshold, and for the slip flag (ordinary
-    ABS logic).
+    """Count false reports of slippery road by car n, at least SETTLED_S [s] after snow and ice, and
+    add the counts to the tally (sums of the evaluation). There are separate counts for the
+    estimator, for its friction belief at each threshold, and for the slip flag (ordinary ABS
+    logic).
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
@@ -379,8 +381,8 @@ def _note_visit(
 
 
 class TownTally(NamedTuple):
-    """Sums and counts of the detection evaluation (`DetectionTally`) for one town, and True if it
-    is winter there.
+    """Sums and counts of the detection evaluation (`DetectionTally`) for one town, and a flag that
+    is True for a winter town.
     """
 
     winter: bool

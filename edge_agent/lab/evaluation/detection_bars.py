@@ -27,11 +27,11 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """A figure (named number) of the detection evaluation: the drives that it covers, the function
-    that computes it from a tally (sums and counts), its unit, and its targets for inaccurate and
-    for accurate cars (KINDS).
+    """Definition of one figure (named number) of the detection evaluation: the drives that the
+    figure covers, the function that computes it from a tally (sums and counts), its unit, and its
+    targets for inaccurate and for accurate cars (KINDS).
 
-    `length`: one of LENGTHS, or "" for both together.
+    `length` is the class of drives, "short" or "long"; "" means both together.
     """
 
     name: str
@@ -219,7 +219,7 @@ DETECTION: Final = (
 def detection_figures(results: DetectionResults) -> list[Figure]:
     """Return the figures (named numbers) of the detection evaluation with their standard errors
     over towns: `NAME.KIND` for every entry of DETECTION and both kinds of cars (rough: inaccurate,
-    plain: accurate). Figures with a target come first.
+    plain: accurate). The list begins with the figures that have a target.
 
     `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
     towns, if there are both.

@@ -48,7 +48,7 @@ DEFAULT: Final = "aco-fckf"
 
 class DetectionTown(NamedTuple):
     """A town to evaluate: its seed, its kind of cars ("rough": inaccurate, or "plain": accurate),
-    duration of the drives [s], number of cars, and True if it is winter there.
+    duration of the drives [s], number of cars, and a flag that is True for a winter town.
     """
 
     seed: int
@@ -65,7 +65,7 @@ class DetectionTown(NamedTuple):
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
     """Return the towns of the campaign. Towns with short drives have other seeds than towns with
-    long drives. For both kinds of cars, accurate and inaccurate, the seeds are equal.
+    long drives. Accurate and inaccurate cars drive in towns with the same seeds.
 
     Towns with an odd seed are winter towns.
     """
@@ -122,7 +122,9 @@ def judge_towns(
 def campaign(
     seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
 ) -> DetectionResults:
-    """Evaluate the detection of slippery road by an estimator in all towns of the campaign."""
+    """Evaluate how well an estimator detects slippery road in all towns of the campaign. `seeds`
+    are the seeds of the towns; `log_line` receives one line of progress per town.
+    """
     return judge_towns(
         towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
     )

@@ -2,8 +2,8 @@
 (passages of a map cell) with their likelihoods, and the slip flag (ordinary ABS logic).
 
 The cars are those of `SimulatedFleet`; the agent's own pipeline (`observe`) computes visits and
-likelihoods. The drives are computed in chunks, so that fifteen minutes of sixteen cars fit in
-memory.
+likelihoods. The drives are computed in chunks of time, so that memory suffices for sixteen cars
+that drive fifteen minutes.
 """
 
 from __future__ import annotations
@@ -51,17 +51,21 @@ class DetectionVisits:
 
 @dataclass(frozen=True)
 class DetectionDrive:
-    """True values and estimates of one town's cars; shape (T, N), or (T, N, 4) per wheel.
+    """True values and estimates of the N cars of one town at T samples. Arrays have the shape (T,
+    N), or (T, N, 4) per wheel.
 
     Attributes:
         speed, ax, ay: true motion [m/s, m/s^2].
         mu: true mean friction of the four wheels.
         mu_wheel, theta, used: true friction, normalised slip and used share of the grip, per wheel.
-        lower, median, upper, slippery, health: estimates; `slippery` is P(mu < SLIPPERY_MU).
+        lower, median, upper, slippery, health: estimates: the 5, 50 and 95 % quantiles of friction,
+        P(mu < SLIPPERY_MU), and the health flags.
         favoured: ln of the largest belief below SLIPPERY_MU over the largest above; NaN where the
             estimator has no belief.
-        flagged: friction that the slip flag reports, infinite without a flag.
-        controlled: True while ABS, traction control or ESC acts, for cars with winter equipment.
+        flagged: friction that the slip flag (ordinary ABS logic) reports; infinite while the flag
+            is not set.
+        controlled: True while ABS, traction control or ESC acts; always False for cars without
+            winter equipment.
         stood: True where ice or snow appeared under the standing car, until the car leaves it.
         visits: the published visits (passages of a map cell).
     """
@@ -86,8 +90,8 @@ class DetectionDrive:
 
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
-    """Simulate a fleet for `seconds`, estimate motion and friction from its signals with the
-    estimator bank (one filter per car), and compute the cars' visits (passages of a map cell).
+    """Simulate a fleet for `seconds` [s], estimate motion and friction from the cars' signals with
+    the estimator bank (one filter per car), and compute the cars' visits (passages of a map cell).
     """
     vehicles = fleet.vehicles
     config = AgentConfig()
@@ -217,9 +221,9 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes. If the
-    estimator computes no likelihood of friction, all bytes are zero, which encodes a flat
-    likelihood.
+    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes, from the
+    table column of the visits' likelihoods. If the estimator computes no likelihood of friction,
+    all bytes are zero, which encodes a flat likelihood.
     """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)

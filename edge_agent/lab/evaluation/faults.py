@@ -1,8 +1,9 @@
 """Evaluation with sensor faults: a table of faults with the expected effect of each, and measures
 of how every estimator responds.
 
-The faults are added to the signals of ordinary simulated drives from BEGINS on. The measure `told`
-is the share of drives in which health reports the expected flag.
+The faults are added to the signals of ordinary simulated drives from the time BEGINS on. The
+measure `told` is the share of drives in which the estimator's health flags include the expected
+one.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ def kept_samples(t: FloatArray) -> FloatArray:
 
 
 def late_samples(t: FloatArray) -> FloatArray:
-    """Return the time stamps t (T, N) with every tenth one 50 ms too old between the times BEGINS
-    and ENDS.
+    """Return the time stamps t (T, N) with an error between the times BEGINS and ENDS: every tenth
+    time stamp is 50 ms too early.
     """
     number = np.arange(len(t))[:, None]
     return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
@@ -146,7 +147,9 @@ CASES: Final = {
 
 
 def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
-    """Return a copy of the drives in which their signals and time stamps have the fault."""
+    """Return a copy of the drives `batch` whose signals and time stamps have the fault of the given
+    case.
+    """
     each = [
         apply_faults(batch.t[:, n], batch.signals[:, n], case.faults)
         for n in range(batch.t.shape[1])
@@ -156,8 +159,8 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
     """Return the measures of a fault case, one value per drive. `finite` (1 or 0): all estimates
-    are finite and in order. `told` (1 or 0): health reports the expected flag. Over the time from
-    BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
+    are finite and in order. `told` (1 or 0): health reports the expected flag. The others cover the
+    time from BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)
@@ -176,8 +179,8 @@ def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str,
 def campaign(
     seeds: Sequence[int], estimators: Sequence[str], drives: Sequence[str] = tuple(DRIVES)
 ) -> dict[tuple[str, str], dict[str, FloatArray]]:
-    """Run every fault case for every estimator on all drives with all seeds; return the measures by
-    (case, estimator).
+    """Run every sensor fault of the table with every estimator on all drives with all seeds. Return
+    the measures by (fault case, estimator), one value per drive.
     """
     batches = [realistic(DRIVES[name], seeds) for name in drives]
     found = {}

@@ -80,8 +80,8 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
-    """Return the 95 % bounds for the mean of `measure` ("nees" or "nis") over this number of
-    drives, for a filter whose stated variances are right.
+    """Return the lower and upper 95 % bounds for the mean of `measure` ("nees" or "nis") over
+    `drives` drives at one instant. They hold for a filter whose stated variances are right.
     """
     from scipy.stats import chi2
 
@@ -137,8 +137,9 @@ def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
 
 
 def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
-    """Return, for each of N drives, how often the friction interval lies more than NEAR away from
-    the constant true friction for at least HOLD_S.
+    """Return, for each of N drives with constant friction, the number of false reports of a change.
+    A false report is a stretch of at least HOLD_S [s] in which the friction interval lies more than
+    NEAR away from the true friction.
     """
     wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

@@ -59,8 +59,10 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """A drive of scenario 002.sine: the readings and true values that the oracle gets, and the
-    effects of roll and pitch on the accelerometers, (T,) each.
+    """Drives of scenario 002.sine for the oracle (an ideal observer): readings and true values
+    (`batch`), and the effects of the body's roll and pitch on the accelerometers. `rolled` and
+    `pitched` (T,) are the parts of a_y and a_x [m/s^2] that roll and pitch have followed. `felt`
+    (T, 2) are a_x and a_y as read by accelerometers with no other error.
     """
 
     batch: DriveSet
@@ -86,8 +88,9 @@ def speed(seeds: Sequence[int]) -> FloatArray:
 def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
-    Each second, the oracle (ideal observer) estimates the error ρ of the wheel radius again from
-    all earlier readings, and corrects the wheel speeds by it.
+    `rho` is the true relative error of the wheel radius, unknown to the oracle (ideal observer).
+    After each second, the oracle estimates this error from all readings so far, and corrects the
+    wheel speeds by its estimate.
     """
     batch = heard.batch
     car = PAPERS["002.sine"].vehicle
@@ -191,8 +194,8 @@ def _force_curve(shape: float, curvature: float) -> FloatArray:
 def _cost(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
-    """Return −ln of the likelihood of one friction and one shape of the tyre curve (which give the
-    slips `slip`), for the wheel speeds and accelerations measured in a drive.
+    """Return −ln of the likelihood of one pair of friction and tyre curve, given the mean wheel
+    speed in a drive, `measured` (T,) [m/s]. `slip` (T,) are the slips that this pair predicts.
     """
     t = np.arange(len(v)) / 100.0
     std = np.array(

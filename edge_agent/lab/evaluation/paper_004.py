@@ -40,8 +40,8 @@ STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R unchanged
 
 
 def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
-    """Return one copy of the drive per seed, with white noise of `variance` (T,) added to a_x, a_y
-    and yaw rate r [SI units].
+    """Return one copy of the drive per seed, with white noise added to a_x, a_y and yaw rate r.
+    `variance` (T,) is the variance of the noise over time [SI units squared].
     """
     copies = repeat_drive(batch, len(seeds))
     for n, seed in enumerate(seeds):
@@ -63,9 +63,9 @@ def experiments(
     the drives for plots by experiment.
 
     "sedan" and "van" are the experiment "constant" with the simulator's own vehicles; with the
-    suffix ".variable" they are the experiment "variable". The filters are the paper's, and two for
-    comparison: untuned (paper-fckf) and without adaptation (paper-ckf). Only a_x, a_y and r have
-    noise.
+    suffix ".variable" they are the experiment "variable". There are three filters: that of the
+    paper, the same filter untuned (paper-fckf), and without adaptation (paper-ckf). Only a_x, a_y
+    and the yaw rate have noise.
     """
     found = {}
     drives = {}

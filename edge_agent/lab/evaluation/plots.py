@@ -38,7 +38,8 @@ def draw(
 ) -> list[Path]:
     """Draw all plots and write them into `folder`; return the paths of the files.
 
-    `seed` is the seed of the displayed drive, for the title; `form` is one of FORMS.
+    `seed` is the seed of the displayed drive, which the titles state. `form` is the file format,
+    one of FORMS.
     """
     import matplotlib as mpl
 
@@ -277,8 +278,9 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> N
 
 
 def _draw_reliability(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot, over all scenarios, the share of true frictions that lie below each quantile of the
-    estimate."""
+    """Plot, over all scenarios, the share of drives and times at which the true friction lies below
+    each quantile of the estimate.
+    """
     from matplotlib import pyplot as plt
 
     found: dict[str, dict[float, float]] = {}
@@ -306,8 +308,9 @@ def _draw_reliability(figures: Sequence[Figure], path: Path) -> Path:
 
 def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
     """Write the ROC plot of the detection evaluation: share of passes over slippery road that are
-    found, against the number of false reports away from snow and ice. It compares the estimator,
-    the slip flag (ordinary ABS logic) and the oracle (knows motion and forces).
+    found, against the number of false reports away from snow and ice. The plot compares the
+    estimator, the slip flag (ordinary ABS logic) and the oracle (an ideal observer that knows
+    motion and forces).
     """
     import matplotlib as mpl
 

@@ -5,14 +5,18 @@ A folder contains LOG.parquet with its vehicle file LOG.json. Optional files are
 (columns t, vx, vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: known friction
 of the surface). The figures cover the time in which the car moves, from the third second on:
 
-    informative    share with an interval narrower than INFORMATIVE times the prior's
-    right          share of the informative time in which the interval agrees with the known
-                   friction: it contains the true one; if that is unknown, it reaches up to the grip
-                   that the car used
-    ice            share with P(slippery) > CALLED_SHARE although the road was not slippery
-    contradicted   share with the health flag CONTRADICTION
-    urgent         observations per hour that would be sent immediately, for logs with a position
-    used           99th percentile of mu_utilised
+    informative    share of the time with a friction interval narrower than INFORMATIVE times the
+                   prior's
+    right          share of the informative time in which the interval is consistent with the
+                   recording: it contains the true friction; if that is unknown, its upper end is at
+                   least the grip that the car used
+    ice            share of the time with P(slippery) > CALLED_SHARE although the road was not
+                   slippery
+    contradicted   share of the time with the health flag CONTRADICTION (no friction explains the
+                   data)
+    urgent         number of friction observations per hour that the agent would send immediately;
+                   only for logs with a position
+    used           99th percentile of the friction in use (mu_utilised)
     vx, vy, slip   root mean square errors of v_x, v_y [m/s] and sideslip [deg], where the true
                    values were measured
 """
@@ -69,8 +73,9 @@ HEAD: Final = (
 
 @dataclass(frozen=True)
 class LogFigures:
-    """Results for one log, such as the share of time with an informative interval; the module's
-    docstring lists them. A result is NaN where the log does not determine it.
+    """Results of the estimator on one log: shares of the time (informative, right, ice,
+    contradicted), urgent observations per hour, friction in use, and errors of the motion. A result
+    is NaN if it cannot be computed from the log.
     """
 
     name: str
@@ -90,7 +95,8 @@ class LogFigures:
 def judge_folder(
     folder: Path, log_line: Callable[[str], None] = lambda _: None
 ) -> list[LogFigures]:
-    """Evaluate every log in a folder for which there is a vehicle file.
+    """Evaluate every log in a folder for which there is a vehicle file. `log_line` is a function
+    that receives each line of text about the progress.
 
     Raises:
         InputError: the folder has no log with a vehicle file, or a log cannot be read.
@@ -126,10 +132,10 @@ def judge_log(path: Path) -> LogFigures:
 
 
 def replay_log(log: SignalLog, vehicle: Vehicle) -> tuple[FloatArray, int | None]:
-    """Replay a log; return the estimates (T, columns), and the number of urgent observations (those
-    that the agent would send immediately).
+    """Run the estimator on a log. Return the estimates (T, columns), and the number of urgent
+    observations (those that the agent would send immediately).
 
-    The number is None if the log has no position.
+    The number of urgent observations is None if the log has no position.
     """
     pipeline = Pipeline(bank_of(ESTIMATOR, [vehicle]), 1, AgentConfig())
     parts = []
@@ -177,7 +183,8 @@ def judge_estimates(
     urgent: int | None,
 ) -> LogFigures:
     """Return the evaluation results for one log, computed from its estimates `values` (T, columns)
-    and the measured true values.
+    and the measured true values `truth`. `known` is the friction of the surface and `urgent` the
+    number of urgent observations, if known.
     """
     t = adopted.log.t
     signals = adopted.log.signals
@@ -227,8 +234,9 @@ def judge_estimates(
 def known_friction(
     t: FloatArray, signals: FloatArray, moving: BoolArray, known: float | None
 ) -> float:
-    """Return one number for a log: a lower limit of the friction of its surface. It is the larger
-    of CERTAIN times the known friction (if it is known) and the grip that the car used.
+    """Return a lower limit of the friction of the surface on which a log was recorded. It is the
+    larger of two numbers: the grip that the car used while `moving`, and CERTAIN times the `known`
+    friction, if there is one.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     along, across = (
@@ -258,8 +266,8 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
 
 def summarise(found: Sequence[LogFigures]) -> list[Figure]:
     """Return the figures (named numbers) of the evaluation over all logs. Most are means weighted
-    by the duration of each log. Where one bad log is too many, the figure is the value of the worst
-    log.
+    by the duration of each log. For false ice, urgent observations and friction in use, the figure
+    is the value of the worst log.
     """
     seconds = np.array([log.seconds for log in found])
 

@@ -14,9 +14,10 @@ Legend
                   true friction
     false ice     share of the samples on wet and dry road with P(mu < SLIPPERY_MU) above
                   CALLED_SHARE. "settled": only samples at least SETTLED_S after snow and ice,
-                  because a driver notices the end of the ice only by using the grip. "of_all":
+                  because an estimator notices the end of the ice only when grip is used. "of_all":
                   share of all samples that are false ice on a road above SURE_GRIP
-    below         share of all samples whose upper end lies below the grip in use: certainly wrong
+    below         share of all samples whose friction interval ends below the grip in use, so that
+                  the interval is certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
     contradiction share of the samples with the health flag CONTRADICTION: no friction explains the
                   data
@@ -69,8 +70,8 @@ STANDING_SLOPES: Final = (0.05, 0.08)
 
 @dataclass
 class Tally:
-    """Accumulator of means over samples, by name of the measure: `add` adds values, and `means`
-    returns the mean of each measure.
+    """Sums and counts of the evaluation's measures over samples, by name of the measure: `add` adds
+    values, and `means` returns the mean of each measure.
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -88,8 +89,8 @@ class Tally:
     def means(self) -> dict[str, float]:
         """Return the mean of the values added under each name; NaN without values.
 
-        For a name that ends in "_squared", the root of the mean is returned, under the name without
-        this suffix.
+        For a measure whose name ends in "_squared", the function returns the root of the mean,
+        under the name without this suffix.
         """
         found = {
             name: total / self.count[name] if self.count[name] else np.nan
@@ -104,15 +105,13 @@ class Tally:
 
 
 def in_winter(seed: int) -> bool:
-    """Return True if the town with this seed is a winter town; half of the seeds give winter
-    towns.
-    """
+    """Return True if the town with this seed is a winter town; all towns with an odd seed are."""
     return seed % 2 == 1
 
 
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
-    """Simulate inaccurate cars in a town drawn by the seed; return their drives, and the largest
-    share of the grip used by any wheel (T, N).
+    """Simulate inaccurate cars in a town drawn by the seed; return their drives, and an array (T,
+    N) with the share of its grip that the most heavily used wheel of each car uses.
 
     In winter towns all cars have winter equipment.
     """
@@ -136,8 +135,8 @@ def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
 
 
 def in_use(batch: DriveSet) -> FloatArray:
-    """Return the grip that each car uses as a whole, (T, N) [1]: true horizontal acceleration over
-    g, smoothed, minus an allowance for noise.
+    """Return the grip that each car uses in total, (T, N) [1]: true horizontal acceleration divided
+    by g, averaged over a short time, minus an allowance for noise.
     """
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))

@@ -6,9 +6,9 @@ follows.
 
 - The default estimator can also output the likelihood of friction over a visit (passage of a map
   cell). Here a visit lasts from the start of the drive until now. The prior of the visit is
-  uniform, so the posterior is proportional to this likelihood. The estimator outputs it only when
-  the visit ends. Therefore the visit is ended in a copy of the estimator, and the original
-  estimator continues the drive.
+  uniform, so the posterior is proportional to this likelihood. The estimator outputs the likelihood
+  only when the visit ends. Therefore the visit is ended in a copy of the estimator, and the
+  original estimator continues the drive.
 - For other estimators, the posterior is assumed to be Gaussian, or uniform if the interval is as
   wide as the prior's (see `between_quantiles`).
 """
@@ -34,8 +34,8 @@ EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
     """Return the estimates of the drives, and an array (K, N) with the rank of the true friction at
-    K times, EVERY_S apart, in N drives. The rank is the posterior probability of a smaller
-    friction.
+    K times, EVERY_S apart, in N drives. The rank is the probability that the estimator's posterior
+    gives to frictions below the true one.
     """
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))

@@ -131,8 +131,8 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
 
 
 def table(values: dict[str, float]) -> str:
-    """Return a Markdown table that compares the numbers printed in the papers with the numbers
-    measured here.
+    """Return a Markdown table that compares the numbers printed in the papers with the results of
+    this evaluation, `values` by name.
     """
     rows = []
     for row in PRINTED:
@@ -146,7 +146,7 @@ def table(values: dict[str, float]) -> str:
 
 
 def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table with the given head and rows."""
+    """Return a Markdown table with the column titles `head` and the given rows of cells."""
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
@@ -287,9 +287,9 @@ def faults(values: dict[str, float]) -> str:
 
 
 def verdict(shares: Sequence[float]) -> str:
-    """Return the cell of the report for a check of several drives. `shares` are shares of drives
-    that passed. The cell is "yes" if all are 1, otherwise "NO" with the smallest share; a dash if
-    there are none.
+    """Return the cell of the report for a check of several estimators. `shares` has, for each
+    estimator, the share of drives that passed the check. The cell is "yes" if all shares are 1,
+    otherwise "NO" with the smallest share; a dash if there are no shares.
     """
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 

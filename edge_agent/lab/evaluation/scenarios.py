@@ -1,8 +1,9 @@
 """The scenarios of the evaluation: the papers' manoeuvres with the papers' vehicles, the manoeuvres
 for the default estimator's targets, and manoeuvres of other vehicles.
 
-Data that a paper does not give (tyres, wheel inertia, the vehicle of paper 003) are those of the
-simulator's sedan or of an ordinary car. All four wheels are driven, as in the papers.
+If a paper does not give some data (tyres, wheel inertia, the vehicle of paper 003), the scenario
+uses those of the simulator's sedan or of an ordinary car. All four wheels are driven, as in the
+papers.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ STIFFNESS_STD: Final = 0.12  # standard deviation of ln k, the same as that of t
 
 
 def tyres_drawn() -> FloatArray:
-    """Return a random sample of tyres (TYRES, 3): shape c, curvature e and stiffness factor k. It
-    is the same at each call.
+    """Return a random sample of tyres (TYRES, 3): shape c, curvature e and stiffness factor k. Each
+    call returns the same sample.
     """
     rng = np.random.default_rng(0)
     shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)
@@ -57,8 +57,9 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return the oracle's evidence of a visit (passage of a map cell): the log-likelihood ln L
-    (BINS,) on the friction grid, with maximum 0. Noise is added to the true values first.
+    """Return the evidence that the oracle (an ideal observer) gets from a visit (passage of a map
+    cell): the log-likelihood ln L (BINS,) on the friction grid, with maximum 0. The function first
+    adds noise to the true values that it gets.
 
     Args:
         force: true force over load (T, 4) [1].

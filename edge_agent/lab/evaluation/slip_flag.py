@@ -1,12 +1,12 @@
 """Slip flag: the friction that ordinary ABS, traction control and ESC logic would report without
 any estimator.
 
-It is the baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and
-steering, and the vehicle file.
+The slip flag is the baseline for the detection of slippery road. It uses the recorded wheel speeds,
+accelerometers, yaw rate and steering, and the vehicle file.
 
     reference speed  fastest wheel while braking, slowest while driving, else the median; it changes
-                     at most by the accelerometer's reading plus FREE; once all wheels have agreed
-                     for AGREE_S it is their speed
+                     at most by the accelerometer's reading plus FREE; once the speeds of all wheels
+                     have agreed for AGREE_S, it is their speed
     slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i is
                      the reference speed at wheel i, including the yaw rate; no slip below SLOWEST
     yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S

@@ -78,7 +78,9 @@ def campaign(
     quick: bool,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> Scores:
-    """Return the interval scores of friction by filter variant and surface, one number per seed."""
+    """Return the interval scores of friction by filter variant and surface, one number per seed.
+    `log_line` is a function that receives each line of text about the progress.
+    """
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
     chosen = [seeds[0]] if quick else list(seeds[:count])
     found = ways()
@@ -102,8 +104,9 @@ def campaign(
 
 
 def ways() -> dict[str, list[MixtureDesign]]:
-    """Return, by the name of each variant, the tables of its filters. A variant whose vertices
-    (corners of fuzzy sets) come from several searches has one filter per search.
+    """Return, by the name of each filter variant, the parameter tables (`MixtureDesign`) of its
+    filters. A variant whose vertices (corners of fuzzy sets) come from several searches has one
+    filter per search.
     """
     untuned = Memberships()
     found = {
@@ -118,7 +121,7 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the tables (`design`) of the default filter for the variant without fuzzy sets. Like
+    """Return the parameter tables of the default filter for the variant without fuzzy sets. Like
     the default, this variant still adapts the measurement noise R to strain (deviation of states
     from their prior) and runs the consistency test.
     """
@@ -129,8 +132,8 @@ def without_sets() -> MixtureDesign:
 
 
 def manoeuvres(seed: int, seconds: float) -> DriveSet:
-    """Simulate one drive of each manoeuvre with misaligned sensors. The seed determines vehicle,
-    friction and road.
+    """Simulate one drive of each manoeuvre, `seconds` [s] long, with misaligned sensors. The seed
+    determines vehicle, friction and road.
     """
     rng = np.random.default_rng([seed, 17])
     drives = []
@@ -153,8 +156,8 @@ def manoeuvres(seed: int, seconds: float) -> DriveSet:
 
 
 def run_filter(batch: DriveSet, design: MixtureDesign) -> tuple[Estimates, FloatArray]:
-    """Run the filter with the tables `design` on a set of N drives. Return its estimates, and the
-    interval scores of friction (K, N) of the K samples from SETTLED_S on.
+    """Run the default filter with the parameter tables `design` on a set of N drives. Return its
+    estimates, and the interval scores of friction (K, N) of the K samples from SETTLED_S on.
     """
     bank = mixture_bank(parameter_table(batch.vehicles), design)
     estimates = bank.advance(batch.t, batch.signals)
@@ -163,9 +166,9 @@ def run_filter(batch: DriveSet, design: MixtureDesign) -> tuple[Estimates, Float
 
 
 def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[str, float]:
-    """Run the filter with the tables `design` on the drives. Return the mean interval score of
-    friction over all drives ("all"), and over the samples of each surface (NaN if a surface does
-    not occur).
+    """Run the default filter with the parameter tables `design` on the drives. Return the mean
+    interval score of friction over all drives ("all"), and over the samples of each surface (NaN if
+    a surface does not occur).
     """
     drives = []
     samples = []
@@ -183,8 +186,9 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
 
 
 def ratio(scores: Scores, name: str) -> float:
-    """Return the ratio `name` of two variants: the mean interval score of one over all seeds,
-    divided by that of the other; NaN if either was not measured.
+    """Return the figure `name`: the mean interval score of one filter variant over all seeds,
+    divided by that of another variant. RATIOS states the two variants; the result is NaN if either
+    was not measured.
     """
     over, under = (scores.get(way) for way in RATIOS[name])
     return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan

@@ -1,5 +1,5 @@
 """Source of simulated samples: a simulated fleet delivers blocks (samples of a short time) without
-end, and a recorder receives the true values.
+end. A recorder can store the true values.
 """
 
 from __future__ import annotations

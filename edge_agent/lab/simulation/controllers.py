@@ -1,15 +1,16 @@
 """Simulated controllers of a vehicle: ABS, traction control (TCS), drag torque control and ESC.
 
 Each controller acts in every integration step of the vehicle model. It gets the true slip of the
-wheels: the effect of the controllers on the wheels is simulated, but not their sensors.
+wheels, because the simulation includes the effect of the controllers on the wheels, but not their
+sensors.
 
     ABS    If a wheel exceeds its slip limit, its brake torque is reduced at the rate DUMP, then
-           held until the slip is half of the limit. It is then increased again: fast up to NEARLY
-           times the torque at which the reduction began, then slowly. This gives 6 to 10 cycles
-           per second. Both rear wheels get the lower of their two torques.
+           held until the slip is half of the limit. The torque is then increased again: fast up to
+           NEARLY times the torque at which the reduction began, then slowly. This gives 6 to 10
+           cycles per second. Both rear wheels get the lower of the two rear torques.
     TCS    The engine torque is cut while a driven wheel spins, and the brake holds a wheel that
-           spins much. The same cut ends the drag torque of engine or generator when the driver
-           releases the accelerator, and while ABS acts.
+           spins much. The same logic removes the drag torque of engine or generator if that torque
+           makes a wheel slip, and while ABS acts.
     ESC    If the yaw rate differs from the value expected from steering, one wheel is braked: the
            outer front wheel of a car that turns too much, the inner rear wheel of a car that turns
            too little. The engine torque is cut.
@@ -73,7 +74,7 @@ def slip_limit(p: FloatArray, i: int) -> float:
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
     """Advance all slip controllers (ABS, traction control) in the vehicle's state `x` by `dt` [s],
-    from the wheel slips in `w` (8, 4), the parameters `p` and the inputs `u` (5, 4).
+    from the wheel slips in `w` (8, 4), the vehicle's parameters `p` and its inputs `u` (5, 4).
     """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
@@ -97,9 +98,10 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 @compiled
 def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
-    """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce it while
-    the wheel slips too much, else hold or increase it. `x` is the vehicle's state, which is
-    changed, `p` its parameters, `u` the inputs and `w` the forces and slips of the wheels.
+    """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce the
+    limit while the wheel slips too much, otherwise hold or increase it. `x` is the vehicle's state,
+    which is changed, `p` the vehicle's parameters, `u` the inputs and `w` the forces and slips of
+    the wheels.
     """
     asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
@@ -124,7 +126,8 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 @compiled
 def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
     """Return the drive slip of wheel `i` divided by the slip at which traction control acts [1].
-    `x` is the vehicle's state, `p` its parameters, and `w` contains the wheels' speeds over ground.
+    `x` is the vehicle's state, `p` the vehicle's parameters, and `w` contains the wheels' speeds
+    over ground.
     """
     along = w[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
@@ -136,8 +139,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
     """Cut or restore the engine torque in the vehicle's state `x` over `dt` [s], as traction
     control does.
 
-    Return True if traction control acts now: the vehicle has it, and a wheel slips too much because
-    it spins or because drag torque slows it.
+    Return True if traction control acts now. It acts if the vehicle has traction control, and a
+    wheel slips too much because it spins or because drag torque slows it.
     """
     acts = drags = False
     for i in range(4):
@@ -158,7 +161,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 
 @compiled
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
-    """Update the stability control (ESC) in the vehicle's state `x` by `dt` [s], from the inputs
+    """Advance the stability control (ESC) in the vehicle's state `x` by `dt` [s], from the inputs
     `u` and the parameters `p`. Return two values: the index of the wheel that ESC brakes (-1 for
     none), and the brake torque divided by weight times wheel radius.
     """

@@ -2,9 +2,9 @@
 
 With a stateful generator, a vehicle's noise would depend on the number of vehicles and on the
 division of a drive into blocks (samples of a short time). With a counter-based generator (Salmon et
-al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) it does not: sample k of channel c of a
-vehicle is the same number in any order of requests. The hash is the finaliser of SplitMix64
-(Steele, Lea, Flood, OOPSLA 2014).
+al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) the noise depends on neither: sample k
+of channel c of a vehicle is the same number in any order of requests. The hash is the finaliser of
+SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
 
 Counters must be non-negative.
 """
@@ -69,7 +69,7 @@ def normal(key: np.uint64, counter: int) -> float:
     """Return a standard normal random number for `counter` in the stream `key` (Box and Muller,
     1958).
 
-    It uses the hashes with the counters 2·counter and 2·counter + 1.
+    The number is computed from the two hashes with the counters 2·counter and 2·counter + 1.
     """
     first = TWO * np.uint64(counter)
     u = (float(mix_bits(key, first) >> DROP) + 0.5) * UNIT

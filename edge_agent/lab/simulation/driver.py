@@ -110,7 +110,9 @@ STOP_DRAW: Final = 1 << 32
 
 @compiled
 def ways_of(ways: IntArray, lane: int) -> int:
-    """Return the number of lanes of the road network that continue from the end of a lane."""
+    """Return the number of lanes that continue from the end of lane number `lane`. `ways` has the
+    numbers of these lanes, one row per lane.
+    """
     count = 0
     while count < ways.shape[1] and ways[lane, count] >= 0:
         count += 1
@@ -149,8 +151,8 @@ def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tu
     in the table of points, and the metres beyond that point. `d` is the driver's state, `g` the
     vehicle's place on the route.
 
-    The route is decided only to the end of the next lane; beyond that, the function assumes the
-    first continuation of each lane.
+    The random choice of the route is made only one lane in advance. Beyond the end of the next
+    lane, the function assumes the first continuation of each lane.
     """
     _, first, size, spacing, ways = lanes
     lane = g[Route.LANE]
@@ -187,9 +189,9 @@ def cruise(d: FloatArray) -> float:
 
 @compiled
 def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s]. It
-    depends on `looks`, the friction that the road ahead seems to have, and on sliding wheels in
-    `w`.
+    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s]. This grip
+    depends on `looks`, the friction that the road ahead seems to have, and on whether wheels slide,
+    as `w` (forces and slips of the wheels) shows.
     """
     lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
     d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
@@ -213,8 +215,8 @@ def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
 
 @compiled
 def heeds_warning(d: FloatArray) -> bool:
-    """Return True if the driver with the state `d` takes a warning into account now, after the
-    reaction time.
+    """Return True if the driver with the state `d` takes a warning into account now: there is a
+    warning, and the reaction time has passed.
     """
     return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
 
@@ -234,8 +236,8 @@ def traffic_braking(t: float, key: Key) -> float:
 def is_stopping(t: float, share: float, key: Key) -> bool:
     """Return True if the driver is stopping or waiting now.
 
-    The driver stops at the beginning of some time windows of length ALERT_S. They are drawn at
-    random, with probability `share` each.
+    The driver stops at the beginning of some time windows of length ALERT_S. These windows are
+    chosen at random; each is chosen with probability `share`.
     """
     window = int(t / ALERT_S)
     return bool(
@@ -250,8 +252,8 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     """Return the square of the driver's target speed [m^2/s^2] at the start of a stretch of which
     the driver was warned.
 
-    The target speed is the advised speed. It is reduced if later points of the route would
-    otherwise require more braking on the stretch than the expected grip allows.
+    The target speed is the advised speed. It is lower if the bends and junctions ahead require a
+    lower speed on a road with the grip that the warning announces.
     """
     row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]
@@ -326,8 +328,9 @@ def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
     """Return the longitudinal force [N] that a driver demands from a vehicle with the parameters
-    `p` for an `acceleration` [m/s^2]. `along` [m/s^2] is the acceleration by gravity along the
-    road. The force is limited by tyres and engine.
+    `p` to reach an `acceleration` [m/s^2] at the speed `vx` [m/s]. `d` is the driver's state.
+    `along` [m/s^2] is the acceleration by gravity along the road. The force is limited by tyres and
+    engine.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
@@ -342,8 +345,8 @@ def wished_steer(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
     """Return the mean road-wheel angle [rad] with which the driver steers on a circle to a point
-    ahead. `x` is the vehicle's state, `d` the driver's, `g` the place on the route. The angle is
-    limited to the angles that the front tyres can follow.
+    ahead. `x` is the vehicle's state, `d` the driver's state, `p` the vehicle's parameters and `g`
+    the place on the route. The angle is limited to the angles that the front tyres can follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
@@ -376,9 +379,10 @@ def drive(
     """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
     d[STEER] and d[FORCE] are the road-wheel angle and the force that the driver now demands.
 
-    `vehicle` is the vehicle's state, its parameters, and its wheels at the last sample. `world` is
-    the lanes and the friction table. `now` is the time [s], the length of the sample [s] and the
-    acceleration by gravity along the road [m/s^2]. `keys` are the random keys of route and traffic.
+    `vehicle` is the vehicle's state, its parameters, and the forces and slips of its wheels at the
+    last sample. `world` is the lanes and the friction table. `now` is the time [s], the length of
+    the sample [s] and the acceleration by gravity along the road [m/s^2]. `keys` are the random
+    keys of route and traffic.
     """
     x, p, w = vehicle
     d, g = driver

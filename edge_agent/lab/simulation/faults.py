@@ -1,4 +1,6 @@
-"""Sensor faults as a table: kind of fault -> function that applies it to a channel."""
+"""Sensor faults as a table, which has for each kind of fault the function that applies it to a
+channel's readings.
+"""
 
 from __future__ import annotations
 

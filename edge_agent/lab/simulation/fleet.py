@@ -101,13 +101,14 @@ def run(
     samples: tuple[int, int],
     timing: tuple[float, int],
 ) -> FloatArray:
-    """Simulate the next samples; return records with the true values (T, N, RECORD). The states
-    are advanced in place.
+    """Simulate the next T samples of N vehicles. Return records with the true values (T, N,
+    RECORD), and advance the states in place.
 
-    `states` are those of vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4) and wheels
-    (N, 8, 4). `ground` is the lanes, the friction table and the relief table. `keys` are the random
-    keys of routes and of traffic (N,). `samples` is the number of the first sample, and how many
-    samples to simulate. `timing` is the sample period [s], and the integration steps per sample.
+    `states` are the states of the vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4) and
+    wheels (N, 8, 4); `parameters` are those of the vehicles. `ground` is the lanes, the friction
+    table and the relief table. `keys` are the random keys of routes and of traffic (N,). `samples`
+    is the number of the first sample, and how many samples to simulate. `timing` is the sample
+    period [s], and the integration steps per sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground
@@ -153,7 +154,7 @@ class SimulatedFleet:
     Args:
         scenario: a key of SCENARIOS, or a Scenario.
         vehicles: number of vehicles; the drive of vehicle k does not depend on it.
-        seed: non-negative.
+        seed: seed of all random numbers, non-negative.
         rate_hz: sampling rate [Hz].
         rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors instead of
             ORDINARY ones, and drivers who stop now and then.
@@ -278,7 +279,8 @@ class SimulatedFleet:
         return self.scenario.to_latlon(line[:, 0], line[:, 1])
 
     def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
-        """Warn the driver of vehicle k of a slippery stretch.
+        """Warn the driver of vehicle k of a slippery stretch of road. The driver responds after a
+        reaction time.
 
         `stretch` is the start and the end of the slippery stretch as distances ahead [m]; (0, 0)
         cancels the warning. `speed` [m/s] is the advised speed and `mu` the friction to expect.
@@ -292,7 +294,8 @@ class SimulatedFleet:
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for rough (inaccurate) vehicles: the share `share` of all,
-    evenly distributed. The value for vehicle k does not depend on the number of vehicles.
+    evenly distributed over the vehicle numbers. The value for vehicle k does not depend on the
+    number of vehicles.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))

@@ -75,8 +75,9 @@ class PatchColumn(IntEnum):
 
 
 def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
-    """Return the table for `look_up`, shape (1 + patches, 10). Its first row is the background, an
-    infinite patch.
+    """Return the friction table, from which `look_up` reads: one row per patch, with the columns of
+    `PatchColumn`, shape (1 + patches, 10). The first row is the friction `background`, a patch
+    without limits.
     """
     everywhere = Patch("background", 0.0, 0.0, math.inf, math.inf, background, looks=background)
     table = np.empty((1 + len(patches), len(PatchColumn)))
@@ -90,8 +91,8 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
     """Return the value of `column`, MU (true friction) or LOOKS (friction that a driver expects),
-    at (x, y) [m] and t [s]. It is that of the last patch in the table that covers the point and for
-    which the column is defined.
+    at (x, y) [m] and t [s]. The value comes from the last patch in the table that covers the point
+    at this time and has a number in this column.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]

@@ -1,5 +1,5 @@
-"""Simulated drivers who receive warnings and slow down. The module keeps their routes ahead, and
-passes warnings to them.
+"""Simulated drivers who receive warnings and slow down. The module stores the routes ahead of these
+drivers, and passes warnings to the drivers.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class WarnedDrivers:
     """The drivers of a fleet who are warned.
 
     Args:
-        fleet: the vehicles.
-        share: share of the drivers who are warned, from 0 to 1; the choice of vehicle k does not
-            depend on the number of vehicles.
+        fleet: the simulated vehicles.
+        share: share of the drivers who are warned, from 0 to 1; the choice whether the driver of
+            vehicle k is warned does not depend on the number of vehicles.
 
     Raises:
         InputError: the share is not between 0 and 1.

@@ -25,8 +25,8 @@ class Moment:
     """State that a driver knows at an instant: time [s], pose [m, m, rad], speed [m/s], and
     demanded speed [m/s].
 
-    Speed control by hub motors also uses `lost` [m], the integral of the speed error, and `gain`
-    [m/s^2], the acceleration.
+    The speed control of hub motors also uses `lost` [m], the integral of the speed error over time,
+    and `gain` [m/s^2], the present acceleration.
     """
 
     t: float
@@ -89,8 +89,8 @@ def split(left: float, right: float) -> Callable[[float, float], float]:
 
 
 def hold(now: Moment, speed: float | None = None) -> float:
-    """Return the acceleration [m/s^2] that brings the car back to `speed` [m/s], by default the
-    demanded speed.
+    """Return the acceleration [m/s^2] that brings the car back to `speed` [m/s], by default to the
+    demanded speed of the manoeuvre.
     """
     error = (now.speed if speed is None else speed) - now.vx
     if now.motors is not None:
@@ -111,7 +111,7 @@ def steer_to(now: Moment, target_x: float, target_y: float) -> float:
 
 
 def preview(now: Moment) -> float:
-    """Return the distance ahead of the car [m] of the point to which the driver steers."""
+    """Return the distance [m] between the car and the point ahead to which the driver steers."""
     return max(4.0, 0.6 * now.vx)
 
 

@@ -1,22 +1,22 @@
 """Sensor errors of real cars: tilted mounts, steering offset, unequal wheels, coarse wheel speed
 counters, clock delays.
 
-The errors are drawn once per vehicle. Each number is a hash of (seed, vehicle, its index), so that
-the numbers do not influence each other.
+The errors are drawn once per vehicle. Each random number is a hash of (seed, vehicle, index of the
+number), so it depends on no other random number.
 
 Legend
     θ, φ, ψ  pitch, roll and yaw of the inertial unit's mount [rad], to first order:
              a_x' = a_x + g θ + ψ a_y,  a_y' = a_y + g φ − ψ a_x
     δ        front wheel angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), with offset, gain, and a gain
              error that depends on the angle
-    ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
-    Δω       step width of wheel speeds; a wheel that stands reads zero, because teeth are counted
-        τ        delay of a device: it reports the state at a time τ earlier
+    ε        of each wheel: ω' = ω (1 + ε), as if the radius were smaller by the share ε
+    Δω       step width of wheel speed readings; a wheel that stands reads exactly zero
+    τ        delay of a device: it reports the state at a time τ earlier
 
-The sizes are those found in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y
-.07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at speed and 5 to 15
-% at .3 to .5 rad, radii that differ by .15 to 1.6 %, wheel speeds in steps of up to 1 km/h, clock
-differences of .02 to .4 s, and torque in hardly any log.
+The sizes of the errors are those found in eleven public logs of real cars: offsets of a_x .22 to
+.96 and of a_y .07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at
+speed and 5 to 15 % at .3 to .5 rad, radii that differ by .15 to 1.6 %, wheel speeds in steps of up
+to 1 km/h, clock differences of .02 to .4 s, and torque in hardly any log.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ DEVICE_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Sizes of the sensor errors of a fleet. Each is a standard deviation, or the largest value
-    where its comment says so.
+    """Sizes of the sensor errors of a fleet: tilted mounts, steering, wheel radii, steps of wheel
+    speeds, delays, and the share of cars without torque signal. The comment of each size states
+    whether it is a standard deviation or a largest value.
     """
 
     tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # standard deviations of θ, φ, ψ [rad]
@@ -121,8 +122,8 @@ def memory_of(rows: FloatArray, rate_hz: float) -> int:
 
 @compiled
 def delayed_record(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
-    """Fill `record` (32,) with the true values at `samples` samples before row `now` of `records`
-    (T, 32); a fraction of a sample is interpolated linearly.
+    """Fill `record` (RECORD,) with the true values `samples` samples before row `now` of `records`
+    (T, RECORD). If `samples` is not an integer, the values are interpolated linearly.
 
     For times before the first record, the first record is used.
     """
@@ -154,8 +155,9 @@ def misalign(mounted: FloatArray, signals: FloatArray) -> None:
 
 @compiled
 def quantise_speeds(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
-    """Round the wheel speeds to steps, with zero for a wheel that stands. Remove the torque
-    readings if the car has no torque signal.
+    """Round the wheel speeds in `signals` (18,) to the sensor's steps; the speed of a wheel that
+    stands becomes zero. Replace the torque readings with NaN if the car has no torque signal.
+    `mounted` is the vehicle's row of sensor errors.
     """
     step = mounted[Misaligned.STEP]
     for i in range(4):

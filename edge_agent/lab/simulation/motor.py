@@ -15,8 +15,9 @@ Legend, in the rotor's d-q axes
 
 The inverter's current control is proportional-integral with feed-forward of the motor's own terms.
 The target of i_d is zero, and the voltage is limited. The paper gives no constants; these are of an
-ordinary hub motor. The mechanical motion is computed in `plant` with the wheel, whose inertia
-includes the rotor. Viscous friction is left out, because the filters use the torque at the wheel.
+ordinary hub motor. The module `plant` computes the rotation of motor and wheel together; the
+wheel's inertia includes the rotor. Viscous friction is left out, because the filters use the torque
+at the wheel.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: 
     """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque
     at the wheel [N m].
 
-    wanted: demanded torque at the wheel [N m].
+    `wanted` is the demanded torque at the wheel [N m].
     """
     per_ampere = 1.5 * motor.pole_pairs * motor.flux
     aim = wanted / (motor.gear * per_ampere)

@@ -20,13 +20,13 @@ accelerations with a lag, the body rolls, and there are air drag and rolling res
     g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to
                                                            the left
 
-An accelerometer measures all forces except gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where
-the vehicle stands. The load transfer follows the measured acceleration, and the sum of the loads is
-the part of the weight normal to the road.
+An accelerometer measures the effect of all forces except gravity: (dv_x/dt − r v_y − g_x). Its
+reading is therefore g sin(slope) where the vehicle stands. The load transfer follows the measured
+acceleration, and the sum of the loads is the part of the weight normal to the road.
 
-By default the slip stiffness K does not depend on μ, because friction acts by similarity (Pacejka,
-Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z. With an option of the vehicle, K grows
-with μ.
+By default the slip stiffness K does not depend on μ: friction scales both axes of the force curve
+(similarity method, Pacejka, Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z. With an
+option of the vehicle, K grows with μ.
 
 A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
 that length), and controllers that work in cycles and report their activity (ABS_HZ:
@@ -34,9 +34,9 @@ that length), and controllers that work in cycles and report their activity (ABS
 
 Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
 slip is stiff. With the secant slope of the tyre in the denominator, the step of a wheel is stable
-at any speed. The tyre force is taken at the end of the step. Therefore it includes the change of
-the ground's speed under the wheel; without that term a wheel would seem to have twice its inertia.
-Wheel order fl, fr, rl, rr; ISO 8855 signs.
+at any speed. The tyre force is taken at the end of the step. Therefore the step includes the change
+of the ground's speed under the wheel; without that term a wheel would seem to have twice its
+inertia. Wheel order fl, fr, rl, rr; ISO 8855 signs.
 """
 
 from __future__ import annotations
@@ -89,7 +89,9 @@ def gravity(u: FloatArray) -> tuple[float, float, float]:
 @compiled
 def stiffness_per_load(slope: float, degression: float, load: float, at_rest: float) -> float:
     """Return the slip stiffness over load, K/F_z [1], of a wheel under `load` [N] whose static load
-    is `at_rest` [N]."""
+    is `at_rest` [N]. `slope` [1] is this ratio at the static load, and `degression` [1] its
+    relative decrease if the load doubles.
+    """
     return slope * max(1.0 - degression * (load / at_rest - 1.0), SOFTEST)
 
 
@@ -129,8 +131,9 @@ def wheel_torques(
 
 @compiled
 def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
-    """Advance the delayed part of the tyres' slip in the vehicle's state `x` by `dt` [s], after the
-    wheel speeds have been updated. It follows the slip of the wheels over the relaxation length.
+    """Advance the delayed part of the tyres' slip in the vehicle's state `x` by `dt` [s]: over the
+    relaxation length, it approaches the slip of the wheels. The wheel speeds in `x` must already
+    have been updated.
     """
     for i in range(4):
         along, across = wheel_velocity(
@@ -226,8 +229,8 @@ def turn_wheels(
     """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in the vehicle's state
     `x`: every torque that decreases with ω acts as damping.
 
-    `change` is dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. They give the change of the
-    ground's speed under the wheels.
+    `change` is dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. From them follows the change of
+    the ground's speed under the wheels.
     """
     gain, yaw_acceleration = change
     radius = p[Parameter.RADIUS]
@@ -257,8 +260,8 @@ def turn_wheels(
 
 @compiled
 def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
-    """Return True if a standing vehicle with state `x`, parameters `p` and inputs `u` is held by
-    its brakes. This is so if brakes and tyres can hold more force than engine and slope exert.
+    """Return True if a vehicle with state `x`, parameters `p` and inputs `u` stands and is held by
+    its brakes: brakes and tyres can hold more force than engine and slope exert.
     """
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
@@ -277,7 +280,8 @@ def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 @compiled
 def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """Apply one step of `dt` [s] to the state `x` of a vehicle that is held by its brakes: only the
-    suspension moves, towards its equilibrium on the slope.
+    suspension moves, towards its equilibrium on the slope. `p` and `u` are the vehicle's parameters
+    and inputs.
     """
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
@@ -293,7 +297,8 @@ def advance(
     x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
 ) -> None:
     """Advance the state `x` of the simulated vehicle by `substeps` integration steps of `dt` [s]
-    with constant inputs `u`; `w` (8, 4) is scratch.
+    with parameters `p` and constant inputs `u`. `w` (8, 4) is scratch memory for forces and slips
+    of the wheels.
     """
     along, across, _ = gravity(u)
     for _ in range(substeps):

@@ -125,7 +125,9 @@ def car(
     longitudinal slip, and 17 per radian of slip angle.
 
     `body` is mass [kg], yaw inertia [kg m^2] and height of the centre of gravity [m]; `axles` are
-    the distances [m] from the centre of gravity to the front and rear axle.
+    the distances [m] from the centre of gravity to the front and rear axle, `tracks` the front and
+    rear track width [m]. `radius` is the wheel radius [m], and `drive_front` the share of the
+    driving force at the front axle.
     """
     mass, yaw_inertia, cg_height = body
     load = mass * GRAVITY / 4.0
@@ -226,7 +228,8 @@ def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
     """Return the vehicle without the effects that the papers' model leaves out: drag, rolling
     resistance, lag of the loads, tyres whose stiffness grows less than the load.
 
-    The tyre curve is a Magic Formula that is as steep as Dugoff's in its middle part.
+    The tyre curve of the returned vehicle is a Magic Formula whose middle part is as steep as that
+    of the Dugoff model.
     """
     return replace(
         vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0
@@ -234,8 +237,9 @@ def matched_to_papers(vehicle: TrueVehicle) -> TrueVehicle:
 
 
 def as_printed(vehicle: TrueVehicle, *, proportional: bool = False) -> TrueVehicle:
-    """Return the `matched_to_papers` vehicle with Dugoff tyres. With `proportional`, stiffness is
-    proportional to friction.
+    """Return the vehicle without the effects that the papers' model leaves out (see
+    `matched_to_papers`), and with Dugoff tyres. With `proportional`, tyre stiffness is proportional
+    to friction.
     """
     stiffness = "proportional-to-friction" if proportional else "similarity"
     return replace(matched_to_papers(vehicle), curve="dugoff", stiffness=stiffness)
@@ -253,8 +257,8 @@ def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:
-    """Return vehicle number `index` of a fleet. The presets are used one after the other; load,
-    tyres and suspension of each vehicle are random.
+    """Return vehicle number `index` of a fleet. It is based on the vehicle presets, used in turn;
+    load, tyres and suspension of each vehicle are random.
     """
     base = list(PRESETS.values())[index % len(PRESETS)]
     extra = rng.uniform(0.0, 0.12)  # passengers and luggage

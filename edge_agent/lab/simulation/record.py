@@ -50,7 +50,8 @@ RECORD: Final = 39
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
     """Fill `record` (RECORD,) with the true values of the vehicle at this instant, from its state
-    `x`, parameters `p` and inputs `u`. The function also fills `w`, the forces of the wheels.
+    `x`, parameters `p` and inputs `u`. The function also fills `w`, the forces and slips of the
+    wheels.
     """
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)

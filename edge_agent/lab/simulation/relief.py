@@ -9,9 +9,9 @@ Legend
     c, b    crossfall to the right of a lane [1], and banking per curvature [m], which lowers the
             inner side of a bend
 
-Slopes add up and are limited to STEEPEST. Positions are measured along the road, so that a metre on
-a slope of 8 % is a metre here and .997 m on a map. The sizes are those of real roads: standard
-deviation 3 %, hardly ever more than 8 %, crossfall 2.5 %.
+Slopes add up and are limited to STEEPEST. Positions are measured along the road, so that a metre of
+road on a slope of 8 % counts as a metre, although it is .997 m on a map. The sizes are those of
+real roads: standard deviation 3 %, hardly ever more than 8 %, crossfall 2.5 %.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class Relief:
 
     @property
     def table(self) -> FloatArray:
-        """Return the table for `gradient`, shape (1 + waves, 6): crossfall and banking in the first
-        row, then one row per wave (`WaveColumn`).
+        """Return the relief as a table, from which the function `gradient` reads, shape (1 + waves,
+        6). The first row has crossfall and banking, and each further row one wave (`WaveColumn`).
         """
         table = np.zeros((1 + len(self.waves), len(WaveColumn)))
         table[0, :2] = self.crossfall, self.banking
@@ -112,8 +112,8 @@ def gradient(
     table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
     """Return the slope of the road at `place` (x, y) [m] as the gradient of its height: rise per
-    metre east and per metre north [1]. The road rises by `left` [1] to the left of the direction
-    `heading` (cos, sin).
+    metre east and per metre north [1]. `table` is the relief table. The lane's cross slope is
+    `left` [1]: the rise to the left of the direction `heading` (cos, sin).
     """
     east = -left * heading[1]
     north = left * heading[0]

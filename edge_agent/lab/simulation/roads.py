@@ -3,9 +3,9 @@ direction on the right, and connectors through junctions.
 
     lane       a directed polyline, points about a metre apart, with heading and curvature
     connector  a lane through a junction, from the end of one lane to the start of another road's
-    profile    v²/q at each point [m], where v is the speed of a driver who accepts lateral
-               accelerations of q m/s^2 and braking of BRAKING·q and knows the next turns; because
-               v² is proportional to q, one profile serves all drivers
+    profile    v²/q at each point [m], where v is the highest speed of a driver who accepts lateral
+               accelerations of q m/s^2 and braking of BRAKING·q, and sees the next turns;
+               because v² is proportional to q, one profile serves all drivers
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class Network:
 
     `ways[k]` (MOST_WAYS,) are the numbers of the lanes that continue from the end of lane k, -1 in
     unused places; `spacing[k]` [m] is the distance between its points. The first `roads` lanes are
-    roads, the others connectors. `starts` (vehicles,) are the lanes at whose beginnings vehicles
-    start; None: the vehicles are distributed over the roads.
+    roads, the others connectors (lanes through junctions). `starts` (vehicles,) are the lanes at
+    whose beginnings vehicles start; None: the vehicles are distributed over the roads.
     """
 
     points: FloatArray
@@ -183,7 +183,7 @@ def shifted_right(line: FloatArray, offset: float) -> FloatArray:
 
 def connect_lanes(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
     """Return the line through a junction: points (n, 2) [m] of a cubic Bezier curve from the end of
-    one lane to the start of the other, without a kink.
+    the lane `arriving` to the start of the lane `leaving`, without a kink.
     """
     p0 = arriving[-1]
     p3 = leaving[0]
@@ -268,7 +268,8 @@ def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
     """Compute the speed profiles of all lanes (v²/q: squared speed over the acceleration that the
-    driver accepts): backwards from their ends, repeatedly until nothing changes.
+    driver accepts): for each lane backwards from its end, repeatedly until no profile changes. The
+    profiles are written into `tables`.
 
     At each point, a driver brakes at most with the part of the accepted acceleration that cornering
     leaves.

@@ -63,7 +63,9 @@ class Scenario:
 
     @cached_property
     def network(self) -> Network:
-        """Return the road network of the scenario, that is, its lanes and connectors."""
+        """Return the road network of the scenario: its lanes and connectors (lanes through
+        junctions).
+        """
         return build_network(self.junctions, self.roads)
 
     @cached_property
@@ -212,7 +214,7 @@ def drawn_town(seed: int) -> Scenario:
     evaluations.
 
     The friction of dry, wet, snowy and icy places lies anywhere in the usual range of its kind.
-    None of these roads was used for tuning. Black ice appears at 30 s.
+    Evaluations use towns with other seeds than tuning. Black ice appears at 30 s.
     """
     key = key_of(checked_seed(seed), DRAWN_STREAM)
     usual = demo()

@@ -1,5 +1,5 @@
-"""Sensor model: computes readings from a true record, with white noise, constant offsets, gains, a
-slowly varying position error and missing readings.
+"""Sensor model that computes readings from a record of true values, with white noise, constant
+offsets, gains, a slowly varying position error and missing readings.
 
 Sensor sets whose name begins with "rough" have the errors of real cars; `misaligned.py` describes
 these further errors and their sources. Every random number is a hash of (vehicle key, sample
@@ -43,8 +43,8 @@ KeyArray: TypeAlias = NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class Sensors:
-    """Errors of a set of sensors: standard deviations of white noise, and of offsets drawn once
-    per drive.
+    """Errors of a set of sensors: standard deviations of white noise, standard deviations of
+    offsets and gain errors that are drawn once per drive, and further errors.
     """
 
     acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white, offset
@@ -205,7 +205,8 @@ def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
 
 @compiled
 def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: FloatArray) -> None:
-    """Fill `signals` (18,) with the true values of `record`.
+    """Fill `signals` (18,) with the readings of sensors without noise, computed from the true
+    values in `record`. `error` is the vehicle's row of sensor errors.
 
     `place` is (latitude and longitude of the origin [deg], degrees per metre north, degrees per
     metre east).
@@ -232,8 +233,9 @@ def read_late(
     rate_hz: float,
     signals: FloatArray,
 ) -> None:
-    """Fill `signals` (18,) with the delayed readings of each device. `records` (T, 32) are true
-    values; row `lead` is the present sample, and the rows before it are past samples.
+    """Fill `signals` (18,) with the readings of each device, delayed by the device's own delay.
+    `records` (T, RECORD) are true values; row `lead` is the present sample, and the rows before it
+    are past samples.
     """
     record = np.empty(records.shape[1])
     readings = np.empty(signals.size)
@@ -251,8 +253,8 @@ def read_late(
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
     """Advance the slow errors `wander` (3,) of the position receiver to the next fix (determined
-    position). At the first fix, the errors are drawn with the standard deviation that they keep
-    afterwards.
+    position). At the first fix, the errors are drawn at random. Their standard deviation is the
+    same at all fixes.
     """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):
@@ -262,7 +264,7 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 
 @compiled
 def drop_out(share: float, key: np.uint64, window: int, row: FloatArray) -> None:
-    """Replace the readings of each device in `row` (18,) with NaN with probability `share`. The
+    """For each device, replace its readings in `row` (18,) with NaN with probability `share`. The
     random choice is made once per time window, so a device is silent in all samples of that window.
     """
     for c in range(len(CHANNELS)):
@@ -279,8 +281,8 @@ def sense(
     keys: tuple[KeyArray, KeyArray],
     clock: tuple[int, float, int],
 ) -> FloatArray:
-    """Return the sensor readings (T, N, 18) for the records with true values (lead + T, N, 32). The
-    first `lead` records only serve delayed readings.
+    """Return the sensor readings (T, N, 18) for the records with true values (lead + T, N, RECORD).
+    The first `lead` records only serve delayed readings.
 
     `wander` (N, 3), the slow errors of the position receivers, is advanced. `keys` are two uint64
     arrays (N,), for the noise and for the dropouts; `clock` is (number of the first sample, rate

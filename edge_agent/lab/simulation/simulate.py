@@ -198,7 +198,7 @@ def _drive_manoeuvre(
     samples: int,
 ) -> FloatArray:
     """Simulate the drive and return the records of its true values (T, RECORD). On a slope, the
-    simulated driver adds the force that the slope requires.
+    simulated driver demands additional force to balance gravity.
     """
     p = truth.row()
     x = np.zeros(STATES)

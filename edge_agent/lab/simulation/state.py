@@ -1,4 +1,4 @@
-"""Index names for the arrays of the simulated vehicle: state, parameters, inputs, wheels."""
+"""Names of indices into the arrays of the simulated vehicle: state, parameters, inputs, wheels."""
 
 from __future__ import annotations
 

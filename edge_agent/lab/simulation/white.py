@@ -1,7 +1,7 @@
 """White noise of paper 004's experiments, on a_x, a_y and the yaw rate only.
 
-Constant noise has the same variance on all three. Variable noise follows the paper's table 2 on a_y
-alone, as the paper states.
+Constant noise has the same variance on all three signals. Variable noise affects a_y alone, as the
+paper states; its variance follows the paper's table 2.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SCHEDULE_S: Final = 2.0  # [s] duration of each variance; the period is six seco
 
 
 def scheduled_variance(t: FloatArray) -> FloatArray:
-    """Return the noise variance at the times t (T,) [s] according to SCHEDULE."""
+    """Return the noise variance at the times t (T,) [s] according to the paper's table 2."""
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
 
@@ -33,7 +33,7 @@ def on_ay(t: FloatArray, others: float) -> FloatArray:
 
 def add_white(signals: FloatArray, variance: FloatArray, rng: np.random.Generator) -> None:
     """Add white noise to a_x, a_y and yaw rate in the signals (T, 18) of one drive, in place.
-    `variance` is (T,), or (T, 3) by channel.
+    `variance` has the shape (T,) if all three have the same variance, otherwise (T, 3).
     """
     by_channel = variance[:, None] if variance.ndim == 1 else variance
     white = rng.normal(size=(len(variance), 3))

@@ -1,5 +1,5 @@
-"""Ant colony optimisation on a graph of possible values (paper 004, III.C). The module has no side
-effects; random generator and objective are arguments.
+"""Ant colony optimisation on a graph of possible values (paper 004, III.C). The functions have no
+side effects; random generator and objective are arguments.
 
 Each variable ("vertex") has a list of possible values ("positions"). An ant goes from vertex to
 vertex and chooses one position at each; its path is one vector of values.
@@ -40,8 +40,8 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """Parameters of the ant colony: weights of pheromone and of visibility (prior preference),
-    evaporation, and deposits.
+    """Parameters of the ant colony: weights of pheromone (learned preference) and of visibility
+    (prior preference), evaporation, and deposits.
 
     Raises:
         InputError: a parameter is out of its range.
@@ -57,8 +57,8 @@ class Habits:
     trace: Callable[[FloatArray], None] | None = None
 
     def __post_init__(self) -> None:
-        """Reject parameters outside the ranges in which the module's equations (31) and (32) have a
-        meaning.
+        """Reject parameters that are out of range, for example negative weights or an evaporation
+        above 1.
         """
         for name in ("evaporation", "elite", "memory", "retrace"):
             value = getattr(self, name)
@@ -80,8 +80,8 @@ def transition_probabilities(
     theta: float,
 ) -> FloatArray:
     """Return the probabilities (V, K) with which an ant chooses the positions (possible values) of
-    all V vertices (variables), by equation (31). A probability is zero where no position exists,
-    and each row sums to one.
+    all V vertices (variables), by equation (31): in proportion to pheromone^alpha *
+    visibility^theta. A probability is zero where no position exists, and each row sums to one.
     """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
@@ -92,8 +92,8 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
     """Return τ_min (V, 1), the lower bound of the pheromone for V vertices (variables). With this
     bound, an ant of a converged colony repeats the best path with probability `retrace`.
 
-    The best position (value) of each vertex then has the probability p = retrace^(1/V) = τ_max /
-    (τ_max + (K − 1)·τ_min); this is solved for τ_min.
+    The ant must choose the best position (value) of each vertex with the probability p =
+    retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min). The function solves this equation for τ_min.
     """
     vertices = len(reachable)
     p = retrace ** (1.0 / vertices)
@@ -122,9 +122,9 @@ def renew(
     evaporation: float,
     retrace: float,
 ) -> FloatArray:
-    """Return the pheromone (V, K) after evaporation and the deposits `laid`, by equation (32),
-    limited to [τ_min, 1]. It is zero where a vertex (variable) has no such position (possible
-    value).
+    """Return the pheromone (V, K) after evaporation and the deposits `laid` (V, K), by equation
+    (32), limited to [τ_min, 1]. The pheromone is zero where a vertex (variable) has no such
+    position (possible value).
     """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
@@ -142,7 +142,8 @@ def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
 
 def _rank_weights(ants: int, habits: Habits) -> FloatArray:
     """Return the amounts of pheromone (P,) that the best ants of an iteration deposit, by rank.
-    Together with the deposit of the best path so far, they sum to ρ (evaporation per iteration).
+    Together with the deposit of the best path so far, these amounts sum to ρ, the share of
+    pheromone that evaporates per iteration.
     """
     count = max(1, round(habits.elite * ants))
     ranks = np.arange(count, 0, -1, dtype=np.float64)
@@ -161,8 +162,9 @@ def optimise(
 ) -> Result:
     """Search for the vector with the largest objective.
 
-    Each vertex (variable) has a list of positions (possible values), which `problem.visibility` may
-    prefer. The objective is called at most ants·iterations times, once per vector.
+    Each vertex (variable) has a list of positions (possible values). `problem.visibility` may state
+    a prior preference among them. The objective is called at most ants·iterations times, at most
+    once for each vector.
 
     Raises:
         InputError: a vertex has no position, or there are no ants or no iterations.
@@ -203,8 +205,9 @@ def optimise(
 def _laid_pheromone(
     paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
 ) -> FloatArray:
-    """Return the pheromone Δτ (V, K) that one iteration deposits: its best ants deposit by rank,
-    and the best path so far receives a fixed share.
+    """Return the pheromone Δτ (V, K) that the colony deposits after one iteration. The best ants of
+    the iteration deposit on their `paths` by rank of their `values`, and the best path so far
+    receives a fixed share.
     """
     order = np.argsort(-np.asarray(values), kind="stable")[: len(weights)]
     best = ledger.best_path if ledger.best_path is not None else paths[0]

@@ -1,17 +1,19 @@
 """Ant colony optimisation for continuous variables, ACO_R (Socha and Dorigo, European J. of
-Operational Research 2008). The module has no side effects.
+Operational Research 2008). The functions have no side effects except on the record of the search.
 
 In the module `colony`, each variable has a short list of possible values. However, the corners of
-fuzzy sets are continuous quantities. Therefore this colony stores the k best vectors (archive) in
-place of pheromone. An ant chooses vector l of the archive with a probability that decreases with
-the vector's rank. It then draws each variable from a normal distribution around that vector.
+fuzzy sets are continuous quantities. Therefore this colony stores the k best vectors so far (its
+archive) in place of pheromone. An ant chooses vector l of the archive with a probability that
+decreases with the vector's rank. It then draws each variable from a normal distribution around that
+vector.
 
 Legend
     l           rank in the archive, 1 is best
     w_l         weight exp(-(l - 1)^2/(2*q^2*k^2))
     sigma_v     standard deviation of variable v: xi times the mean distance between the archive's
                 vectors and the chosen vector
-    q, xi       q: smaller values prefer the best vectors; xi: larger values keep the spread longer
+    q, xi       q: the smaller, the more often an ant chooses the best vectors; xi: the larger, the
+                longer the vectors stay spread out
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ REDRAWS: Final = 32  # number of attempts to draw an admissible vector
 
 @dataclass(frozen=True)
 class ArchiveHabits:
-    """Constants of the ant colony for continuous variables, which stores its best vectors in an
-    archive.
+    """Constants of the ant colony for continuous variables: number of best vectors that it stores
+    (its archive), preference for the best of them, and width of the random draws.
 
     Raises:
         InputError: a constant is out of range.
@@ -78,8 +80,9 @@ class SearchTally:
         self.history: list[Iteration] = []
 
     def evaluate(self, vector: FloatArray) -> float:
-        """Return the objective at a vector of variables, and count the evaluation. A value that is
-        not finite counts as the worst.
+        """Return the objective's value for a vector (V,), count the evaluation, and store the
+        vector if it is the best so far. An objective that is not finite counts as the worst,
+        -infinity.
         """
         value = float(self.problem.objective(vector))
         value = value if np.isfinite(value) else -np.inf
@@ -142,8 +145,9 @@ def optimise(
 ) -> Result:
     """Search for the vector with the largest objective, with ants·iterations evaluations.
 
-    The archive is filled first, with the start vector and random vectors from the whole range. The
-    range of a variable extends from its smallest to its largest choice.
+    The search first fills the archive (the stored best vectors) with the start vector and with
+    random vectors from the whole range. The range of a variable extends from its smallest to its
+    largest possible value in `problem.choices`.
     """
     habits = habits or ArchiveHabits()
     tally = SearchTally(problem)
@@ -172,9 +176,9 @@ def _next_vector(
     rng: np.random.Generator,
     habits: ArchiveHabits,
 ) -> FloatArray:
-    """Return the next vector (V,) to evaluate. First comes the start vector, then random vectors
-    until the archive (the best vectors so far) is full. After that, vectors are drawn near a vector
-    of the archive.
+    """Return the next vector (V,) to evaluate. `vectors` and `values` are the archive: the best
+    vectors so far, and their objectives. First comes the start vector, then random vectors until
+    the archive is full. After that, vectors are drawn near a vector of the archive.
     """
     if tally.count == 0 and tally.problem.start is not None:
         return tally.fit(np.asarray(tally.problem.start, float))

@@ -1,5 +1,5 @@
 """(1+1) evolution strategy with the one-fifth rule (Rechenberg 1973), for comparison with the ant
-colonies. The module has no side effects.
+colonies. The search changes one vector at random and keeps the better one.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def optimise(
 def _mutate_vector(
     tally: SearchTally, parent: FloatArray, step: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return a random variation of the vector `parent` (V,) that the problem admits, or `parent`
-    itself if none is found.
+    """Return a random variation of the vector `parent` (V,) that the problem admits; `step` is the
+    size of the variation. Return `parent` itself if no admissible variation is found.
     """
     for _ in range(REDRAWS):
         child = tally.fit(rng.normal(parent, step * (tally.upper - tally.lower)))

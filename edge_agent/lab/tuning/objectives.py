@@ -12,8 +12,8 @@ Therefore inflating R does not improve them. Paper 004's objective (equation 33,
 is not a proper score, and neither is the error of an estimate. IS is the score of Gneiting and
 Raftery (JASA 2007). l_v does not need the true friction. However, it looks only one update ahead
 and does not show persistent errors. A tuning on l_v alone therefore reduces R to that of white
-noise, and friction intervals become too narrow. Therefore the objective `predictive` subtracts a
-cost for the deviation of NIS from its expectation. README.md, section "Choices", explains the
+noise, and friction intervals become too narrow. Therefore the objective `predictive` subtracts from
+l_v a cost for the deviation of NIS from its expectation. README.md, section "Choices", explains the
 default objective.
 
 The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
@@ -141,8 +141,8 @@ class TuningScores:
 
 
 def detection_cost(scores: TuningScores) -> float:
-    """Return the interval score plus costs for false and for missed ice. With both costs, a search
-    gains nothing from reducing one at the expense of the other.
+    """Return the interval score plus a cost for false ice and a cost for missed ice. Because both
+    have a cost, a search gains nothing if it reduces one error by increasing the other.
     """
     false_ice = max(scores.false_ice - MOST_FALSE_ICE, 0.0)
     return scores.surface_score + FALSE_ICE_PRICE * false_ice + MISSED_ICE_PRICE * scores.missed_ice
@@ -193,8 +193,8 @@ def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
 
 
 def record_all(name: str, duration_s: float) -> TuningSet:
-    """Return the drives and towns of "train" or "held_out" as one set, each `duration_s`
-    [s] long.
+    """Simulate all drives and towns of the set called `name`, "train" (for the search) or
+    "held_out", each `duration_s` [s] long. Return them as one set for tuning.
     """
     sets = [record(TRAIN if name == "train" else HELD_OUT, duration_s)]
     seeds, cars = TOWNS[name]
@@ -212,7 +212,8 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
     """Simulate cars in a town that is drawn randomly by the seed, and return their drives. The
-    first WARM_S seconds are left out. The share ROUGH_SHARE of the cars is inaccurate.
+    first WARM_S seconds of each drive are left out. The share ROUGH_SHARE of the cars is
+    inaccurate.
     """
     fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))
@@ -237,7 +238,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
     """Run the estimator on the drives, and return the scores (such as interval score and missed
-    ice) of its output after the first second.
+    ice) of the estimates after the first second.
     """
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(
         drives.t, drives.signals, threads=2
@@ -268,8 +269,8 @@ def detection_scores(
 
     `surface_score` is the interval score, averaged over the kinds of surface; NaN if no kind
     occurs. `false_ice` is the share of samples on wet and dry road whose interval lies below
-    SLIPPERY_MU. `missed_ice` is the share of samples on clearly slippery road, with enough grip in
-    use, whose interval does not.
+    SLIPPERY_MU. `missed_ice` is the share of samples whose interval does not lie below SLIPPERY_MU,
+    among those on clearly slippery road with enough grip in use.
     """
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
@@ -289,8 +290,9 @@ def _share(of: BoolArray, among: BoolArray) -> float:
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
-    """Return an objective as a function of a vector of memberships (parameters of the fuzzy sets).
-    An invalid vector has the worst value.
+    """Return the objective called `name` as a function. The function takes a vector of memberships
+    (parameters of the fuzzy sets), and returns their score with `estimator` on `drives`. For an
+    invalid vector it returns the worst value, -infinity.
 
     Raises:
         InputError: there is no objective with that name.
@@ -311,9 +313,9 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
 
 
 def choices(positions: int) -> tuple[FloatArray, ...]:
-    """Return an array of `positions` candidate values for every corner of a fuzzy set ("vertex")
-    and every noise scale. They are evenly spaced within the bounds; the value nearest to the
-    default is replaced by the default.
+    """Return an array of `positions` candidate values for every parameter of the memberships, such
+    as a corner of a fuzzy set ("vertex") or a noise scale. The candidates are evenly spaced within
+    the parameter's bounds; the one nearest to the default value is replaced by the default.
     """
     default = Memberships().to_vector()
     found = []

@@ -27,8 +27,8 @@ def own_drives(
     """Cut recordings into parts of `duration_s` [s]; return the parts for the search and the
     held-out parts.
 
-    The last third of the parts is held out. Recordings may have any sampling rate; all parts have
-    as many samples as the slowest recording has in that time.
+    The last third of the parts is held out. Recordings may have any sampling rate. Each part has as
+    many samples as the recording with the lowest rate has in `duration_s`.
 
     Raises:
         InputError: the recordings are too short.

@@ -2,8 +2,8 @@
 levels, and a choice of objectives.
 
 The drive is the double lane change at 80 km/h on the printed tyre, with initial covariance P_0 =
-.2*I and process noise Q = .1*T^2 for the sampling interval T. Noise variance and R are .1, .05 and
-.01 in turn (section IV.A). Objectives, larger is better:
+.2*I and process noise Q = .1*T^2 for the sampling interval T. The noise variance and the filter's R
+both are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
 
     mismatch     1/(1 + |e|), e the mean difference between actual and theoretical innovation
                  variance (33)
@@ -46,9 +46,9 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """Simulated drive at one level of measurement noise, with one copy per seed of the noise. With
-    it comes the filter setting whose R (assumed noise variance) equals this noise. The tuning runs
-    the filter on it.
+    """Simulated drive at one level of measurement noise (`batch`), with one copy per seed of the
+    noise, and the filter's setting for it. In the setting, R (assumed noise variance) equals the
+    noise variance of the drive. The tuning runs the filter on the drive.
     """
 
     batch: DriveSet
@@ -58,8 +58,8 @@ class LevelDrive:
 def record_levels(
     spec: DriveSpec, seeds: Sequence[int], setting: Setting = AS_PRINTED
 ) -> list[LevelDrive]:
-    """Simulate a drive without errors. Return one set of drives per noise level: one copy of the
-    drive per seed, with white noise of this level added.
+    """Simulate a drive without errors. Return, for each noise level, a set of copies of the drive,
+    one per seed, to which white noise of this level is added.
     """
     exact = ideal(spec)
     levels = []
@@ -99,8 +99,9 @@ def mismatch(sets: Sets, drive: LevelDrive) -> float:
 
 
 def accuracy(sets: Sets, drive: LevelDrive) -> float:
-    """Run paper 004's filter with the given fuzzy sets on a drive; return minus the mean, over the
-    estimated quantities, of the RMSE divided by the printed RMSE.
+    """Run paper 004's filter with the given fuzzy sets on a drive; return the objective "error". It
+    is minus the mean, over the estimated quantities (v_x, v_y, yaw rate, friction), of the RMSE
+    divided by the RMSE printed in the paper.
     """
     reported = _run_filter(sets, drive)
     batch = drive.batch
@@ -129,7 +130,7 @@ def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
 
 def visibility() -> list[FloatArray]:
     """Return the visibility eta (prior preference) of every position (value) of every vertex
-    (variable), for equation (31). It is larger for positions near the untuned value.
+    (variable), for equation (31). The visibility is larger for positions near the untuned value.
     """
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())

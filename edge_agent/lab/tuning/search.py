@@ -3,8 +3,8 @@ the result with its history.
 
 A search looks for the best vector, with one value per vertex (variable). Each vertex has its own
 short list of possible values, its positions. A path is an array of V indices that selects one
-position per vertex; the selected positions form a vector. A search does not depend on filters: the
-objective is any function of the vector, and larger is better.
+position per vertex; the selected positions form a vector. The search methods know nothing about
+filters: the objective is any function of the vector, and larger is better.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,8 +20,8 @@ Admissible = Callable[[FloatArray], bool]
 
 
 def is_always_allowed(_vector: FloatArray) -> bool:
-    """Return True for any vector of a search. This is the default of `Problem.admissible`, so no
-    vector is excluded.
+    """Return True for any vector of a search. This function is the default of `Problem.admissible`,
+    with which no vector is excluded.
     """
     return True
 
@@ -33,8 +33,8 @@ REDRAWS = 32
 
 @dataclass(frozen=True)
 class Iteration:
-    """Progress of a search after one iteration: values of the objective (larger is better), and
-    number of evaluations.
+    """Progress of a search after one iteration: the objective's best value so far and its mean in
+    this iteration (larger is better), and the number of evaluations.
     """
 
     iteration: int
@@ -53,9 +53,9 @@ class Problem:
 
     `objective` returns the value of a vector. `choices` are the possible values ("positions") of
     each vertex, in ascending order. `start` (V,) is the vector that is evaluated first, so that the
-    result is never worse than it. `admissible` returns True for vectors that may be evaluated;
-    others are replaced by new draws. `visibility` is the preference η > 0 of each position, which
-    the ant colony uses; None: all are equally preferred.
+    result is never worse than the start vector. `admissible` returns True for vectors that may be
+    evaluated; others are replaced by new draws. `visibility` is the preference η > 0 of each
+    position, which the ant colony uses; None: all are equally preferred.
     """
 
     objective: Objective
@@ -118,8 +118,8 @@ class Graph:
 @dataclass
 class Ledger:
     """Record of a search: all evaluated paths with their objectives, the best path, and the
-    iterations. A path is an array of V indices that selects one value per variable. The objective
-    of each path is computed only once.
+    iterations. A path is an array of V indices that selects one possible value per variable. The
+    record computes the objective of each path only once.
     """
 
     objective: Objective
@@ -131,9 +131,9 @@ class Ledger:
     history: list[Iteration] = field(default_factory=list)
 
     def draw(self, sample: Callable[[], IntArray]) -> IntArray:
-        """Draw paths (V,) with `sample` until one has not been evaluated before and its vector is
-        admissible, at most REDRAWS times; return this path. If there is none, return a drawn path
-        that has been evaluated.
+        """Draw random paths (V,) with `sample` until one is new (not evaluated before) and its
+        vector is admissible, at most REDRAWS times; return this path. If no drawn path is new,
+        return a drawn path that was evaluated before.
 
         Raises:
             InputError: no drawn path is admissible.
@@ -190,8 +190,9 @@ class Ledger:
 
 
 def nearest(graph: Graph, vector: FloatArray) -> IntArray:
-    """Return, per vertex (variable), the index of the position (possible value) nearest to the
-    value in a vector (V,); shape (V,)."""
+    """Return the path (V,) nearest to a `vector` (V,): for each vertex (variable), the index of the
+    position (possible value) that is nearest to the vector's value.
+    """
     distance = np.abs(graph.positions - np.asarray(vector)[:, None])
     indices: IntArray = np.argmin(np.where(graph.reachable, distance, np.inf), axis=1)
     return indices

@@ -7,11 +7,12 @@ paper 004.
     aco_r        ants over continuous variables                 (`continuous_colony`)
     evolution    (1+1) evolution strategy                       (`evolution_strategy`)
 
-The objective is the mean log-likelihood of the innovations (measurement minus prediction) over four
-conditions of the measurement noise R [nat/s] (`study`), on four drives. Each seed gives one search
-of each kind, and one set of held-out drives with its own noise. The results of all searches are
-scored on these drives, together with the untuned sets and a filter with constant R for comparison.
-Differences are paired by seed; `.se` is the standard error over seeds.
+The objective is the mean log-likelihood of the innovations (measurement minus prediction) [nat/s],
+over four drives and four conditions of the measurement noise R (right, ten times too small, ten
+times too large, or with noise that varies; see `study`). Each seed gives one search by each method,
+and one set of held-out drives with its own noise. The results of all searches are scored on the
+held-out drives. For comparison, the untuned fuzzy sets and a filter with constant R are scored too.
+Differences are paired by seed; the suffix `.se` marks the standard error over seeds.
 """
 
 from __future__ import annotations
@@ -88,8 +89,8 @@ def compare_searches(
     quick: bool = False,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[Figure]:
-    """Run every search method with every seed, and score the results on held-out noise. Return the
-    figures (named numbers): means with standard errors.
+    """Run every search method with every seed, and score the fuzzy sets that it finds on held-out
+    drives. Return the figures (named numbers): means with standard errors.
     """
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
     train = study.record(study.TRAIN, duration)

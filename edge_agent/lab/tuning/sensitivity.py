@@ -1,4 +1,5 @@
-"""Sensitivity analysis: how much the default estimator's results change with each of its constants.
+"""Sensitivity analysis: how much the default estimator's results change if one of its constants
+changes.
 
 Each number of `Constants` and of the shipped memberships (fuzzy sets) is multiplied by .7 and by
 1.4, one at a time. The filter then runs on simulated towns, half of them in winter, and on
@@ -14,9 +15,9 @@ Legend of the columns, each the change from the filter as it is
     time       time of the filter [%]; the changed and the usual filter are measured alternately, so
                that other load on the computer cancels
 
-A number that changes score, false ice and found by less than 1 in both directions can be merged
-with another one or deleted. Chance also moves the score by about 1 %, because a small change of one
-drive can decide whether a slide is noticed.
+A number can be merged with another one or deleted if both factors change score, false ice and found
+by less than 1 each. Chance alone can change the score by about 1 %: after a small change of one
+constant, the filter may notice a slide that it missed before, or miss one.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ class JudgedDrives(NamedTuple):
 
 
 class FilterMeasures(NamedTuple):
-    """Measures of one filter on all drives; the legend of the module explains them."""
+    """Measures of one filter on all drives: mean interval score of friction (`score`), share of the
+    samples with high friction that the filter calls slippery (`false_ice`), and share of the
+    samples on slippery road that it calls slippery (`found`).
+    """
 
     score: float
     false_ice: float
@@ -66,7 +70,9 @@ class FilterMeasures(NamedTuple):
 
 
 class ConstantChange(NamedTuple):
-    """Change of each measure when the constant `name` is multiplied by `factor`."""
+    """Change of the filter's measures (score, false ice, found, computing time) when the constant
+    `name` is multiplied by `factor`.
+    """
 
     name: str
     factor: float
@@ -77,8 +83,8 @@ class ConstantChange(NamedTuple):
 
     @property
     def effect(self) -> float:
-        """Return the largest absolute change of score, false ice and found; the computing time is
-        not included.
+        """Return the largest absolute value of the three changes of score, false ice and found. The
+        computing time is not included.
         """
         return max(abs(self.score), abs(self.false_ice), abs(self.found))
 
@@ -86,7 +92,9 @@ class ConstantChange(NamedTuple):
 def simulate_drives(
     seeds: Sequence[int], *, cars: int = CARS, town_s: float = TOWN_S, drive_s: float = DRIVE_S
 ) -> list[JudgedDrives]:
-    """Simulate, for each seed, cars in one town and one set of manoeuvres."""
+    """Simulate, for each seed, `cars` cars in one town for `town_s` [s], and one drive of each
+    manoeuvre for `drive_s` [s].
+    """
     drives = []
     for seed in seeds:
         batch, used = town(seed, cars, town_s)
@@ -97,9 +105,11 @@ def simulate_drives(
 
 
 def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeasures:
-    """Run the filter with the tables `design` on all drives, and return its measures.
+    """Run the default filter with the parameter tables `design` on all drives, and return its
+    measures.
 
-    Only towns count for `found`, because a simulated manoeuvre does not report the grip in use.
+    Only towns count for the measure `found`, because the simulated manoeuvres do not record the
+    grip in use.
     """
     scores = []
     cried = grippy = warned = slippery = 0
@@ -119,9 +129,9 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
 
 
 def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, MixtureDesign]]:
-    """Yield, for each constant and each factor of FACTORS, the name, the factor and the tables of a
-    filter with this constant multiplied by it. Zeros, and values that would make the fuzzy sets
-    invalid, are left out.
+    """Yield, for each constant and each factor of FACTORS, the constant's name, the factor, and the
+    parameter tables of a filter in which the constant is multiplied by the factor. Zeros, and
+    values that would make the fuzzy sets invalid, are left out.
     """
     usual = Constants()
     for name, value in usual._asdict().items():
@@ -179,7 +189,9 @@ def campaign(
 
 
 def list_without_effect(changes: Sequence[ConstantChange]) -> list[str]:
-    """Return the names of the constants whose effect is below SMALL for all factors."""
+    """Return the names of the constants whose effect (largest change of score, false ice or found)
+    is below SMALL for all factors.
+    """
     largest: dict[str, float] = {}
     for change in changes:
         largest[change.name] = max(change.effect, largest.get(change.name, 0.0))

@@ -1,11 +1,12 @@
-"""Study of paper 004's tuning with its own filter and noise. It compares untuned fuzzy sets, random
-search and ant colony, for correct and wrong measurement noise R of the filter.
+"""Study of paper 004's tuning with the paper's filter and noise. It compares untuned fuzzy sets,
+random search and ant colony, for correct and wrong measurement noise R of the filter.
 
 The filter is `paper-aco-fckf` as in the paper's experiments: white noise only on a_x, a_y and r,
-exact inputs, start at the true state. R can therefore be exactly right, ten times too small or ten
-times too large. The objective is the mean log-likelihood of the innovations over all conditions
-[nat/s]. Inflating R does not improve it, in contrast to the paper's own objective (equation 33).
-Held-out drives share neither seed nor manoeuvre with the drives of the search.
+exact inputs, start at the true state. The true noise is therefore known, and the filter's R can be
+exactly right, ten times too small or ten times too large. The objective is the mean log-likelihood
+of the innovations over all conditions [nat/s]. Inflating R does not improve it, in contrast to the
+paper's own objective (equation 33). Held-out drives share neither seed nor manoeuvre with the
+drives of the search.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 class Condition(NamedTuple):
     """Condition of a study: the filter's measurement noise R divided by the true constant variance
-    (VARIANCE), and True if the simulated noise varies over time by the paper's schedule.
+    (VARIANCE), and a flag that is True if the simulated noise varies over time by the paper's
+    schedule.
     """
 
     scale: float
@@ -206,7 +208,7 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 def memberships_of(vector: FloatArray) -> Memberships:
     """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. Only
-    vertices are tuned, because the measurement noise R of this filter is given.
+    vertices are tuned: the measurement noise R of this filter is given by the condition.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
@@ -237,7 +239,7 @@ def search(
     progress: Progress | None = None,
 ) -> Result:
     """Search for the best vertices (corners of the fuzzy sets) by the method `way`, "random" or
-    "colony".
+    "colony", and return the result. `seed` is the seed of the search.
     """
     return WAYS[way](
         problem,

@@ -60,8 +60,9 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships (fuzzy sets) found by each search of the kind `way`. If `way` is
-        in GIVEN (fuzzy sets that are given, not searched), return only those.
+        """Return the memberships (fuzzy sets) found by each search of the kind `way`. GIVEN has
+        fuzzy sets that are given, not searched; if `way` is one of its names, return only these
+        sets.
         """
         if way in GIVEN:
             return [GIVEN[way]]
@@ -69,8 +70,8 @@ class Study:
 
     def best(self, way: str) -> Memberships:
         """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
-        by the objective on the drives of the search. If `way` is in GIVEN (fuzzy sets that are
-        given, not searched), return those.
+        by the objective on the drives of the search. GIVEN has fuzzy sets that are given, not
+        searched; if `way` is one of its names, return these sets.
         """
         if way in GIVEN:
             return GIVEN[way]

@@ -29,16 +29,17 @@ def means(batch: DriveSet, reported: Estimates) -> Values:
 
 
 def without_noise(spec: DriveSpec, make: BankMaker) -> tuple[DriveSet, Estimates]:
-    """Simulate a drive with error-free sensors, and estimate its motion and friction; return the
-    drive and the estimates.
+    """Simulate a drive with error-free sensors, and estimate its motion and friction with the
+    estimators that `make` builds for its vehicles. Return the drive and the estimates.
     """
     batch = ideal(spec)
     return batch, estimates(make(batch.vehicles), batch)
 
 
 def with_sensors(name: str, estimator: str, seeds: Sequence[int]) -> tuple[Values, Values]:
-    """Simulate the scenario `name` with ordinary sensors; return the measures (such as errors) of
-    the paper's estimator and of the default estimator.
+    """Simulate the scenario `name` with ordinary sensors, once per seed. Return two sets of
+    measures (such as errors): those of the paper's estimator, called `estimator`, and those of the
+    default estimator.
     """
     batch = realistic(PAPERS[name], seeds)
     found = [

@@ -3,8 +3,8 @@ manoeuvres that they drive.
 
 A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
 the paper. Only drives at constant speed have drag and rolling resistance, which the filter knows.
-Without these there would be no longitudinal force, and the tyres would give no information on
-friction.
+Without drag and rolling resistance the tyres would have no longitudinal force there, and would give
+no information on friction.
 """
 
 from __future__ import annotations
@@ -109,8 +109,9 @@ MATCHED: Final[dict[str, DriveSpec]] = {
 
 
 def given_motion(batch: DriveSet, vehicle: TrueVehicle) -> GivenMotion:
-    """Return the first drive of the batch with its true motion, as input of the literal filters
-    (the papers' filters as printed, which do not estimate motion).
+    """Return the first drive of the batch with its true motion, as input of those filters that are
+    implemented literally as printed in the papers. They need the true motion, because they do not
+    estimate it.
     """
     truth = batch.truth
     return GivenMotion(

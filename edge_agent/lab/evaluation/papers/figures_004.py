@@ -26,7 +26,9 @@ FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 def plots(
     constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
 ) -> list[PaperPlot]:
-    """Return all plots for paper 004. Curves over time show the drive with the first noise seed."""
+    """Return all plots for paper 004 from its two experiments (`constant` and `variable` noise) and
+    its tuning. Curves over time show the drive with the first noise seed.
+    """
     return [
         _path_plot(constant),
         _torque_plot(constant),
@@ -167,7 +169,8 @@ def _search_plot(tuning: PaperTuning) -> PaperPlot:
 
 def pheromone_plot(tuning: PaperTuning) -> PaperPlot:
     """Return the plot of the pheromone as a colour map. One axis shows the vertices (corners of the
-    fuzzy sets), the other their positions (possible values).
+    fuzzy sets), the other their positions (possible values). Pheromone is the colony's learned
+    preference for a value.
     """
     count = len(tuning.pheromone)
     ticks = tuple(f"{'e' if k < count // 2 else 'n'} {k % (count // 2) + 1}" for k in range(count))

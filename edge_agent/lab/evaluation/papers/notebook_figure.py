@@ -11,8 +11,8 @@ DPI: Final = 80
 
 
 class NotebookFigure(Figure):
-    """Matplotlib figure that notebooks can show as a picture. Plain figures that are made without
-    `pyplot` lack the method for it.
+    """Matplotlib figure that notebooks can show as a picture. Ordinary figures that are made
+    without `pyplot` lack the method `_repr_png_`, which notebooks call.
     """
 
     def _repr_png_(self) -> bytes:

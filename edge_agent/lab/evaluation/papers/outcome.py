@@ -32,7 +32,8 @@ class PaperRow(NamedTuple):
         bar: target for `matched`. None: the printed number is the target, if there is one. NaN:
             there is no target.
         better: "less" or "more": the side of the target on which `matched` must lie.
-        shown: text for the printed number, if it is more than a number.
+        shown: text that replaces the printed number in the report, for example "about 3"; "" if
+            none.
     """
 
     name: str
@@ -62,7 +63,7 @@ class PaperRow(NamedTuple):
     @property
     def holds(self) -> bool:
         """Return True if the reproduced number (`matched`, simulated under the paper's conditions)
-        meets its target, or has no target.
+        meets the target, or if there is no target.
         """
         return self.limit is None or self.figure("papers").holds
 
@@ -74,7 +75,7 @@ class PaperRow(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One curve in a panel of a plot: its name, points (x, y), and the kind that selects its
+    """One curve in a panel of a plot: its name, points (x, y), and its kind, which determines its
     colour.
     """
 

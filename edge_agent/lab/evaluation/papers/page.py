@@ -80,8 +80,8 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
 
 
 def markdown_elements(elements: Sequence[Element]) -> str:
-    """Return a Markdown table of a paper's elements (equations, tables, figures): whether each is
-    implemented, why, and where.
+    """Return a Markdown table of a paper's elements (equations, tables, figures): for each element,
+    whether it is implemented, the reason, and the place in the code.
     """
     lines = ["| paper | element | verdict | why | where |", "|---|---|---|---|---|"]
     for element in elements:

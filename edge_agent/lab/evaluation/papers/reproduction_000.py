@@ -35,7 +35,9 @@ NEAR: Final = 0.1
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     """Return two durations [s] until the estimated mean friction `mu` (T,) is within NEAR of the
-    true value: the first from the start of the drive, the second from the change of friction.
+    true value. The first counts from the start of the drive, the second from the change of
+    friction. If the estimate does not come so near, the duration is the whole time before the
+    change, or after it.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]

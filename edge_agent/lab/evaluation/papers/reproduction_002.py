@@ -117,8 +117,9 @@ class ForceRun:
 
 
 def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
-    """Simulate a drive with error-free sensors; store, after every sample, the states of the wheel
-    filter WCKF-A and the compensated tyre forces.
+    """Simulate a drive with error-free sensors, and run the paper's filters on it. After every
+    sample, store the states of the wheel filter WCKF-A and the compensated tyre forces (weighted
+    means of tyre model and wheel filter).
     """
     batch = ideal(spec)
     bank = compensated_wckf.make_bank(batch.vehicles, float(batch.mu[0, 0]), tyre)

@@ -326,8 +326,8 @@ def _add_noise(signals: FloatArray) -> FloatArray:
 
 
 def _scale_radius(signals: FloatArray) -> FloatArray:
-    """Return the signals (T, 18) as a car would measure them whose wheel radius is larger than the
-    filter assumes, by the share WHEEL_RADIUS_ERROR.
+    """Return the signals (T, 18) that a car with larger wheels would measure. Its wheel radius
+    exceeds the radius that the filter assumes by the share WHEEL_RADIUS_ERROR.
     """
     changed = signals.copy()
     changed[:, S.OMEGA : S.OMEGA + 4] /= 1.0 + WHEEL_RADIUS_ERROR

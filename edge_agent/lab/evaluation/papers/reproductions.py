@@ -35,8 +35,9 @@ LONGEST_S: Final = 90.0  # [s] limit for the reproduction of one paper on two co
 def write_paper(
     paper: str, seeds: Sequence[int], folder: Path, *, plots: bool = True
 ) -> Reproduction:
-    """Reproduce the results of a paper and return them. Write figures.json and report.md into the
-    folder; with `plots`, also the plots and index.html, which shows them.
+    """Reproduce the results of a paper and return them. Write figures.json (the numbers) and
+    report.md into the folder. With `plots`, also write the plots, and index.html, which shows the
+    plots.
     """
     began = time.monotonic()
     done = REPRODUCTIONS[paper](seeds)
