@@ -1,5 +1,5 @@
 """Map of cells as one HTML file that needs no network. It can show several maps next to each other
-(panels), an animation of frames, and a colour scale.
+(panels), an animation of frames (maps of several moments), and a colour scale.
 
 It can be used with mouse, touch and keyboard. Unmeasured cells are hatched and have no colour.
 """
@@ -56,8 +56,8 @@ class DrawnCells:
         panels: for each panel (map), its name and one value per row; None means 'not measured'.
         names, rows: labels of the texts that are shown for each row, and these texts.
         frames, frame: names of the frames, and the frame number of each row.
-        lasting: for each row, True if its value will still grow, such as the duration of a spell
-            that has not ended.
+        lasting: for each row, True if its value will still grow, such as the duration of a slippery
+            spell that has not ended.
     """
 
     boxes: Sequence[Sequence[float]]

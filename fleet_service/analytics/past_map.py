@@ -18,8 +18,8 @@ LATENESS_S = 120.0  # [s] default of ServiceConfig.lateness_s
 
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
-    """Return a table of the visited cells that touch a box [deg], with their beliefs (probabilities
-    of each friction) at the time `at` [ns].
+    """Return a table of the visited cells that touch a box [deg], with their beliefs (probability
+    of each friction value) at the time `at` [ns].
     """
     # Inaccurate positions create neighbouring cells that no vehicle has certainly visited.
     slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
@@ -39,7 +39,7 @@ def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Tabl
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
-    """Return the table of cells with their beliefs (probabilities of each friction) in the
+    """Return the table of cells with their beliefs (probability of each friction value) in the
     GeoParquet form of a map snapshot; `at` [ns] is the time of the beliefs.
     """
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)

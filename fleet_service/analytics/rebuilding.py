@@ -83,7 +83,7 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
     Raises:
         InputError: there are no compacted (sorted) observations, a file has a newer version, or the
-            engine is unknown or not installed.
+            engine (this process or Spark) is unknown or not installed.
         OSError: a file cannot be read or written.
     """
     if engine not in ENGINES:

@@ -20,8 +20,8 @@ from schemas.wire import Kind
 class Endpoints:
     """Subscriptions and queryables of a service for its regions.
 
-    Received batches go to `inbox`, and weather reports to the engine (service without network).
-    `replies` answers map queries.
+    Received batches (messages with records) go to `inbox`, and weather reports to the engine
+    (service without network). `replies` answers map queries.
     """
 
     def __init__(

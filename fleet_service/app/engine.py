@@ -99,8 +99,8 @@ class Engine:
 
     def reload_state(self, before: Callable[[], None]) -> None:
         """Call the function `before`, which may change the archive. Then load the map, the alerts
-        and the record of admitted batches from the archive again, and use them as the state. Use
-        this only in a function that `run_between_segments` calls.
+        and the record of admitted batches (messages with records) from the archive again, and use
+        them as the state. Use this only in a function that `run_between_segments` calls.
 
         Raises:
             OSError: the archive cannot be read; the state stays unchanged.

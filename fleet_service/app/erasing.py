@@ -8,11 +8,11 @@ the service.)
     3. between two later segments:    the service drops its state, and loads this checkpoint and the
                                       segments written since
 
-Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an
-incomplete erasure. Other processes wait for the compaction lock. Messages wait for as long as a
-start from a checkpoint takes. If the service dies during the erasure, its next start finds the
-request, and no checkpoint contains the vehicle. Later measurements of the vehicle are accepted as
-new.
+Checkpoints, snapshots of the map, retention (removal of old rows) and compaction (merging of files)
+run in the same thread, so none of them sees an incomplete erasure. Other processes wait for the
+compaction lock. Messages wait for as long as a start from a checkpoint takes. If the service dies
+during the erasure, its next start finds the request, and no checkpoint contains the vehicle. Later
+measurements of the vehicle are accepted as new.
 """
 
 from __future__ import annotations

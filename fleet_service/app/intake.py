@@ -1,5 +1,5 @@
 """Intake of a running service: it takes messages and weather, passes fused rows to the segment log
-(queue for the disk), and returns alerts.
+(queue of rows for the disk), and returns alerts.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Intake:
         config: settings.
         root: folder of the archive.
         shared: state of the service.
-        log: segment log, which writes the admitted rows to disk.
+        log: segment log (queue of rows for the disk), which writes the admitted rows to disk.
         counts: counters of the service.
 
     Attributes:
@@ -163,7 +163,7 @@ class Intake:
 
     def update_weather(self, now: int) -> None:
         """Archive the weather reports that arrived since the last call, and apply them to the
-        fusion (the beliefs about all cells).
+        fusion (the beliefs about the friction of all cells).
         """
         self._apply_weather(self.weather.take(now))
 

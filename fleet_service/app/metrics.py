@@ -143,7 +143,7 @@ def collect_metrics(
 
 
 def standby_metrics(config: ServiceConfig) -> list[Metric]:
-    """Return all metrics of a standby (a service that waits for the lease)."""
+    """Return all metrics of a standby (a service that waits for the ownership of the archive)."""
     return [_serves_metric(config, 0.0)]
 
 

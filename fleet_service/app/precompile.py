@@ -50,8 +50,8 @@ def warm_up() -> None:
 
 def exercise_map() -> None:
     """Call every compiled function once, with a small temporary map: update it with reports, let it
-    grow, advance in time, update it with late reports, and read beliefs (probabilities of each
-    friction).
+    grow, advance in time, update it with late reports, and read beliefs (probability of each
+    friction value).
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):

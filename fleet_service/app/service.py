@@ -1,4 +1,5 @@
-"""The running service. One worker thread connects Zenoh and the engine.
+"""The running service. One worker thread connects Zenoh and the engine (the parts of the service
+without its network).
 
 subscribers ─► inbox ─► worker: ingest ─► alerts at once
                                 flush ─► thread: rows on disk ─► acknowledgements

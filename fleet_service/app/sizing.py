@@ -102,8 +102,8 @@ class PlannedFleet(NamedTuple):
 
 class DeploymentSize(NamedTuple):
     """Size of a deployment. `services` is the number of services for which each uses at most 60 %
-    of a core. `memory_bytes` is the memory of all services together, and `parts_bytes` divides it
-    by use.
+    of a core. `memory_bytes` is the memory of all services together, and `parts_bytes` is its share
+    for each kind of content.
     """
 
     observations_per_s: float
@@ -117,8 +117,8 @@ class DeploymentSize(NamedTuple):
 
 
 def estimate_size(fleet: PlannedFleet, costs: Costs = COSTS) -> DeploymentSize:
-    """Return the size of a deployment for a fleet. No vehicle is assumed to visit a cell twice
-    within hours, so the number of pairs is an upper limit.
+    """Return the size of a deployment for a fleet. The estimate assumes that no vehicle visits a
+    cell twice within hours, so the number of pairs is an upper limit.
     """
     rate = fleet.vehicles * fleet.rate_hz
     pairs = remembered_pairs(rate, costs.values)
@@ -140,8 +140,8 @@ def estimate_size(fleet: PlannedFleet, costs: Costs = COSTS) -> DeploymentSize:
 
 
 def remembered_pairs(rate: float, values: float) -> float:
-    """Return the number of pairs of a vehicle and a cell that the fusion (beliefs about all cells)
-    remembers, if no vehicle visits a cell twice.
+    """Return the number of pairs of a vehicle and a cell that the fusion (beliefs about the
+    friction of all cells) keeps in memory, if no vehicle visits a cell twice.
 
     Args:
         rate: observations per second.

@@ -128,8 +128,8 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
 
 @contextmanager
 def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
-    """Run the block, which erases data, and then synchronise the archive's copy in a bucket (object
-    store), if any.
+    """Run the `with` block, which erases data, and then synchronise the archive's copy in a bucket
+    (object store), if any.
 
     Raises:
         InputError: the settings of the copy are unknown, and nothing was done; or the copy could

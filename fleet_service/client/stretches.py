@@ -154,7 +154,7 @@ class Stretches:
         return out
 
     def _group_by_stretch(self) -> dict[str, list[Alert]]:
-        """Return the active alerts of cells, grouped by the id of their stretch."""
+        """Return the active alerts of cells, grouped by the id of their road stretch."""
         alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
         label = link_cells(np.array([one.cell for one in alerts], np.int64))
         parts: list[list[Alert]] = [[] for _ in range(int(label.max(initial=-1)) + 1)]
@@ -210,8 +210,9 @@ class Stretches:
 
 
 def link_cells(cell: IntArray) -> IntArray:
-    """Return the number of the stretch to which each cell belongs, (n,). Cells at most LINK_CELLS
-    apart belong to the same stretch. Stretches are numbered in the order of their first cells.
+    """Return the number of the road stretch to which each cell belongs, (n,). Cells at most
+    LINK_CELLS apart belong to the same stretch. Stretches are numbered in the order of their first
+    cells.
     """
     distinct, first, of_cell = np.unique(cell, return_index=True, return_inverse=True)
     one, other = _find_neighbours(distinct)

@@ -1,5 +1,5 @@
 """Acknowledgements: sequence numbers of durable or rejected batches (messages with records),
-collected per vehicle and stream, and sent as messages.
+collected per stream (batches of one vehicle, start, kind and region), and sent as messages.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def _split_stream(
 
 
 def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """Return the ranges of consecutive numbers as pairs (first, last), both included; the given
-    numbers may be repeated and unsorted.
+    """Return the ranges of consecutive sequence numbers as pairs (first, last), both included; the
+    given sequence numbers may be repeated and unsorted.
     """
     ordered = sorted(set(numbers))
     # The most frequent case: the numbers are consecutive.

@@ -60,8 +60,9 @@ class SequenceTracker:
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Record a sequence number and the newest time of its records [ns]. Return False and record
-        nothing if too many sequence numbers are missing before it.
+        """Record the sequence number of an accepted batch (message with records), and the newest
+        time of the batch's records [ns]. Return False and record nothing if too many sequence
+        numbers are missing before it.
         """
         if seq == self.low + 1:
             self.low = seq
@@ -211,9 +212,9 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams (vehicle, start, kind, region) whose newest record is older than `before`
-        [ns]. Duplicates of their batches are still not accepted, because they are refused as too
-        old.
+        """Drop streams (batches of one vehicle, start, kind and region) whose newest record is
+        older than `before` [ns]. Duplicates of their batches are still not accepted, because they
+        are refused as too old.
         """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]

@@ -88,7 +88,7 @@ class Inbox:
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
         """Return the function to be called for each message, for a Zenoh subscriber that receives
-        batches of one kind (observations or states).
+        batches (messages with records) of one kind (observations or states).
         """
 
         def take(sample: zenoh.Sample) -> None:
@@ -160,7 +160,7 @@ class BatchIntake:
     Args:
         streams: accepted batches per stream (batches of one vehicle, start, kind and region);
             updated.
-        pseudonyms: pseudonyms of the vehicles.
+        pseudonyms: pseudonyms that replace the vehicles' names in the archive.
         counts: counters of refusals, under `refused.RULE`, and of duplicates.
         acks: collects refusals, and acknowledgements of duplicates that are already durable.
     """
@@ -210,8 +210,8 @@ class BatchIntake:
         return self._witnesses.number_of(name)
 
     def sync(self) -> None:
-        """Write the numbers and pseudonyms of the vehicles of accepted batches (messages with
-        records) durably to disk.
+        """Write the numbers and pseudonyms (names in the archive) of the vehicles of accepted
+        batches (messages with records) durably to disk.
 
         Raises:
             OSError: the disk is full or broken.
@@ -300,8 +300,9 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Return the valid batches (mask `good`) that were not accepted before, each once, with
-        their positions in `heads` (fields of the batches other than records).
+        """Return the batches (messages with records) that are valid (mask `good`) and that were not
+        accepted before, each once, with their positions in `heads` (fields of the batches other
+        than records).
         """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
@@ -333,10 +334,10 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream (record of accepted batches) of a (vehicle, start, region, day). Return
-        None if the key for the vehicle's pseudonym cannot be read, or if the vehicle opens too many
-        streams. The vehicle then keeps its batch until the disk works again, or until the next
-        hour.
+        """Return the stream of a (vehicle, start, region, day): the record of its accepted batches
+        (messages with records). Return None if the key for the vehicle's pseudonym cannot be read,
+        or if the vehicle opens too many streams. The vehicle then keeps its batch until the disk
+        works again, or until the next hour.
         """
         vehicle, boot, region, _ = name
         try:
@@ -405,9 +406,9 @@ class BatchIntake:
     def _refuse_unusable(
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
-        """Refuse a batch whose records cannot be used. If its sender and sequence number can be
-        read, send a rejection, because otherwise the vehicle would send the batch for ever. If they
-        cannot be read, only count the refusal.
+        """Refuse a batch (message with records) whose records cannot be used. If its sender and
+        sequence number can be read, send a rejection, because otherwise the vehicle would send the
+        batch for ever. If they cannot be read, only count the refusal.
         """
         head = head_of(kind, message.payload, message.encoding)
         named = (

@@ -103,8 +103,8 @@ class Refusal(NamedTuple):
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check the heads (fields other than records) of batches: owner and region must agree with the
-    key, sequence numbers must be valid, and times must be acceptable.
+    """Check the heads (fields other than records) of batches (messages with records): owner and
+    region must agree with the key, sequence numbers must be valid, and times must be acceptable.
 
     Args:
         kind: kind of the batches.
@@ -190,7 +190,8 @@ def owner_of(key: str) -> keys.Parsed | None:
 def check_rows(
     kind: Kind, columns: Columns, region: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check every row (record) of the batches, and return the first rule that it breaks.
+    """Check every row (record) of batches (messages with records), and return the first rule that
+    it breaks.
 
     Args:
         kind: kind of the batches.

@@ -59,7 +59,7 @@ class WeatherMessage(NamedTuple):
 
 
 class WeatherInbox:
-    """Receiver of weather reports for one fusion (beliefs about all cells).
+    """Receiver of weather reports for one fusion (beliefs about the friction of all cells).
 
     Args:
         root: folder of the archive.

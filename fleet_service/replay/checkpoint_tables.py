@@ -1,5 +1,5 @@
-"""Lossless conversion of a fusion (the beliefs about all cells) to Arrow tables and back, so that a
-restart needs no complete replay.
+"""Lossless conversion of a fusion (the beliefs about the friction of all cells) to Arrow tables and
+back, so that a restart needs no complete replay.
 
 The caller stores the tables and decides which archived rows are newer. This module does no I/O.
 """
@@ -22,8 +22,8 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Return the complete state of a fusion (beliefs about all cells) as tables by name. Each
-    column is stored as one list, because columns may differ in length.
+    """Return the complete state of a fusion (beliefs about the friction of all cells) as tables by
+    name. Each column is stored as one list, because columns may differ in length.
     """
     out = {}
     for name, columns in image_of(fusion).items():
@@ -34,8 +34,8 @@ def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
 
 
 def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
-    """Return a column of a checkpoint's table as an Arrow list array with one item: the list of all
-    values.
+    """Return a column of a checkpoint's table (part of a saved state) as an Arrow list array with
+    one item: the list of all values.
     """
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
@@ -54,8 +54,9 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """Restore a fusion (beliefs about all cells) from its tables. With the same later observations,
-    it gives exactly the same results as the fusion that was passed to `tables_of`.
+    """Restore a fusion (beliefs about the friction of all cells) from its tables. With the same
+    later observations, it gives exactly the same results as the fusion that was passed to
+    `tables_of`.
 
     Raises:
         InputError: the tables are of another version, or incomplete.

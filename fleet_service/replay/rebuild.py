@@ -111,7 +111,7 @@ def restore_streams(
 
 
 def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Convert pseudonyms (n,) from text to 64-bit numbers."""
+    """Convert pseudonyms (vehicles' names in the archive), (n,), from text to 64-bit numbers."""
     chunked = (
         pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
     )
@@ -128,13 +128,13 @@ class Since(NamedTuple):
     """Selection of rows for a replay.
 
     Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
-    cells. Therefore cells inside a box get the same belief (probabilities of each friction) as in a
-    complete replay, if the rows of a margin around the box are read too.
+    cells. Therefore cells inside a box get the same belief (probability of each friction value) as
+    in a complete replay, if the rows of a margin around the box are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of the batches before the start. Their rows are left out, because a compacted
-            (sorted) file may also contain older batches.
+        known: record of the batches (messages with records) before the start. Their rows are left
+            out, because a compacted (sorted) file may also contain older batches.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
         most: maximum number of rows; if there are more, an error is raised.
@@ -190,8 +190,8 @@ def too_much() -> InputError:
 
 
 def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
-    """Return a fusion (beliefs about all cells) with the weather received until the time `until`
-    [ns], and without observations.
+    """Return a fusion (beliefs about the friction of all cells) with the weather received until the
+    time `until` [ns], and without observations.
 
     Raises:
         OSError: the archive cannot be read.
@@ -209,8 +209,8 @@ def past_fusion(
     most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
-    """Return the fusion (beliefs about the cells) after everything that was received until the time
-    `until` [ns], near a box (west, south, east, north [deg]).
+    """Return the fusion (beliefs about the friction of the cells) after everything that was
+    received until the time `until` [ns], near a box (west, south, east, north [deg]).
 
     `listener` is called with the fusion. It returns a context in which each group of observations
     is fused, so that the listener can follow the fusion.
@@ -257,7 +257,8 @@ def replay(
 
     Args:
         root: folder of the archive.
-        fusion: a new fusion, or one that contains everything before `since`.
+        fusion: a new fusion (beliefs about the friction of all cells), or one that contains
+            everything before `since`.
         since: selection of rows.
         damaged: called with each damaged file.
         heard: function that returns the context in which a group of observations is fused.
@@ -300,8 +301,8 @@ def _recorded_result(rows: segments.Rows) -> RecordedResult:
 def _join_parts(
     parts: list[tuple[Observations, RecordedResult]],
 ) -> tuple[Observations, RecordedResult]:
-    """Return several parts of archived observations, each with its recorded results, joined into
-    one in the given order.
+    """Return several parts of archived observations, each with its recorded results (lateness and
+    vote weight), joined into one in the given order.
     """
     of = Observations(
         **{
@@ -320,7 +321,9 @@ def _join_parts(
 def _select_rows(
     o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
 ) -> tuple[Observations, RecordedResult]:
-    """Return those of the archived observations and their recorded results that `rows` selects."""
+    """Return those of the archived observations and their recorded results (lateness and vote
+    weight) that `rows` selects.
+    """
     return o.take(rows), RecordedResult(
         before.late[rows], before.late_by[rows], before.weight[rows]
     )
@@ -329,8 +332,8 @@ def _select_rows(
 def _fuse_epochs(
     fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
 ) -> Iterator[Updated]:
-    """Add archived observations to the beliefs epoch by epoch (minute by minute), in order of the
-    time at which they were first processed.
+    """Add archived observations to the beliefs about friction epoch by epoch (minute by minute), in
+    order of the time at which they were first processed.
     """
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")

@@ -28,10 +28,10 @@ ABOVE: Final = "streams_above"
 
 
 class Restart(NamedTuple):
-    """Initial state of a service, from a checkpoint.
+    """Initial state of a service, from a checkpoint (saved state).
 
     Attributes:
-        fusion: fusion (beliefs about all cells) of the checkpoint, or a new one.
+        fusion: fusion (beliefs about the friction of all cells) of the checkpoint, or a new one.
         streams: record of the batches (messages with records) that were accepted when the
             checkpoint was taken.
         standing: alerts that were active ("standing") when the checkpoint was taken.
@@ -89,9 +89,9 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
 def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
-    """Return the tables of a checkpoint (saved state) by name: the tables of the fusion, the active
-    alerts, and the record of accepted batches (messages with records). `load_restart` restores the
-    state from them.
+    """Return the tables of a checkpoint (saved state) by name: the tables of the fusion (beliefs
+    about the friction of all cells), the active alerts, and the record of accepted batches
+    (messages with records). `load_restart` restores the state from them.
     """
     columns, above = streams.columns()
     return tables_of(fusion) | {

@@ -53,8 +53,9 @@ class Fence(NamedTuple):
 
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
-    """Upload the fence (list of valid objects) to the bucket. Its name contains the lease `number`
-    and the `turn` (count of renewals), so that a delayed upload never replaces a later fence.
+    """Upload the fence (list of valid objects) to the bucket. Its name contains the `number` of the
+    owner's lease and the `turn` (count of renewals), so that a delayed upload never replaces a
+    later fence.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.

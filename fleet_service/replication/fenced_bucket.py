@@ -1,6 +1,6 @@
-"""Bucket (object store) under the lease and the fence of its owner. The lease decides which service
-may write to the bucket, and the fence (list of valid objects) decides which objects readers must
-ignore.
+"""Bucket (object store) under the lease and the fence of its owner. The lease (ownership limited in
+time) decides which service may write to the bucket, and the fence (list of valid objects) decides
+which objects readers must ignore.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class FencedBucket:
 
     def admit_objects(self, names: Iterable[str]) -> None:
         """Add uploaded objects to the fence (list of valid objects) if they are not valid yet. Such
-        a file was compacted by a service that started earlier, so its name has an older epoch
-        (number of the owner's term).
+        a file was compacted (merged from others) by a service that started earlier, so its name has
+        an older epoch (number of the owner's term).
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))
@@ -89,9 +89,9 @@ class FencedBucket:
         self._fence = fence
 
     def create_key(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file of keys to the bucket (object store); its name must be new. There is one
-        exception. If a former service uploaded a file of this name after it had lost its lease, the
-        file belongs to rows that are not valid, and is replaced.
+        """Upload a file of the archive's secret keys to the bucket (object store); its name must be
+        new. There is one exception. If a former service uploaded a file of this name after it had
+        lost its lease (ownership), the file belongs to rows that are not valid, and is replaced.
         """
         if self.assert_alone is None or bucket.create(name, content):
             bucket.put_new(name, content)

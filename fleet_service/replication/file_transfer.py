@@ -1,5 +1,5 @@
 """Upload and download of single files between an archive's folder and its bucket replica. The
-journal of the uploads records each file that both have.
+upload journal (list of uploaded files) records each file that both have.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class FileTransfer:
         self._pool = pool
 
     def upload_file(self, path: Path, bucket: ObjectBucket) -> None:
-        """Upload a file through `bucket`, and record it in the upload journal. The caller chooses a
-        `bucket` whose time limit for a request suits this file.
+        """Upload a file through `bucket`, and record it in the upload journal (list of uploaded
+        files). The caller chooses a `bucket` whose time limit for a request suits this file.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.

@@ -88,10 +88,11 @@ LOOK_S: Final = 0.25  # [s] period of the checks while waiting
 
 
 class LeaseRecord(NamedTuple):
-    """Lease as stored in the bucket.
+    """Lease (ownership limited in time) as stored in the bucket.
 
     Attributes:
-        number, epoch: number of the lease, and epoch in the holder's file names.
+        number, epoch: number of the lease, and epoch (a number) in the names of the files that the
+            holder writes.
         holder, service: identity of the holder's folder, and name of the service that runs on it.
         turn: count of renewals of this lease; the lease number stays the same.
         released: True if the holder released the lease.
@@ -128,7 +129,8 @@ class LeaseRecord(NamedTuple):
 
 
 class Standby(NamedTuple):
-    """Functions that a standby (a service that waits for the lease) gives to `Lease.wait`.
+    """Functions that a standby (a service that waits for the lease, the ownership) gives to
+    `Lease.wait`.
 
     Attributes:
         may: returns True if the standby reaches a router and so could serve if it took over now.
@@ -193,7 +195,7 @@ class Lease:
     @property
     def left_s(self) -> float:
         """Return the time [s] for which the service may still acknowledge data in the bucket
-        without another renewal of its lease; 0 or less if it may not.
+        without another renewal of its lease (ownership); 0 or less if it may not.
         """
         return (
             0.0
@@ -318,7 +320,9 @@ class Lease:
                 log.warning("the lease was not released and expires by itself: %s", error)
 
     def make_new_lease(self) -> Lease:
-        """Return a new `Lease` with which the service can wait again after this lease was lost."""
+        """Return a new `Lease` object with which the service can wait for the ownership again after
+        it has lost this lease.
+        """
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
@@ -370,8 +374,8 @@ class Lease:
     def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
-        """Create the lease object with the next number in the bucket, by which this service takes
-        over; return False if another service was faster.
+        """Create the lease object with the next number in the bucket; in this way, this service
+        takes over the archive. Return False if another service was faster.
         """
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
@@ -429,8 +433,8 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
 
 
 def forget_holder(root: Path) -> None:
-    """Remove the identity of a folder that is written without a lease. Such a folder contains data
-    that no bucket has, so it must not be synchronised with a bucket.
+    """Remove the identity of a folder that is used without a lease (ownership in a bucket). Such a
+    folder contains data that no bucket has, so it must not be synchronised with a bucket.
 
     Raises:
         OSError: the identity cannot be removed.
@@ -440,8 +444,8 @@ def forget_holder(root: Path) -> None:
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
-    """Raise InputError if the lease's live holder (record `found`) uses another lease time than
-    `lease_s` [s]: such a holder could still acknowledge data after a take-over.
+    """Raise InputError if `found`, the record of a live holder's lease (ownership), states another
+    lease time than `lease_s` [s]: such a holder could still acknowledge data after a take-over.
     """
     if found.lease_s not in (0.0, lease_s):
         problem = (
@@ -453,8 +457,8 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
 
 
 def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
-    """Return the lease record (who owns the archive) from the content of an object; None if it is
-    damaged. Unknown fields are ignored.
+    """Return the lease record (who owns the archive) from the content of its object in the bucket;
+    None if it is damaged. Unknown fields are ignored.
     """
     try:
         record: dict[str, Any] = json.loads(content)

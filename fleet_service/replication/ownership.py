@@ -1,5 +1,5 @@
 """Exclusive ownership of an archive by a running service: of the folder by a file lock, and of the
-bucket copy, if any, by a lease.
+bucket copy, if any, by a lease (ownership limited in time).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Ownership:
 
     @property
     def smallest_epoch(self) -> int:
-        """Return the smallest number that may be used as the epoch in the names of new segments
-        (files of new rows).
+        """Return the smallest epoch (number in file names) that this owner may use in the names of
+        new segments (files of new rows).
         """
         return 0 if self.lease is None else self.lease.term.epoch
 

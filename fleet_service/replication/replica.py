@@ -122,7 +122,8 @@ class BucketReplica:
         return got
 
     def largest_epoch(self) -> int:
-        """Return the largest epoch (lease term) in the file names of folder and bucket, or 0.
+        """Return the largest epoch (number of an owner's term) in the file names of folder and
+        bucket, or 0.
 
         Raises:
             CopyError: the bucket cannot be listed.

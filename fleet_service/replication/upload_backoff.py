@@ -1,4 +1,4 @@
-"""Pauses between repeated uploads to a bucket (object store) that fail."""
+"""Pauses after failed uploads to a bucket (object store), which grow with each further failure."""
 
 from __future__ import annotations
 

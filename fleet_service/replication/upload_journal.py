@@ -94,17 +94,19 @@ class UploadJournal:
             self._stamps.pop(name, None)
 
     def sync(self) -> None:
-        """Write the recorded lines of the upload journal durably to disk (fsync)."""
+        """Write the recorded lines of the upload journal (list of uploaded files) durably to disk
+        (fsync).
+        """
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file of the upload journal."""
+        """Close the file of the upload journal (list of uploaded files)."""
         self._file.close()
 
 
 def last_copy_url(root: Path) -> str | None:
     """Return the URL of the bucket to which an archive was last copied; None if there is no
-    readable upload journal.
+    readable upload journal (list of uploaded files).
     """
     with suppress(OSError, ValueError, KeyError, TypeError), (root / NAME).open() as file:
         return str(json.loads(file.readline())["copy"])

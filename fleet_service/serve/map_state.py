@@ -19,7 +19,8 @@ PARTS: Final = 32
 
 
 class MapState:
-    """Index from the tiles of the map to the cells of a fusion (beliefs about all cells).
+    """Index from the tiles of the map to the cells of a fusion (beliefs about the friction of all
+    cells).
 
     Args:
         fusion: owner of the cells.

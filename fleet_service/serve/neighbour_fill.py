@@ -89,7 +89,7 @@ def _route_gaps(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return three arrays (k,) for the unvisited parts of a route in a tile: the keys (cell and
     heading sector), the slots of the nearest visited keys before or behind each, and the share of
-    that neighbour in the estimate, [0, 1].
+    this visited neighbour in the estimate, [0, 1].
 
     A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
     are excluded, because they are handled as neighbours.

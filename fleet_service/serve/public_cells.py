@@ -46,8 +46,8 @@ PRESENT: Final = "present"
 
 
 class PublicCells:
-    """Public copy of the cells of a fusion (beliefs about all cells); use it only while holding the
-    lock of the map.
+    """Public copy of the cells of a fusion (beliefs about the friction of all cells); use it only
+    while holding the lock of the map.
 
     Args:
         fusion: owner of the cells.
@@ -107,8 +107,8 @@ class PublicCells:
 
     @contextmanager
     def follow(self, o: Observations) -> Iterator[None]:
-        """Provide a context in which the caller adds the observations `o` to the beliefs; at the
-        end of the context, update the public copy of the cells.
+        """Provide a context in which the caller adds the observations `o` to the beliefs about
+        friction; at the end of the context, update the public copy of the cells.
         """
         now = int(o.time.max(initial=0))
         self.publish(now)
@@ -258,7 +258,9 @@ class PublicCells:
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
-        """Keep only the rows `slots` of the public copy, in arrays with room for `room` rows."""
+        """Keep only the rows `slots` (one per cell and heading sector) of the public copy, in
+        arrays with room for `room` rows.
+        """
         room = len(slots) if room is None else room
         rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
         rows.belief[: len(slots)] = self._rows.belief[slots]

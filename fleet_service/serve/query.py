@@ -1,5 +1,5 @@
-"""Answers to map queries, one tile at a time: select cells, compute beliefs (probabilities of each
-friction), estimate unvisited cells, encode. Pure (no I/O).
+"""Answers to map queries, one tile at a time: select cells, compute beliefs (probability of each
+friction value), estimate unvisited cells, encode. Pure (no I/O).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def answer_query(
         cache: the tiles of the map.
         query: parameters of the query.
         wanted: function that returns True if a tile's key matches the query's key.
-        now: time [ns] for which beliefs (probabilities of each friction) and ages are computed.
+        now: time [ns] for which beliefs (probability of each friction value) and ages are computed.
         only: the only matching tile, if the query's key names it.
 
     Raises:

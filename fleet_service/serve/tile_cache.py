@@ -1,8 +1,8 @@
 """Cache of encoded tiles for readers. A tile is made on request or for publication, and reused
 while it is fresh.
 
-A returned tile is at most SHOWN_NS old and contains everything that was acknowledged or alerted
-before the query. Under load, most queries cost only a look-up.
+A returned tile is at most SHOWN_NS old and contains everything for which an acknowledgement or
+alert was sent before the query. Under load, most queries cost only a look-up.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class TileCache:
     @property
     def source(self) -> Readable:
         """Return the object from which readers' cells are read: the public copy if persons are kept
-        private, otherwise the fusion (the true beliefs) itself.
+        private, otherwise the fusion (the true beliefs about friction) itself.
         """
         return self.state.fusion if self._public is None else self._public
 

@@ -53,8 +53,8 @@ class TileRounds:
         return len(self._left)
 
     def begin(self) -> bool:
-        """Begin a publication round if its time has come. Return True if the time has come, even if
-        the previous round is continued instead.
+        """Begin a publication round if one is due, and return True; return False if none is due. If
+        the previous round is not complete, it is continued instead of a new one.
         """
         passed = int((self._clock() - self._due) // self._every_s) + 1
         if passed <= 0:

@@ -56,7 +56,7 @@ class CellView(NamedTuple):
 
 
 class Readable(Protocol):
-    """Interface to the cells of a map and their beliefs (probabilities of each friction):
+    """Interface to the cells of a map and their beliefs (probability of each friction value):
     implemented by a `Fusion` and by its public copy.
     """
 
@@ -79,7 +79,7 @@ class Readable(Protocol):
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
     """Return a copy of the state of `slots` (one per cell and heading sector), with beliefs
-    (probabilities of each friction) for the time `now` [ns]. The map may be updated afterwards
+    (probability of each friction value) for the time `now` [ns]. The map may be updated afterwards
     without changing the copy.
     """
     live = source.live

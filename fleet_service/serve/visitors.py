@@ -27,8 +27,9 @@ _SHIFT: Final = np.uint64(58)
 
 
 class Visitors:
-    """Recent vehicles of each slot (cell and heading sector) of a fusion (beliefs about all cells).
-    The time window is divided into parts; in each part, a visiting vehicle sets one of 64 bits.
+    """Recent vehicles of each slot (cell and heading sector) of a fusion (beliefs about the
+    friction of all cells). The time window is divided into parts; in each part, a visiting vehicle
+    sets one of 64 bits.
 
     Args:
         fusion: owner of the slots; it must process observations before they are passed to `add`.
@@ -86,8 +87,8 @@ class Visitors:
 
     @staticmethod
     def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
-        """Return the visitors that `columns` describe; empty if the columns do not match the cells
-        of `fusion`.
+        """Return the recent visitors of cells that `columns` describe; no visitors if the columns
+        do not match the cells of `fusion`.
         """
         made = Visitors(fusion)
         bits = columns["bits"]

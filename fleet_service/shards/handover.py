@@ -110,8 +110,8 @@ def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
-    """Send a request to a service to hand over its regions to the standby `to`; return the regions
-    that the service hands over, as text.
+    """Send a request to a service to hand over its regions to the standby (waiting service) named
+    `to`; return the regions that the service hands over, as text.
     """
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:

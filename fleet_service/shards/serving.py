@@ -33,16 +33,16 @@ def claim_regions(
     stop: threading.Event,
     former: Collection[str] = (),
 ) -> Iterator[frozenset[ServiceToken]]:
-    """Claim regions exclusively until the block ends; yield the liveliness tokens by which this
-    service announces them.
+    """Claim regions exclusively until the `with` block ends; yield the liveliness tokens by which
+    this service announces them.
 
     Args:
         session: Zenoh session of the service.
         name: name of the service.
         regions: key expressions of the regions.
         stop: event that ends the wait for another service's token to disappear.
-        former: names of earlier holders of this service's lease; their remaining tokens are
-            ignored, because they will disappear soon.
+        former: names of earlier holders of this service's lease (ownership of the archive); their
+            remaining tokens are ignored, because they will disappear soon.
 
     Raises:
         InputError: another service has one of the regions.
@@ -54,9 +54,9 @@ def claim_regions(
 
 @contextmanager
 def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
-    """Announce to all clients that regions are served while the block runs. The service must be
-    able to answer queries before the block begins and until after it ends: an empty answer from an
-    announced region means that no data exist there.
+    """Announce to all clients that regions are served while the `with` block runs. The service must
+    be able to answer queries before the block begins and until after it ends: an empty answer from
+    an announced region means that no data exist there.
     """
     with _hold_tokens(_declare_tokens(session, mine, SERVES)):
         yield
@@ -76,8 +76,8 @@ def watch_successors(
     session: zenoh.Session, mine: frozenset[ServiceToken]
 ) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True if another service has taken over the regions of the
-    tokens `mine` since the block began. In this way a service that cannot reach its bucket learns
-    that it was replaced, and stops serving outdated data.
+    tokens `mine` since the `with` block began. In this way a service that cannot reach its bucket
+    learns that it was replaced, and stops serving outdated data.
     """
     with presence.track_tokens(session) as there:
         before = there.active

@@ -25,7 +25,8 @@ class Question(NamedTuple):
     Attributes:
         name: name of the question on the command line.
         about: one line of help text.
-        order: column by which the terminal sorts rows; a leading minus means descending.
+        order: column by which the rows are sorted on the terminal; a leading minus means
+            descending.
         colour: column that gives the colour of cells on a map; None if the answer has no place.
         answer: function that answers a question of a plug-in; None for a question of this package.
     """
@@ -95,8 +96,8 @@ log = logging.getLogger(__name__)
 
 
 def known_questions() -> dict[str, Question]:
-    """Return all questions by name, including those of plug-ins. A plug-in that cannot be loaded is
-    left out and logged.
+    """Return all questions by name, including those that plug-ins (installed extensions) add. A
+    plug-in that cannot be loaded is left out and logged.
     """
     others = {}
     for name in plugins.entry_points_of(plugins.QUESTIONS):

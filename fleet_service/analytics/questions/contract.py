@@ -253,8 +253,8 @@ def _link_rows(
 
 
 def _measured_share(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
-    """Return, for each link and direction, the share of its length that lies in cells with a value
-    of friction.
+    """Return, for each road link and direction, the share of the link's length that lies in cells
+    with a value of friction.
     """
     rows = roads.join(seen, ["cell", "sector"], join_type="inner").sort_by("from_m")
     total: dict[tuple[str, str], float] = {}

@@ -1,5 +1,5 @@
 """`replay`: the map at any past moment, replayed from the archive; or a period as a sequence of
-frames.
+frames (maps of successive moments).
 """
 
 from __future__ import annotations

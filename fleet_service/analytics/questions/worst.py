@@ -53,7 +53,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 def join_stretches(cells: pa.Table) -> pa.Table:
     """Return a table with one row per slippery stretch: a stretch is a group of touching cells of
-    the same heading sector. `members` are its cells, and the box encloses them.
+    the same heading sector. `members` are its cells, and its box encloses them.
     """
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _label_components(column["cell"], column["sector"].astype(np.int64))
@@ -122,8 +122,8 @@ def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
 
 
 def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
-    """Return the list of cells of each stretch. With these cells a bent road can be drawn in its
-    true shape instead of its bounding box.
+    """Return, for each slippery stretch, the list of its cells. With these cells a bent road can be
+    drawn in its true shape instead of its bounding box.
     """
     order = np.lexsort((cell, label))
     ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])

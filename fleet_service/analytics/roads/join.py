@@ -92,8 +92,9 @@ class _Joined(NamedTuple):
 
 
 def join_roads(network: RoadNetwork) -> pa.Table:
-    """Return a table with one row for each cell and heading sector on a link. The documentation
-    page "Columns of the questions" explains the columns.
+    """Return a table with one row for each cell and heading sector on a road link. Among the
+    columns are the link, the part of its length in the cell [m], and the distance from the cell to
+    the link [m]. The documentation page "Columns of the questions" lists all columns.
     """
     lengths, marks = _link_marks(network.links)
     scale = np.cos(np.radians(marks.latitude))
@@ -228,7 +229,7 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
     """Return the numbers (n,) of the cells that may lie on a road link: all cells within REACH_M
-    metres of a mark, and some further ones.
+    metres of a mark (point on a link), and some further ones.
     """
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
@@ -250,8 +251,8 @@ def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
 
 
 def _end_points(links: list[DirectedLink]) -> FloatArray:
-    """Return the first and the last point of each link in turn, (2 n, 2) [deg], rounded to a tenth
-    of a metre.
+    """Return the first and the last point of each road link in turn, (2 n, 2) [deg], rounded to a
+    tenth of a metre.
     """
     ends = [(at.latitude[k], at.longitude[k]) for at in links for k in (0, -1)]
     return np.asarray(np.round(np.array(ends), 6), np.float64)

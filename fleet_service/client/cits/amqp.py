@@ -29,8 +29,8 @@ log = logging.getLogger(__name__)
 
 
 class Parcel(NamedTuple):
-    """Message (DENM) to send to the interchange. Its name is passed to `on_accepted` when the
-    interchange has accepted it.
+    """Hazard message (DENM) to send to the interchange. The function `on_accepted` is called with
+    its name when the interchange has accepted it.
     """
 
     name: str
@@ -177,7 +177,7 @@ class AmqpLink:
         return self
 
     def send(self, parcel: Parcel) -> None:
-        """Queue a message (DENM); it is sent repeatedly until the interchange accepts it."""
+        """Queue a hazard message (DENM); it is sent repeatedly until the interchange accepts it."""
         self.queue.append(parcel)
         if not self.is_waking:
             self.is_waking = True

@@ -222,9 +222,10 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
-    """Return the offsets of points from `origin` in the encoding of a DENM. Each point has the
-    offsets to the north and to the east, both encoded with the same number of bits, and a height
-    that is marked as unavailable. Points that are too far away for these bits are left out.
+    """Return the offsets of points from `origin` in the encoding of a DENM (hazard message). Each
+    point has the offsets to the north and to the east, both encoded with the same number of bits,
+    and a height that is marked as unavailable. Points that are too far away for these bits are left
+    out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]

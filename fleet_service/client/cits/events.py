@@ -92,7 +92,7 @@ class EventBook:
     def update(
         self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]
     ) -> list[Denm]:
-        """Return the messages (DENM) that are due now. Events at places for which no service
+        """Return the hazard messages (DENM) that are due now. Events at places for which no service
         answers are not ended, because their state is unknown.
 
         Args:

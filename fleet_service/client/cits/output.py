@@ -1,5 +1,5 @@
-"""Output of alerts as DENM to an interchange. Each message is saved to a file before it is sent,
-and stays in the file until the interchange accepts it.
+"""Output of alerts as DENM (hazard messages) to an interchange. Each message is saved to a file
+before it is sent, and stays in the file until the interchange accepts it.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 
 class BitWriter:
-    """Sequence of bits to which numbers are appended, for the encoding of a DENM."""
+    """Sequence of bits to which numbers are appended; used to encode a DENM (hazard message)."""
 
     def __init__(self) -> None:
         self._bits = 0
