@@ -53,8 +53,8 @@ PARTS: dict[str, Callable[[], list[Figure]]] = {part.__name__: part for part in 
 
 
 def main() -> int:
-    """Run the named benchmarks, or all benchmarks without names, and print progress. Return the
-    exit code.
+    """Run the benchmarks that the command line names (all if it names none), and print progress.
+    Return the exit code.
     """
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks", description=(__doc__ or "").splitlines()[0]

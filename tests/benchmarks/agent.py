@@ -65,7 +65,9 @@ def agent() -> list[Figure]:
 
 
 def simulate_drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
-    """Simulate a drive, and return the paths of its signal log and its vehicle file."""
+    """Simulate a drive of `seconds` seconds. Return the paths of its signal log and of its vehicle
+    file.
+    """
     log = folder / f"{name}.parquet"
     vehicle = folder / f"{name}.json"
     files = [
@@ -124,11 +126,12 @@ def measure_cold_start(folder: Path, files: list[str]) -> float:
 
 
 def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
-    """Return processor time [s] and resident memory [MB] of a command of the edge agent.
+    """Run a command of the edge agent in a process. Return its processor time [s] and its peak
+    resident memory [MB].
 
     Raises:
-        ArithmeticError: the command left reports unacknowledged, so the measured cost would be too
-            low.
+        ArithmeticError: the command left reports without acknowledgement, so the measured cost
+            would be too low.
     """
     config = folder / "agent.json"
     config.write_text(
@@ -147,8 +150,8 @@ def measure_usage(folder: Path, endpoint: str, *words: str) -> tuple[float, floa
 
 
 def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
-    """Return the peak resident memory [MB] of a process, sampled until its end, and its resource
-    usage.
+    """Wait until a process ends. Return its peak resident memory [MB], which is sampled until then,
+    and its resource usage.
 
     The peak that the system reports cannot be used: it begins at the fork, when the memory was
     still that of the parent.
@@ -169,8 +172,8 @@ def watch_memory(pid: int) -> tuple[float, resource.struct_rusage]:
 
 
 def measure_live(folder: Path, endpoint: str) -> list[Figure]:
-    """Measure the processor time of one vehicle at 100 Hz: the difference between a long and a
-    short run, so that the start is not included.
+    """Measure the processor time of one vehicle at 100 Hz. It is the difference between the
+    processor times of a long and a short run, so the start of the process does not count.
     """
     log, vehicle = simulate_drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = (
@@ -226,9 +229,9 @@ def measure_fleet(folder: Path, endpoint: str) -> list[Figure]:
 
 
 def measure_replay(folder: Path) -> list[Figure]:
-    """Measure the throughput of a replay of many logs with two jobs (worker processes), including
-    the writing of Parquet. Return it divided by twice the throughput of the compiled estimator on
-    one core.
+    """Measure how many logs two jobs (worker processes) replay per second, including the writing of
+    Parquet. Return this rate as a figure, divided by twice the rate of the compiled estimator alone
+    on one core.
     """
     logs = [simulate_drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
     log = read_log(logs[0][0])

@@ -63,7 +63,7 @@ def print_progress(line: str) -> None:
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Return the median duration [s] of `rounds` calls of a function."""
+    """Return the median duration [s] of `rounds` calls of the function `work`."""
     spent = []
     for _ in range(rounds):
         began = time.perf_counter()
@@ -118,7 +118,9 @@ def measure_archive(root: Path, rows: int) -> list[Figure]:
 
 
 def _ask_question(name: str, root: Path, options: Options) -> pa.Table:
-    """Answer a query about the archive, called `name`, with a new instance of the query program."""
+    """Answer the query called `name` about the archive `root`, with a new instance of the query
+    engine.
+    """
     return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
 
 
@@ -152,7 +154,9 @@ def measure_questions(root: Path, readings: Path) -> list[Figure]:
 
 
 def write_small_archive(root: Path) -> dict[int, pa.Table]:
-    """Write a small archive, and return the maps that it contains (snapshots), by time."""
+    """Write a small archive that contains three stored maps (snapshots). Return these maps by their
+    time [ns].
+    """
     synthetic.write_archive(root, SMALL, 4000)
     compact(root)
     rollup.complete_parts(root)
@@ -169,8 +173,9 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Return three counts: files that a validator refuses, programs that cannot read the archive,
-    and queries to which the two query engines (DuckDB and Spark) give different answers.
+    """Test with how many programs and in how many ways the archive can be read. Return three counts
+    as figures: files that a validator refuses, programs that cannot read the archive, and queries
+    to which the query engines DuckDB and Spark give different answers.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))

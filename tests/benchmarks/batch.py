@@ -19,9 +19,9 @@ FOLDER: Final = ROOT / ".batch"
 
 
 def measure_all(folder: Path) -> list[Figure]:
-    """Run all benchmarks of this module: compare results on Spark, and the rows of Iceberg tables,
-    with those of one process; measure the speed-up. Return the figures. Temporary files are written
-    to `folder`.
+    """Run all benchmarks of this module, and return their figures: differences between the results
+    of Spark and of one process, differing rows of Iceberg tables, and the speed-up of Spark by a
+    second core. Temporary files are written to `folder`.
     """
     logs = spread.simulate_drives(folder / "drives")
     return [

@@ -27,8 +27,8 @@ BAR = 2.0
 
 
 def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
-    """Start a service with these archive settings, send it reports, and return the times [s] until
-    their acknowledgements.
+    """Start a service with the settings `archive` for its archive, and send reports to this
+    service. Return the time [s] from each report to its acknowledgement.
     """
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")

@@ -77,8 +77,8 @@ def make_visits(
 
 
 def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
-    """Return a fusion (a map's beliefs) that has received `per_cell` visits per cell, and the
-    random generator for further visits.
+    """Fill a new map computation (`Fusion`) with `per_cell` visits in each of `cells` cells. Return
+    it, together with the random generator that drew the visits.
     """
     rng = np.random.default_rng(SEED)
     fusion = Fusion(120.0)
@@ -94,8 +94,8 @@ def fill_fusion(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.r
 
 
 def split_batches(o: Observations) -> Iterator[Observations]:
-    """Yield observations in batches, each with as many observations as the service processes in one
-    pass of its main loop.
+    """Yield the observations `o` in batches. Each batch has as many observations as the service
+    processes in one pass of its main loop.
     """
     for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
         yield o.take(rows)
@@ -119,8 +119,8 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 
 def table_vs_dict() -> float:
-    """Return the time of a look-up among 10⁶ keys in numba's typed dictionary, divided by that in
-    the store's hash table. BATCH keys are looked up at once.
+    """Return the time of a look-up of BATCH among 10⁶ keys in numba's typed dictionary, divided by
+    the time of the same look-up in the hash table of the product's map store.
     """
     keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
     turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))

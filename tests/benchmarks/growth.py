@@ -55,9 +55,10 @@ def growth() -> list[Figure]:
 
 
 def second_s(rate: int, seconds: int) -> float:
-    """Return the mean processor time [s] for one second of messages at `rate`, measured over
-    `seconds` after a warm-up. In the middle of the measurement an epoch (minute of the fusion)
-    ends, so the work at its end is included.
+    """Return the mean processor time [s] that an engine (service without network) needs for one
+    second of messages, at `rate` observations per second. It is measured over `seconds` seconds
+    after a warm-up. In the middle of the measurement an epoch (minute of the fusion) ends, so the
+    work at its end is included.
     """
     vehicles = rate // ROWS
     spent = 0.0

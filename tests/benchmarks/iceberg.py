@@ -55,9 +55,9 @@ def _count_rows(table: pa.Table) -> Counter[str]:
 
 
 def count_different_rows(folder: Path) -> float:
-    """Return the number of differing rows between archive and Iceberg tables, over four rounds of
-    compaction (sorting of new rows) and registration in Iceberg, and after retention has removed a
-    day.
+    """Return the number of rows that differ between the archive and its Iceberg tables. The rows
+    are compared after each of four compactions (sorting of new rows) with registration in Iceberg,
+    and again after retention has removed a day.
     """
     root = folder / "archive"
     uri = f"sqlite:///{folder}/tables.db"

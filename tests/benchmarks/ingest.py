@@ -68,9 +68,9 @@ def ingest() -> list[Figure]:
 
 
 def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
-    """Return medians after a warm-up: observations per wall second and per CPU second of the whole
-    ingest; then observations per CPU second of decoding alone, with the generated module and with
-    our decoder.
+    """Measure the ingest of messages with `records` observations each. Return medians after a
+    warm-up: observations per wall second and per CPU second of the whole ingest; observations per
+    CPU second of decoding alone with protobuf's generated module; and the same with our decoder.
     """
     sent = make_messages(COUNTS[records], records, time.time_ns())
     taken = [_time_ingest(sent, records) for _ in range(ROUNDS + 1)][1:]
@@ -96,8 +96,8 @@ def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) 
 
 
 def turn_of(sent: list[Message]) -> int:
-    """Return the number of the messages `sent` that the service ingests in one pass of its main
-    loop.
+    """Return how many of the messages `sent` the service would ingest in one pass of its
+    main loop.
     """
     return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
@@ -118,8 +118,8 @@ def _decode_messages(sent: list[Message]) -> list[NDArray[Any]]:
 
 
 def corner_of_region(east: int) -> tuple[int, int]:
-    """Return column and row of the north-west cell of a region, `east` regions east of the one with
-    Gothenburg.
+    """Return column and row of the north-west cell of a region. The region lies `east` regions east
+    of the one that contains Gothenburg.
     """
     x, y = grid.deinterleave(grid.region_of(grid.cell_of(57.7, 11.97)) << REGION_BITS)
     return int(x) + (east << REGION_BITS // 2), int(y)

@@ -57,8 +57,8 @@ def compile_library(source: str, *options: str) -> ctypes.CDLL:
 
 
 def setting_row(memberships: Memberships) -> FloatArray:
-    """Return the settings of the C filters as an array: the fields of the structure Setting in
-    order.
+    """Return all settings of the C filters as one array, in the order of the fields of the C
+    structure `Setting`.
     """
     setting = Setting()
     return np.array(
@@ -79,8 +79,8 @@ def setting_row(memberships: Memberships) -> FloatArray:
 
 
 def first_memory(first: FloatArray, speed: float) -> FloatArray:
-    """Return the memory of N filters in their initial state, as rows (N, doubles) in the layout of
-    the C kernels' structures.
+    """Return the initial state of N filters in C as an array (N, doubles). Each row has the layout
+    of the C structure of one filter.
 
     Args:
         first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
@@ -166,8 +166,9 @@ class VectorLimit:
         )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
-        """Rearrange values (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes), so
-        that `lanes` vehicles lie side by side in a SIMD vector; the array is aligned to a vector.
+        """Rearrange `values` (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes), so
+        that one SIMD vector contains the same number of `lanes` vehicles. The returned array is
+        aligned in memory to such vectors.
         """
         *rest, vehicles, numbers = values.shape
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(

@@ -13,7 +13,9 @@ SEED = 0
 
 
 def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Return the median duration [s] of a function, after one call as a warm-up."""
+    """Return the median duration [s] of `rounds` calls of the function `work`, after one call as a
+    warm-up.
+    """
     work()
     spent = []
     for _ in range(rounds):
@@ -26,8 +28,8 @@ def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def time_in_turn(
     ours: Callable[[], object], other: Callable[[], object], rounds: int = ROUNDS
 ) -> tuple[float, float]:
-    """Return the median durations [s] of two functions that are called alternately, each after a
-    warm-up.
+    """Call the functions `ours` and `other` alternately, `rounds` times each, after a warm-up.
+    Return the median duration [s] of each function.
     """
     ours(), other()
     spent: tuple[list[float], list[float]] = ([], [])

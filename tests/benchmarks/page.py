@@ -126,7 +126,9 @@ map.once("idle", () => { globalThis.shown = performance.now(); });
 
 @contextmanager
 def open_window(address: str) -> Iterator[Opened]:
-    """Open an address in a large window and record when painting was complete."""
+    """Open an address in a large browser window, wait until the page has painted its map, and yield
+    the window.
+    """
     with browser.open_page("about:blank", unbound=True) as seen:
         size: Any = VIEWPORT
         seen.page.set_viewport_size(size)
@@ -257,8 +259,8 @@ def pushed_ms(on: Stage) -> float:
 
 
 def bytes_per_cell(on: Stage) -> float:
-    """Return the mean number of bytes, before compression, per cell in the page's data blocks
-    (encoded cells).
+    """Return the mean number of bytes per cell in the data blocks (encoded cells) that the live
+    page sends to browsers, before compression.
     """
     tiles = ",".join(map(str, on.town.tiles))
     with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:
@@ -266,9 +268,9 @@ def bytes_per_cell(on: Stage) -> float:
 
 
 async def _measure_pushes(on: Stage, count: int) -> float:
-    """Let `count` watchers (event streams of browsers) receive changes of the page. Return the 95 %
-    quantile of the time [s] from a publication until each has received it; infinity if a watcher
-    missed one.
+    """Let `count` watchers (event streams of browsers) receive changes of the live page. Return the
+    95 % quantile of the time [s] from a publication until a watcher has received it. A publication
+    that a watcher missed counts as infinity.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
     heard = [dict[int, float]() for _ in range(count)]
@@ -314,7 +316,8 @@ def _fetch_page(address: str) -> bytes:
 
 def count_watchers(on: Stage) -> float:
     """Return the largest tested number of watchers (event streams of browsers) that get 95 % of the
-    updates within a second from a page on one core; 0 if the smallest tested number is too large.
+    updates within a second from a page on one core. Return 0 if even the smallest tested number
+    does not.
     """
     pin_to_core(on.process, 0)
     for count in WATCHERS:

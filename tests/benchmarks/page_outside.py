@@ -80,8 +80,8 @@ def is_over(record: ET.Element) -> bool:
 
 
 def is_valid() -> Callable[[bytes], bool] | None:
-    """Return a function that validates DATEX II publications, or None if the schema is not
-    installed.
+    """Return the function that checks that a DATEX II publication follows the schema. Return None
+    if the schema is not installed.
     """
     if not SCHEMA.exists():
         print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
@@ -93,12 +93,12 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Make STEPS DATEX II publications of simulated alerts; `valid` validates each. Return the
-    number of invalid publications, and the number of situations that were not ended although their
-    alert was over.
+    """Make STEPS DATEX II publications of simulated alerts, and check each with the function
+    `valid`. Return the number of invalid publications, and the number of situations whose end was
+    not published although their alert was over.
 
-    The alerts of cells on a road begin and end at random. A count is NaN if the schema is not
-    installed, or if hardly any alert ended.
+    The alerts of cells on a road begin and end at random. Both counts are NaN if hardly any alert
+    ended; the first one is also NaN if `valid` is None, because the schema is not installed.
     """
     rng = np.random.default_rng(SEED)
     stretches = Stretches()
@@ -204,7 +204,7 @@ def measure_publication() -> dict[str, float]:
 
 
 def fetch_publication(address: str) -> bytes:
-    """Return the page's current publication, or an empty one if there is none yet."""
+    """Return the current DATEX II publication of the page, or empty bytes if there is none yet."""
     try:
         with urllib.request.urlopen(f"{address}datex2/situation.xml", timeout=30) as answer:
             found: bytes = answer.read()
@@ -214,8 +214,8 @@ def fetch_publication(address: str) -> bytes:
 
 
 def count_features(address: str) -> int:
-    """Return the number of features (map cells) in the answer of the page's OGC API, or 0 without
-    an answer.
+    """Return the number of features (map cells) in an answer of the page's OGC API, or 0 if the
+    page does not answer.
     """
     try:
         with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:

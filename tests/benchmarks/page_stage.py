@@ -34,8 +34,8 @@ BOUND_SHARE: Final = 0.3
 
 
 class Town:
-    """Cells of a simulated town by map tile. Changes of cells are published in the form that a
-    service uses.
+    """Simulated town whose map cells are stored by map tile. Its tiles can be changed and encoded
+    for publication as a service does.
     """
 
     def __init__(self, seed: int) -> None:
@@ -52,8 +52,9 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local_marker(self, tile: int) -> int:
-        """Return the index of a tile's marker cell. The vehicle count of this cell states the
-        number of the publication, so that a test that reads the tile can recognise the publication.
+        """Return the index of the marker cell within a map tile. Its vehicle count is the number of
+        the publication, so that a test can recognise by this cell which publication it has
+        received.
         """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 
@@ -91,7 +92,9 @@ class Town:
         }
 
     def make_batch(self, tile: int) -> pa.RecordBatch:
-        """Return a tile as a record batch with the schema of the map."""
+        """Return the map tile number `tile` of the simulated town as a record batch with the schema
+        of the map.
+        """
         columns = ((self.tiles[tile][f.name], f.type) for f in tables.MAP_SCHEMA)
         arrays = [
             (c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False)

@@ -79,7 +79,9 @@ def _find_largest_change(
 
 @contextmanager
 def _open_service(root: Path) -> Iterator[zenoh.Session]:
-    """Yield a client's session to a running service on the archive."""
+    """Start a service on the archive `root`, and yield the Zenoh session of a client of this
+    service.
+    """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     lines: list[str] = []
@@ -102,8 +104,9 @@ def _open_service(root: Path) -> Iterator[zenoh.Session]:
 
 
 def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
-    """Return the time [s] until the answer to a map query, and the tiles in this answer. Repeat the
-    query while another past map is being computed.
+    """Send the map query `selector`. Return the time [s] until its answer, and the tiles in the
+    answer. If the service refuses the query because it computes other past maps, send the query
+    again.
     """
     while True:
         began = time.perf_counter()
@@ -118,8 +121,8 @@ def _time_answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.
 
 
 def _time_queries(root: Path) -> tuple[list[float], int]:
-    """Return the time [s] until the answer to each map query, and the number of cells in the
-    answers.
+    """Send QUERIES queries for a past map. Return the time [s] until the answer to each one, and
+    the number of cells in all answers.
     """
     rng = np.random.default_rng(0)
     step = 360.0 / (1 << grid.CELL_ZOOM)

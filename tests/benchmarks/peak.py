@@ -47,8 +47,8 @@ def measure_peak() -> float:
 
 @nogil
 def add_products(values: FloatArray, turns: int) -> float:
-    """Run CHAINS recursions x <- factor*x + term in registers; `values` (2, LANES) are the factor
-    and the term.
+    """Run CHAINS independent recursions x <- factor*x + term in registers, `turns` times each.
+    `values` (2, LANES) has the factor in its first row and the term in its second.
     """
     factor = lanes_at(values, 0)
     term = lanes_at(values, 1)

@@ -38,8 +38,11 @@ class Problem(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """Filter made with another library, and the smallest accepted ratio of our filters' speed to
-    its speed.
+    """Filter that is made with another library.
+
+    Attributes:
+        drive: function that runs this filter over the readings.
+        bar: smallest accepted value of the speed of our filter divided by the speed of this filter.
     """
 
     drive: Callable[[Problem], object]

@@ -45,8 +45,8 @@ def public() -> list[Figure]:
 
 
 class _Map:
-    """Map of CELLS cells that readers may see. Since readers last received it, each cell was
-    visited by one more vehicle, so that every cell has unpublished data.
+    """Map of CELLS cells that readers may see. Each cell was visited by one more vehicle after its
+    last publication, so that every cell has unpublished data.
     """
 
     def __init__(self, least: int) -> None:

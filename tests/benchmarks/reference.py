@@ -58,8 +58,8 @@ def compute_response(
     readings: FloatArray,
     mu: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return longitudinal, lateral and yaw acceleration, each (P,), of a vehicle with four Dugoff
-    tyres in P states.
+    """Return the longitudinal, lateral and yaw acceleration, each (P,), of a vehicle with four
+    Dugoff tyres in each of P states of motion.
     """
     front = np.array([True, True, False, False])
     left = np.array([1.0, -1.0, 1.0, -1.0])

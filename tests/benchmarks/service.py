@@ -51,8 +51,9 @@ _X, _Y = (
 
 
 def make_batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
-    """Return a batch (message) of visits (passes through map cells) of the test tile, dated now.
-    They report ice if `ice` is True, otherwise only how much friction the tyres used.
+    """Return a batch (message) of visits (passes through map cells) that end now, in cells of the
+    test tile at the given columns and rows. They report ice if `ice` is True, otherwise only how
+    much friction the tyres used.
     """
     cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
     latitude, longitude = grid.centre(cell)
@@ -150,13 +151,15 @@ def run_process(*words: str) -> Iterator[None]:
 
 
 def fetch_reply(session: zenoh.Session, selector: str) -> bytes:
-    """Return the only reply to a map query; empty if there is none."""
+    """Send a map query, and return the bytes of its only reply, or empty bytes if no reply
+    arrives.
+    """
     return b"".join(reply.ok.payload.to_bytes() for reply in session.get(selector) if reply.ok)
 
 
 def poll_until(something: Callable[[], object]) -> None:
-    """Call a function repeatedly until its result is not empty. Raise TimeoutError after two
-    minutes.
+    """Call the function `something` repeatedly until its result is not empty. Raise TimeoutError
+    after two minutes.
     """
     deadline = time.monotonic() + 120.0
     while not something():
@@ -179,8 +182,9 @@ def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
 
 
 def alert_delays_ms(session: zenoh.Session) -> list[float]:
-    """Return the times [ms] from the second vehicle's publication to the alert of its cell at a
-    subscriber. The cells are far from each other.
+    """Let two vehicles report ice in each of ALERTS cells, which are far from each other. Return,
+    for each cell, the time [ms] from the second vehicle's publication until a subscriber receives
+    the alert.
 
     Alerts of neighbouring cells, and alerts that are published again, do not count.
     """

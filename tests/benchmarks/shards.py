@@ -96,8 +96,9 @@ def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float
 
 
 def _time_round(running: Sequence[subprocess.Popen[str]]) -> float:
-    """Let all processes ingest one burst at the same time, and return the time [s] until all have
-    finished. The caller ignores the first round, which is a warm-up.
+    """Let all processes in `running` ingest one burst of messages at the same time, and return the
+    time [s] until all have finished. The caller ignores the time of the first burst, which is a
+    warm-up.
     """
     began = time.perf_counter()
     for process in running:

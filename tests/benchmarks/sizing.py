@@ -54,8 +54,9 @@ def sizing() -> list[Figure]:
 
 
 def main(vehicles: int, messages: int) -> None:
-    """Let an engine (service without network) ingest `messages` messages of each vehicle. Print the
-    content of the engine's memory, and the memory that it takes [bytes], as one line of JSON.
+    """Let an engine (service without network) ingest `messages` messages from each of `vehicles`
+    vehicles. Print one line of JSON with the numbers of vehicles, cells and other entries that its
+    memory contains, and with the size of this memory [bytes].
     """
     with (
         tempfile.TemporaryDirectory() as folder,

@@ -58,8 +58,8 @@ def simulate_drives(folder: Path) -> list[Path]:
 
 
 def replay_difference(logs: Sequence[Path], folder: Path) -> float:
-    """Return the number of estimate files from Spark that differ from those of this process,
-    although each Spark task was killed once.
+    """Estimate the recorded drives `logs` on Spark, where each task is killed once and repeated,
+    and in this process. Return the number of estimate files that differ.
     """
     here = folder / "here"
     there = folder / "there"
@@ -77,8 +77,8 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
 
 
 def rebuild_difference(folder: Path) -> float:
-    """Return the largest difference between a map rebuilt here and one rebuilt on Spark with each
-    task killed once.
+    """Rebuild a map from an archive on Spark, where each task is killed once and repeated, and in
+    this process. Return the largest difference between both maps.
     """
     archive, here, there, tries = (folder / name for name in ("archive", "here", "there", "tries"))
     fill(archive, WORLD)

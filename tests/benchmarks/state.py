@@ -72,10 +72,11 @@ def state() -> list[Figure]:
 
 
 def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
-    """Return two times [s]: from the request until the checkpoint is on disk, and the longest pass
-    of the service's main loop (worker) meanwhile.
+    """Ingest all messages of `sent`, and request a checkpoint (saved state) meanwhile. Return two
+    times [s]: from the request until the checkpoint is on disk, and the longest pass of the
+    service's main loop (worker).
 
-    All messages of `sent` are ingested, half of them after the checkpoint.
+    Half of the messages are ingested only after the checkpoint is written.
     """
     parts = [sent[at : at + TURN] for at in range(0, len(sent), TURN)]
     turns: list[float] = []

@@ -33,8 +33,9 @@ AGREE = 1e-6
 
 
 class Drive:
-    """Simulated manoeuvre, repeated as often as needed, in two forms: as all 18 signals for the
-    estimator, and as the 11 of these signals that the C kernel reads ("readings").
+    """Simulated manoeuvre in two forms: all 18 signals for the estimator, and those 11 of these
+    signals that the C kernel reads ("readings"). A caller can repeat the manoeuvre as often as
+    needed.
     """
 
     def __init__(self) -> None:
@@ -77,8 +78,8 @@ Kind = TypeVar("Kind", Limit, VectorLimit)
 
 
 def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
-    """Return a bank of filters (one per vehicle, computed together) in C, each in the state of the
-    drive's first sample.
+    """Return a bank of filters in C (one per vehicle, computed together) of the class `kind`. Each
+    filter starts from the first sample of `drive`.
     """
     rows = parameter_table([drive.vehicle] * vehicles)
     return kind(
@@ -198,8 +199,8 @@ def bank() -> list[Figure]:
 
 
 def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
-    """Return the duration of a filter step for many vehicles divided by that of C code with
-    vehicles side by side in SIMD vectors. Both use one thread.
+    """Return the duration of a step of the product's filter for many vehicles, divided by that of
+    the same filter in C, which computes several vehicles in one SIMD vector. Both use one thread.
 
     Every vehicle has its own noise, so that an error that mixes up vector lanes is found.
 

@@ -62,8 +62,8 @@ class Sumo:
         )
 
     def draw_trips(self, seconds: int, every_s: float, seed: int, *more: str) -> None:
-        """Draw random trips, one every `every_s` seconds, preferably from and to the edge of the
-        town.
+        """Let SUMO draw random trips that begin within `seconds` seconds, one every `every_s`
+        seconds. Most begin and end at the edge of the town.
         """
         words = (
             f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed "

@@ -64,8 +64,8 @@ _ROWS = _ACROSS // ROW
 
 
 def make_visit(vehicle: int, turn: int) -> Batch:
-    """Return a batch with an observation of a vehicle in the middle of a map tile. In each turn
-    (period between two visits) the vehicle moves to the next of its tiles.
+    """Return a batch with one observation of the vehicle number `vehicle`, in the middle of a map
+    tile. In each turn (period between two visits) the vehicle is in the next one of its tiles.
     """
     first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
     x, y = (int(v) for v in grid.deinterleave(first))
@@ -91,7 +91,7 @@ def make_visit(vehicle: int, turn: int) -> Batch:
 
 
 class Acks:
-    """Record of the time at which each batch was sent, and of its waiting time for the
+    """Record of the time at which each batch was sent, and of the time from then until its
     acknowledgement.
     """
 
@@ -109,8 +109,8 @@ class Acks:
                     self.waits[vehicle, seq] = now - self.put[vehicle, seq]
 
     def waits_since(self, since: float) -> list[float]:
-        """Return, for each batch that was sent after `since`, the time [s] until its
-        acknowledgement; infinity if it was not acknowledged.
+        """Return, for each batch that was sent at or after the time `since`, the time [s] until its
+        acknowledgement. It is infinite for a batch without acknowledgement.
         """
         return [
             self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since
@@ -177,8 +177,9 @@ def read(endpoint: str) -> None:
 
 
 def _time_answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
-    """Return the times [ms] of queries for one tile while READERS readers query everything, until
-    each reader has an answer. Also return the smallest number of tiles that a reader received.
+    """Query one map tile repeatedly while READERS readers query the whole map, until each reader
+    has an answer. Return the time [ms] of each query of the tile. Return also the smallest number
+    of tiles that a reader received.
     """
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]

@@ -36,7 +36,9 @@ LIBRARIES: Final = {"zenohpico": ["-DZENOH_LINUX"], "zenohc": ["-DUSE_ZENOH_C"]}
 
 
 def missing_tool(language: str) -> str:
-    """Return the reason why a client cannot be built or run on this machine, or "" if it can."""
+    """Return the tool that is missing to build and run the client in this language, as a text.
+    Return "" if nothing is missing.
+    """
     if language == "c":
         for tool in ("cc", "pkg-config"):
             if shutil.which(tool) is None:
@@ -116,7 +118,9 @@ def served_map(folder: Path) -> Iterator[str]:
 
 
 def report_ice(endpoint: str, vehicle: str, place: tuple[float, float]) -> None:
-    """Publish a second vehicle's report of ice at a place, because an alert needs two vehicles."""
+    """Publish a report of ice at `place` as the vehicle `vehicle`. The tests call this for a second
+    vehicle, because an alert needs two.
+    """
     region = int(grid.region_of(int(grid.cell_of(*place))))
     now = time.time_ns()
     given = {"latitude": place[0], "longitude": place[1], "yaw": 1.57, "mu": 0.2}
@@ -137,8 +141,8 @@ def report_ice(endpoint: str, vehicle: str, place: tuple[float, float]) -> None:
 
 
 def run_client(command: list[str], language: str, endpoint: str) -> dict[str, Any]:
-    """Run a built client at a place of its own, at which another vehicle reports ice, and return
-    the JSON that the client prints.
+    """Let another vehicle report ice at a place, and run a built client there. Each language has a
+    place of its own. Return the JSON that the client prints.
 
     Raises:
         RuntimeError: the client failed.

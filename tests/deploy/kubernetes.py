@@ -59,8 +59,8 @@ def build_overlay(overlay: str) -> list[Manifest]:
 
 
 def find_schema_errors(objects: list[Manifest]) -> list[str]:
-    """Return the errors of a strict check against Kubernetes' schemas, which also reports unknown
-    fields.
+    """Return the errors that a strict check of `objects` against Kubernetes' schemas finds. The
+    check also reports unknown fields.
     """
     import kubernetes_validate
 
@@ -74,7 +74,7 @@ def find_schema_errors(objects: list[Manifest]) -> list[str]:
 
 
 def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
-    """Return the Kubernetes objects of a kind, such as "Service"."""
+    """Return those of the Kubernetes `objects` that have this kind, such as "Service"."""
     return [one for one in objects if one["kind"] == kind]
 
 
@@ -100,13 +100,17 @@ class Pod:
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
 
     def port_of(self, container: Manifest, named: str | int) -> int:
-        """Return the port on this machine for a container's port, given by name or number."""
+        """Return the port of this machine that stands for a port of the container. The container's
+        port is given by its name or its number.
+        """
         numbers = {one["name"]: one["containerPort"] for one in container.get("ports", [])}
         return self.ports[numbers.get(named, named)]
 
 
 def make_pods(objects: list[Manifest], root: Path) -> list[Pod]:
-    """Return every pod of every StatefulSet, with free ports of this machine."""
+    """Return every simulated pod of every StatefulSet in `objects`. Each container port is replaced
+    by a free port of this machine.
+    """
     found = []
     for one in of_kind(objects, "StatefulSet"):
         claims = [
@@ -321,8 +325,9 @@ class Cluster:
                 return
 
     def fetch_page(self, pod: Pod, path: str) -> str:
-        """Return a page of a pod's metrics server. The text is empty while a standby (waiting
-        service) takes over, because it then replaces its own server by that of the service.
+        """Return a page of a pod's metrics server. The text is empty if the server does not answer.
+        This happens while a standby (waiting service) takes over, because the standby's server then
+        ends and the service's server starts.
         """
         (container,) = pod.containers
         address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"

@@ -55,8 +55,8 @@ class SerializedReader:
         self._at = 0
 
     def read_number(self, layout: str) -> int:
-        """Read the next little-endian number and return it; `layout` is its format in the notation
-        of the module `struct`.
+        """Read the next little-endian number from the serialized data and return it. `layout` is
+        the format of the number in the notation of the module `struct`.
         """
         (found,) = struct.unpack_from("<" + layout, self._data, self._at)
         self._at += struct.calcsize("<" + layout)

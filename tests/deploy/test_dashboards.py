@@ -32,7 +32,7 @@ EXPRESSIONS = [rule["expr"] for rule in RULES] + [
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    """Return the names of all metrics that a running service and a running agent export."""
+    """Start a service and an agent, and return the names of all metrics that they export."""
     return reference_pages.all_metrics(tmp_path_factory.mktemp("archive"))
 
 

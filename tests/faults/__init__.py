@@ -1,1 +1,3 @@
-"""Fault campaigns of `make faults`; `frame.py` explains how to add one."""
+"""Fault campaigns (tests of the whole system under failures) of `make faults`. The docstring of
+`frame.py` explains how to add one.
+"""

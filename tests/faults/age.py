@@ -1,12 +1,13 @@
 """Campaign on the age of an archive: the time until a service is ready on a large archive, and the
 cost of a query about the past.
 
-20 million observations and 40 million states of six days are generated once and stored in
-`age-archive` next to the campaigns' folders. A service starts from Parquet files only, writes a
-checkpoint (saved state), and starts again from this checkpoint and the few later rows. Each start
-runs in a separate process, whose peak memory is measured. Finally a service starts twice more: from
-an archive of one day, and from this day plus the other days moved back by months. Both starts must
-cost the same, because expired days are not read.
+20 million observations and 40 million states (vehicle positions and speeds) of six days are
+generated once and stored in `age-archive` next to the campaigns' folders. A service starts from
+Parquet files only, writes a checkpoint (saved state), and starts again from this checkpoint and the
+few later rows. Each start runs in a separate process, and the campaign measures the peak memory of
+this process. Finally a service starts twice more: from an archive of one day, and from this day
+plus the other days moved back by months. Both starts must cost the same, because expired days are
+not read.
 """
 
 from __future__ import annotations
@@ -116,8 +117,8 @@ def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
-    """Return the folder of an archive with this number of observations; generate it if it does not
-    exist.
+    """Return the folder `root` of an archive with `observations` observations. Generate the archive
+    if `root` contains none of this size.
     """
     said = root / "size"
     if said.exists() and said.read_text() == str(observations):
@@ -151,8 +152,8 @@ def _last_day(root: Path, to: Path, old: int) -> Path:
 
 
 def _write_states(root: Path, rows: int) -> None:
-    """Write states of a thousand vehicles at 2 Hz, two states per batch, on the roads of the
-    observations.
+    """Write `rows` states (vehicle positions and speeds) of a thousand vehicles into an archive.
+    Each batch has two states. The vehicles drive on the roads of the archive's observations.
     """
     writer = Writer(root, "shard-1")
     rng = np.random.default_rng(1)
@@ -180,8 +181,9 @@ def _write_states(root: Path, rows: int) -> None:
 
 
 def _encode_past_query(root: Path) -> bytes:
-    """Return a query about the map at a past moment, encoded for the program `age_process`. The
-    moment and the box are chosen so that the service would accept the query.
+    """Return a query about the map at a past moment, encoded for the program `age_process`. Its
+    moment and its box (rectangle of latitude and longitude) are chosen so that the service would
+    accept the query.
     """
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
@@ -189,8 +191,9 @@ def _encode_past_query(root: Path) -> bytes:
 
 
 def _measure_process(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """Run the program `age_process` with the operation `what` ("ready", "checkpoint" or "past") on
-    an archive. Return the time [s] and the peak memory [MB] that it prints.
+    """Run the program `age_process` on an archive. `what` names its operation: "ready",
+    "checkpoint" or "past"; `asked` is the encoded query for "past". Return the time [s] and the
+    peak memory [MB] that the program prints.
     """
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)

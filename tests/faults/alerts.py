@@ -112,8 +112,8 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
-    """Return batches that report ice in `places` new cells. Each cell is reported by as many
-    vehicles as an alert needs.
+    """Return batches of observations that report ice in `places` cells. Each cell is reported by as
+    many vehicles as an alert needs. Another number `turn` gives other cells.
     """
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]
@@ -135,12 +135,12 @@ def _make_ice_batches(turn: int, places: int) -> list[Batch]:
 
 
 def _has_alerts(session: zenoh.Session, least: int) -> bool:
-    """Return True if the service has at least `least` active alerts."""
+    """Query the service for its active alerts, and return True if there are at least `least`."""
     return len(_list_alerts(session)) >= least
 
 
 def _list_alerts(session: zenoh.Session) -> set[Place]:
-    """Return cell and heading sector of each active alert of the service."""
+    """Query the service for its active alerts. Return the cell and the heading sector of each."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
     return {
         (alert.cell, alert.sector)

@@ -1,5 +1,5 @@
-"""Attacks on a secured fleet. Each function returns True if its attack succeeded; on a secured
-fleet all must return False.
+"""Attacks on a fleet secured by TLS and an access list. Each function returns True if its attack
+succeeded; in a secured fleet all must return False.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def register_attempt(function: Attempt) -> Attempt:
 
 
 def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
-    """Return True if the router accepts a session of this name with these TLS settings."""
+    """Return True if the router accepts a session as `name` with the TLS settings `changed`."""
     try:
         with ground.network.open_session(name, router, **changed):
             return True
@@ -127,7 +127,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if a vehicle connects to a false router that presents the certificate `name`."""
+    """Return True if a vehicle connects to a false router with the certificate `name`."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
@@ -163,7 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish on each key as the attacker; return True if a listener receives any message."""
+    """Publish on these keys in `session`; return True if a listener receives any message."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)
@@ -173,7 +173,7 @@ def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
 
 
 def list_foreign_keys(name: str) -> list[str]:
-    """Return Zenoh keys on which a vehicle of this name may not publish."""
+    """Return Zenoh keys on which the vehicle `name` may not publish."""
     other = HONEST if name != HONEST else ROGUE
     return [
         key(other),
@@ -301,7 +301,7 @@ def spoofed_reply(ground: Ground) -> bool:
 
 
 def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
-    """Return True if a session receives observations or acknowledgements of another vehicle."""
+    """Return True if `session` receives anything but the map when another vehicle reports."""
     listener = Listener(
         session,
         (

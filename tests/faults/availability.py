@@ -1,9 +1,10 @@
 """Availability of the page and the service for another reader during attacks: share of that
 reader's requests that are answered.
 
-Each attacker runs alone, from its own address. The other reader sends requests of the kind that the
-attacker competes for, one after the other. A request counts as failed if it is refused or not
-answered within PATIENCE_S. Page, service and router run in separate processes.
+Only one attack runs at a time. The attacker has an address of its own. Meanwhile the other reader
+sends requests, one after the other, which need the same resource (such as threads or connections)
+as the attack. A request counts as failed if it is refused or not answered within PATIENCE_S. Page,
+service and router run in separate processes.
 """
 
 from __future__ import annotations
@@ -100,7 +101,9 @@ def _await_page(target: Target) -> None:
 
 
 def _get(target: Target, path: str, source: str = "127.0.0.1") -> int:
-    """Send an HTTP request to the attacked page; return the status, or 0 without an answer."""
+    """Send an HTTP request for `path` to the attacked page. Return the HTTP status of the answer,
+    or 0 if no answer arrives.
+    """
     connection = HTTPConnection(target.host, target.port, PATIENCE_S, (source, 0))
     try:
         connection.request("GET", path)
@@ -134,7 +137,7 @@ def _ask_events(target: Target) -> bool:
 
 
 def _ask_tile(target: Target, parameters: str = "") -> bool:
-    """Query the service for one tile over Zenoh. Return True if it answers."""
+    """Query the service for one map tile over Zenoh. Return True if the service answers."""
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None
     with session:
@@ -196,8 +199,9 @@ def _loop_service(target: Target, query: str) -> Iterator[None]:
 
 @contextmanager
 def _hold_connections(target: Target, *parts: bytes) -> Iterator[None]:
-    """Open CONNECTIONS connections, and on each send the given parts and read a little of the
-    answer after each part. The connections stay open during the `with` block.
+    """Open CONNECTIONS connections to the attacked page. On each connection, send the `parts` of a
+    request one after the other, and read a little of the answer in between. The connections stay
+    open during the `with` block.
     """
     with ExitStack() as stack:
         for _ in range(CONNECTIONS):
@@ -228,7 +232,9 @@ def _hold_unread_answers(target: Target) -> Attack:
 
 @contextmanager
 def _hold_streams(target: Target) -> Iterator[None]:
-    """Open event streams without reading them, and keep them open during the `with` block."""
+    """Open event streams of the attacked page without reading their events, and keep them open
+    during the `with` block.
+    """
     with ExitStack() as stack:
         for _ in range(STREAMS):
             one = HTTPConnection(target.host, target.port, PATIENCE_S, (ATTACKER, 0))

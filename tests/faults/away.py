@@ -6,7 +6,8 @@ its network) are real. Network and time are simulated, so that an hour takes a m
 service puts messages into a queue and drops those that do not fit. It acknowledges rows on disk
 twice a second. Its capacity is that of a service for a thousand cars, scaled to the number of cars:
 20 batches a second and 20 places in the queue per car. Every second each car enters a cell that no
-car visited before. At the end all these cells must be on the map, the old ones as late reports.
+car visited before. At the end all these cells must be on the map, including those that were visited
+during the outage.
 """
 
 from __future__ import annotations

@@ -8,7 +8,9 @@ from schemas.runtime.figures import Figure
 
 
 class Bar(NamedTuple):
-    """Target of a figure, with its unit and the kind of target: upper or lower limit."""
+    """Bar (target) of a figure, with the figure's unit. The bar is either an upper or a lower
+    limit.
+    """
 
     unit: str
     bar: float

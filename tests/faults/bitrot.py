@@ -100,8 +100,8 @@ def _flip_bit(path: Path, random_: random.Random) -> int:
 
 
 def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
-    """Return map, rows and counters of a service that starts from `root` and receives every batch
-    again.
+    """Start a service from the archive `root`. If this is a damaged copy of `whole`, send every
+    batch again. Return the service's map, its rows, and the number of damages that it counted.
     """
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):

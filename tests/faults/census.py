@@ -47,17 +47,18 @@ class Census:
 
 
 class Told(NamedTuple):
-    """Content of the load generators' journals: number of records and time [s] of every batch
-    stored in an outbox, and time [s] at which an acknowledgement settled a batch (made it final).
+    """Content of the load generators' journals. `stored`: number of records, and time [s], of every
+    batch that was stored in an outbox. `settled`: time [s] at which an acknowledgement settled a
+    batch (made it final).
     """
 
     stored: dict[Name, tuple[int, float]]
     settled: dict[Name, float]
 
     def longest_wait(self, since: float) -> float:
-        """Return the time [s] from `since` until all batches that an outbox had stored before
-        `since` were settled (acknowledged or refused by the service). The result is infinite if one
-        of these batches was never settled.
+        """Return the time [s] from `since` until the service had acknowledged or refused all
+        batches that were in an outbox at `since`. The result is infinite if it never did so for one
+        of them.
         """
         waits = [
             self.settled.get(name, float("inf")) - since
@@ -67,7 +68,9 @@ class Told(NamedTuple):
         return max(waits, default=0.0)
 
     def stored_between(self, begin: float, end: float) -> int:
-        """Return the number of batches that the outboxes stored between two times [s]."""
+        """Return the number of batches that the vehicles' outboxes stored between the times `begin`
+        and `end` [s].
+        """
         return sum(begin <= at <= end for _, at in self.stored.values())
 
 
@@ -109,8 +112,9 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Return the number of rows that appear twice for a program that does not know the rules of the
-    archive format and reads all compacted (sorted) files directly.
+    """Read all compacted (sorted) files of an archive directly, as a program would that does not
+    know the rules of the archive format. Return the number of rows that this program would read
+    twice.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

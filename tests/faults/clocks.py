@@ -1,10 +1,10 @@
 """Campaign on a service's clock that is years ahead or behind for a minute, while the service runs
 or at its start. Meanwhile vehicles drive on, some of them on ice.
 
-The clock is the service's own, but it reads simulated clocks of the machine. Messages, engine,
-archive, checkpoint (saved state), retention and restart are those of a real service. In each case
-vehicles report ice, the clock jumps, the vehicles go on and send some batches again, and the
-service is restarted.
+The service's own clock runs unchanged, but it reads simulated clocks instead of those of the
+machine. Messages, engine, archive, checkpoint (saved state), retention and restart are those of a
+real service. In each case vehicles report ice, the clock jumps, the vehicles go on and send some
+batches again, and the service is restarted.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ class Machine:
 
     def clock(self, seen: int) -> SteadyClock:
         """Return a new service clock (`SteadyClock`) that reads these simulated clocks of the
-        machine.
+        machine. `seen` is the latest time [ns] of a report before the service's start, or 0.
         """
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
-        """Return True if a service's clock is far from the true time, or if it reports that the
-        system clock is far away.
+        """Return True if the time of a service's clock is more than half a year from the true time.
+        Return True also if this clock reports such a distance of the machine's wall clock.
         """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
@@ -186,7 +186,8 @@ def _make_message(vehicle: int, seq: int, at: int) -> Message:
 
 def _count_rows(root: Path) -> Counter[tuple[int, int]]:
     """Return the number of archived rows per boot (start of the vehicle's agent) and seq (number of
-    the batch). The vehicle is not used, because its pseudonym differs from month to month.
+    the batch). The rows are not counted per vehicle, because a vehicle has another pseudonym each
+    month.
     """
     tables = list(reading.read_tables(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)

@@ -202,8 +202,8 @@ def _make_figures(failovers: int, happened: list[Failover], census: list[Census]
 
 def _make_figure(failovers: int, name: str, value: float, unit: str) -> Figure:
     """Return a figure (named number) about the failovers. The figure gets its target from
-    `tests.faults.bars` only if at least FULL failovers were run, because the targets of counts
-    assume a whole campaign.
+    `tests.faults.bars` only if at least FULL failovers were run, because a count in a shorter
+    campaign is smaller and cannot be compared with the target.
     """
     return make_figure(name, value) if failovers >= FULL else Figure(name, value, unit)
 

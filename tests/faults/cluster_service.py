@@ -46,8 +46,8 @@ def run(
 
 
 def sync_and_report(copy: BucketReplica) -> int:
-    """Synchronise the archive's copy in the bucket once, and print a line at its end if it uploaded
-    anything. Return the number of changed objects.
+    """Bring the archive's copy in the bucket (object store) up to date once. Print a line at the
+    end if anything was uploaded. Return the number of changed objects.
     """
     _copying.at = False
     changed = _follow(copy)
@@ -57,8 +57,8 @@ def sync_and_report(copy: BucketReplica) -> int:
 
 
 def put_there(transfer: FileTransfer, name: str) -> bool:
-    """Upload one file to the bucket copy. At the first upload of a synchronisation, print a line
-    first, so that a campaign can interrupt it.
+    """Upload one file to the archive's copy in the bucket (object store). Before the first upload
+    of a synchronisation, print a line, so that a campaign can interrupt the upload.
     """
     if getattr(_copying, "at", None) is False:
         _copying.at = True

@@ -79,8 +79,8 @@ class Journals:
         self._times: list[float] = []
 
     def read_new_times(self) -> list[float]:
-        """Return the times [s] of the acknowledgements to the load generators since the last
-        call.
+        """Return the times [s] of those acknowledgements to the load generators that are new since
+        the last call.
         """
         found: list[float] = []
         for path in self._paths:
@@ -94,12 +94,14 @@ class Journals:
 
     def longest_pause(self, since: float) -> float:
         """Return the longest time [s] between successive acknowledgements to the load generators
-        since a moment [s].
+        after the time `since` [s].
         """
         return float(np.diff(sorted(at for at in self._times if at >= since)).max())
 
     def first_after(self, moment: float) -> float:
-        """Wait for the first acknowledgement after a moment, and return its time [s]."""
+        """Wait for the first acknowledgement to a load generator after the time `moment` [s], and
+        return its time [s].
+        """
         later: list[float] = []
 
         def has_arrived() -> bool:
@@ -141,9 +143,9 @@ class Asking:
     correct answer is complete, or reports that no service serves the box.
 
     Attributes:
-        whole: number of answers with everything that was known at the beginning.
+        whole: number of answers that contain every map cell of the first answer.
         unserved: number of answers, or errors, that report that something is missing.
-        silent: number of incomplete answers that do not report this.
+        silent: number of incomplete answers that do not report that something is missing.
     """
 
     PAUSE_S: Final = 0.2
@@ -198,8 +200,11 @@ Go = Callable[[Host, random.Random, float], None]
 
 
 class Way(NamedTuple):
-    """One way in which a campaign lets a service fail: a function that causes the failure (`go`;
-    its last argument is the lease time [s]), and a function that ends it.
+    """One way in which a campaign lets a service fail.
+
+    Attributes:
+        go: function that causes the failure; its last argument is the lease time [s].
+        end: function that ends the failure.
     """
 
     go: Go
@@ -235,8 +240,8 @@ def _kill_during(what: str) -> Go:
 
 
 def _restore_link(host: Host, random_: random.Random) -> None:
-    """Restore a host's network links, either after a random time or after the service on this host
-    has noticed that another one took over.
+    """Restore the network links of `host` after an interruption. Wait before that, either for a
+    random time or until the service on this host has noticed that another one took over.
     """
     if random_.random() < 0.5 or host.to_router.is_cut:
         time.sleep(random_.uniform(0.0, 3.0))
@@ -275,8 +280,8 @@ class Failover(NamedTuple):
 
 
 class Machines:
-    """Machines of one region: one is active, some are standbys (they wait to take over), the others
-    are spare.
+    """Machines of one region. One of them serves the region, some are standbys (they wait to take
+    over), and the others are not started.
     """
 
     def __init__(
@@ -391,8 +396,8 @@ class Machines:
         return find_difference(both[0].tables, both[1].tables)
 
     def stop_all(self) -> list[Host]:
-        """Let each machine take over and stop in turn, so that each one has received all data.
-        Return all machines.
+        """Let each machine take over and then stop, one after the other, so that each machine has
+        received all data. Return all machines.
         """
         seen = []
         everybody = len(self.waiting) + len(self._idle)
@@ -418,8 +423,8 @@ def _was_amid(host: Host, what: str) -> bool:
 
 
 def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
-    """Return the largest difference of the floating-point numbers in two sets of tables. The result
-    is infinite if anything else differs.
+    """Return the largest difference between the floating-point numbers in two sets of tables, which
+    are given by name. The result is infinite if anything else differs.
     """
     worst = 0.0
     if one.keys() != other.keys():

@@ -98,8 +98,8 @@ def read_compacted(root: Path) -> Iterable[pa.Table]:
 
 
 def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
-    """Return True if the archive's tables contain every row of the acknowledged batches 1 to
-    `owed`, and no row twice.
+    """Return True if the rows in `tables` are complete and unique: each row of the batches 1 to
+    `owed`, which were acknowledged, is present, and no row occurs twice.
     """
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)

@@ -36,10 +36,10 @@ class CrashDisk:
     """Simulated disk: the content of a folder that would survive a power loss.
 
     Args:
-        live: the folder; empty, or an image that `write_image` made.
-        random_: chooses which unsynced data survives.
+        live: folder of the disk's files; it is empty or was written by `write_image`.
+        random_: random generator that chooses which unsynced data survives.
         power: number of operations until power is lost; None for no power loss.
-        full: numbers of the operations that find the disk full.
+        full: numbers of the operations that fail because the disk is full.
     """
 
     def __init__(self, live: Path, random_: random.Random, power: int | None, full: range) -> None:
@@ -76,8 +76,8 @@ class CrashDisk:
         return self._numbers
 
     def _keep_content(self, path: Path) -> None:
-        """Before a file is renamed, removed or replaced, record that content of it which is durable
-        on the simulated disk.
+        """Record a file's content as it was written, before the file is renamed, removed or
+        replaced.
         """
         if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
@@ -148,8 +148,8 @@ class CrashDisk:
         return rename
 
     def _move_names(self, source: str, target: str) -> None:
-        """Record that a folder was renamed: its durable content remains durable under the surviving
-        name.
+        """Record that a folder was renamed from `source` to `target`: everything that the simulated
+        disk knows about its files and subfolders now belongs to the new name.
         """
         for path in [path for path in self._names if f"{path}/".startswith(f"{source}/")]:
             self._names[target + path.removeprefix(source)] = self._names[path].copy()
@@ -218,8 +218,8 @@ class CrashDisk:
         return open_
 
     def write_image(self, target: Path) -> None:
-        """Write the files that a machine would find after power loss at this moment into the folder
-        `target`.
+        """Write into the folder `target` the files that a machine would find after a power loss at
+        this moment.
         """
         there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
         numbered = {self._number.get(path.stat().st_ino): path for path in there}

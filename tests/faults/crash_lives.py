@@ -64,15 +64,17 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """Run one life of the archive (from start to power loss) on the disk `root`."""
+        """Run one life of the archive (from its start to the power loss) on the simulated disk
+        `root`. In the `last` life the power does not fail.
+        """
 
     @abstractmethod
     def _find_problems(self, root: Path, last: bool) -> list[str]:
-        """Read the archive as the next life (run of the program) finds it, and return a message for
-        each error in it.
+        """Read the archive as the next life (run of the program) finds it. Return a message for
+        each error in it. After the `last` life, every batch must be present.
         """
 
     def _pass_time(self) -> None:
-        """Change the archive between two lives (runs of the program), as the passing of time or an
-        operator would.
+        """Change the archive between two lives (runs of the program), for example by letting days
+        pass or by an operator's erasure.
         """

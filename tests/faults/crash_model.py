@@ -61,8 +61,8 @@ class Batch(NamedTuple):
 
 
 def rows_of(batches: list[Batch]) -> Rows:
-    """Return the rows of batches of one kind as columns, in the form that the segment log (writer
-    of new rows) takes.
+    """Return the rows of the given batches, all of one kind, as columns. The segment log (writer of
+    new rows) takes rows in this form.
     """
     kind = batches[0].kind
     n = ROWS * len(batches)
@@ -209,8 +209,8 @@ def _run_service(number: int) -> tuple[list[str], int]:
 
 
 def _find_memory_folder() -> str | None:
-    """Return a folder in memory if the system has one. A real disk is not needed, because the
-    simulated disk decides about durability.
+    """Return a temporary folder in memory if the system has one, otherwise None. A real disk is not
+    needed, because the simulated disk decides which data survives a power loss.
     """
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 

@@ -85,7 +85,7 @@ class ServiceHistory(Lives[Sent]):
     """Simulated history of a service (operations and power losses) on one disk.
 
     Attributes:
-        done: operations that were completed before a power loss.
+        done: number of completed operations, by name.
     """
 
     lives = 4
@@ -345,8 +345,8 @@ class ServiceHistory(Lives[Sent]):
 
 
 def _compute_boot(vehicle: str) -> int:
-    """Return the boot number (identifier of the vehicle's start) that `examples.batch` gives to a
-    vehicle's batches.
+    """Return the boot number (identifier of the start of a vehicle's agent) that the helper
+    `examples.batch` uses in all batches of this vehicle.
     """
     return 1 + sum(vehicle.encode())
 

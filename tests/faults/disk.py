@@ -91,8 +91,8 @@ def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
 
 @contextmanager
 def _refuse_writes(*names: str) -> Iterator[None]:
-    """Let the named functions of `os` fail as on a full disk, for the duration of the `with` block.
-    The functions work again afterwards.
+    """Let the functions of the module `os` that `names` lists fail as on a full disk, for the
+    duration of the `with` block. They work again afterwards.
     """
 
     def refuse(*_: object, **__: object) -> object:
@@ -163,8 +163,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _drive(engine: Engine, since: int, steps: int) -> int:
-    """Let simulated vehicles report to the service for `steps` seconds, and return the number of
-    acknowledged batches.
+    """Let each simulated vehicle send `steps` batches to the service, with the sequence numbers
+    after `since`. Return the number of acknowledged batches.
     """
     got = 0
     for seq in range(since + 1, since + steps + 1):
@@ -198,8 +198,8 @@ def _until_settled(engine: Engine) -> int:
 
 
 def _until_done(engine: Engine) -> int:
-    """After space on the disk has become free, wait until each background job has succeeded once.
-    Return the number of rows acknowledged meanwhile.
+    """Wait until each background job has succeeded once after space on the disk has become free.
+    Return the number of rows that were acknowledged meanwhile.
     """
     got = 0
     deadline = time.monotonic() + STUCK_S

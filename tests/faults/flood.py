@@ -47,14 +47,17 @@ _ASKED: Final = "gripmap/v1/map/**"
 
 
 def list_places() -> list[tuple[int, float, float]]:
-    """Return (cell, latitude, longitude) of each place along the road."""
+    """Return (cell, latitude, longitude) of each place along the road on which all vehicles of this
+    campaign drive.
+    """
     longitudes = [LONGITUDE + 2e-4 * place for place in range(CELLS)]
     return [(int(grid.cell_of(LATITUDE, one)), LATITUDE, one) for one in longitudes]
 
 
 def make_visit(name: str, seq: int, now: int) -> Batch:
-    """Return a batch with one visit (pass through a cell). Over successive sequence numbers, the
-    vehicle drives along the road repeatedly.
+    """Return a batch of the vehicle `name` with one visit (pass through a cell) that ends at `now`
+    [ns]. The sequence number `seq` determines the cell: the next number is the next cell along the
+    road.
     """
     cell, latitude, longitude = list_places()[(seq + hash_of(name)) % CELLS]
     mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
@@ -62,7 +65,9 @@ def make_visit(name: str, seq: int, now: int) -> Batch:
 
 
 def hash_of(name: str) -> int:
-    """Return a number computed from a vehicle's name, the same in every run."""
+    """Return a number that is computed from the vehicle name `name` and is the same in every run of
+    the program, unlike Python's `hash`.
+    """
     return sum(name.encode())
 
 
@@ -259,8 +264,8 @@ def _simulate_unflooded(
 
 
 def _find_difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """Return the largest difference of `mu_lower` or `mu_upper` between two maps over the cells of
-    the honest vehicles, or NaN if a cell is missing.
+    """Return the largest difference of the friction bounds `mu_lower` and `mu_upper` between two
+    maps, over the cells that honest vehicles visited. The result is NaN if such a cell is missing.
     """
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
     ends = [

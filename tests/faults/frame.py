@@ -49,15 +49,15 @@ class Site:
     say: Callable[[str], None]
 
     def choose_amount(self, full: int, quick: int) -> int:
-        """Return an amount (of time, messages, …) for the campaign: `quick` in a quick run,
-        otherwise `full`.
+        """Return the amount (for example a number of messages or a time) for this run of the
+        campaign: `quick` in a quick run, otherwise `full`.
         """
         return quick if self.quick else full
 
 
 class Campaign(NamedTuple):
-    """Name of a campaign, and the figures that the campaign must return. A figure may be marked as
-    absent in quick runs.
+    """Campaign, given by its name, its function, and the names of the figures that the function
+    must return (`owes`). A figure can be marked as absent in quick runs.
     """
 
     name: str

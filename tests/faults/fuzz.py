@@ -140,8 +140,8 @@ def _make_honest(seq: int, now: int) -> Iterator[Message]:
 
 
 def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
-    """Process messages in one pass of the main loop of a service. Return 1 if a message caused any
-    failure except a refusal, otherwise 0.
+    """Let the service process `messages` in one pass of its main loop. Return 1 if a message caused
+    an exception instead of a refusal, otherwise 0.
     """
     try:
         engine.intake.ingest(messages, now)
@@ -158,8 +158,8 @@ def _run_turn(site: Site, engine: Engine, messages: list[Message], now: int) -> 
 def _ask_query(
     site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool
 ) -> tuple[int, int, int]:
-    """Let the service answer a query. Return three counts (0 or 1): crashes, answers, and past maps
-    rebuilt. Without `past` no past map is rebuilt.
+    """Let the service answer the query `asked`. Return three counts, each 0 or 1: crashes, answers,
+    and rebuilt past maps. If `past` is False, queries about a past map are not sent.
     """
     rebuilt = 0
     try:

@@ -4,8 +4,9 @@ service and vehicles.
 Campaign `fuzz` passes its inputs directly to the engine (service without network). Here the inputs
 pass through the whole system: Zenoh's threads, the bounded queue, rate limits of vehicles, handlers
 of queries, and the worker (thread that processes messages). Meanwhile vehicles report through the
-agent's publisher and outbox. The acknowledgements sent here are all undecodable; certificates
-protect against forged ones (campaign `security`).
+agent's publisher and outbox. The malformed acknowledgements cannot be decoded. Forged
+acknowledgements are no part of this campaign, because certificates prevent them (see campaign
+`security`).
 """
 
 from __future__ import annotations

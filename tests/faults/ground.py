@@ -34,8 +34,8 @@ MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 @dataclass
 class Listener:
-    """Zenoh session that records all messages on some key expressions, by which the effects of an
-    attack are seen.
+    """Zenoh session that records all messages on some key expressions. The records show the effects
+    of an attack.
     """
 
     session: zenoh.Session
@@ -77,8 +77,8 @@ class Ground:
         self._marks = self._seq = 0
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """Open a Zenoh session with the certificate of `name`; it is closed together with this
-        environment.
+        """Open a Zenoh session with the certificate of `name` at the router `router`. The keywords
+        `changed` replace TLS settings. The session is closed together with this environment.
         """
         return self._stack.enter_context(self.network.open_session(name, router, **changed))
 
@@ -88,8 +88,8 @@ class Ground:
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
-        """Send a valid batch of one observation, again and again, until the service has
-        acknowledged it as durable.
+        """Send a valid batch of one observation of the vehicle `name`, repeatedly, until the
+        service has acknowledged the batch as durable.
         """
         self._seq += 1
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
@@ -104,10 +104,10 @@ class Ground:
         until(is_settled)
 
     def _is_durable(self, sent: wire.Batch) -> bool:
-        """Return True if this batch was acknowledged as durable.
+        """Return True if the service has acknowledged the batch `sent` as durable (stored on disk).
 
-        Other messages on the key are ignored: the acknowledgement of an earlier batch that was sent
-        twice, or one that an attack forged.
+        Other messages on the Zenoh key of these acknowledgements are ignored: acknowledgements of
+        earlier batches, and forged ones that cannot be decoded.
         """
         for place, _, payload in list(self.monitor.heard):
             if place == keys.ack_key(sent.vehicle):
@@ -130,8 +130,8 @@ class Ground:
         self.drive()
 
     def await_effects(self, session: zenoh.Session, *listeners: Listener) -> None:
-        """Wait until every message of `session` has been delivered and the listeners received its
-        effects.
+        """Wait until every message that `session` has sent is delivered, and until the listeners
+        have received all messages that resulted from it.
         """
         list(session.get(f"{keys.ROOT}/map/**"))
         self._marks += 1

@@ -1,11 +1,11 @@
 """Campaign on one enrolled car that uses everything a valid car may do, for a simulated hour, with
 ten honest cars on the same road.
 
-The insider sends as much as its rate limit allows: visits to cells all over a region and over the
-world, a new boot (identifier of an agent's start) for each batch, JSON, batches whose rows lie in
-two months, its own reports again (unchanged and under other numbers), and ice on a road that only
-it drives. Engine, limits and archive are real; only time is simulated. One figure counts the
-insider's actions. The campaign `queries` measures the cost of queries.
+The insider (the car that attacks) sends as much as its rate limit allows: visits to cells all over
+a region and over the world, a new boot (identifier of an agent's start) for each batch, JSON,
+batches whose rows lie in two months, its own reports again (unchanged and under other numbers), and
+ice on a road that only it drives. Engine, limits and archive are real; only time is simulated. One
+figure counts the insider's actions. The campaign `queries` measures the cost of queries.
 """
 
 from __future__ import annotations
@@ -150,7 +150,9 @@ def _make_ice(seq: int, now: int, rows: int) -> Batch:
 
 
 def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
-    """Return a batch of an honest car that drives along a road of twenty cells at 12 m/s."""
+    """Return a batch of an honest car with one visit (pass through a cell). The car drives along a
+    road of twenty cells at 12 m/s; `second` determines its place.
+    """
     longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
     one = batch(name, seq, now, [0.8])
     cell = grid.cell_of(LATITUDE, longitude)
@@ -160,8 +162,8 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
-    """Return a batch of the insider that reports fifty random cells within `degrees` of the road.
-    The region of the batch is that of its first cell.
+    """Return a batch of the insider. It draws fifty random places within `degrees` [deg] of the
+    road, and reports those in the same region as the first.
     """
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)
@@ -182,8 +184,8 @@ def _make_message(one: Batch) -> Message:
 
 
 def _make_text_message(one: Batch) -> Message:
-    """Return a message that contains the batch `one` as JSON, in the form in which a person would
-    write it.
+    """Return a message that contains the batch `one` as JSON, written as a person would write it by
+    hand.
     """
     text = {
         "vehicle": one.vehicle,

@@ -65,8 +65,12 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """Load of the system while processes were killed: number of observations sent, duration [s],
-    and True if a retention process (deletion of old rows) removed a day in this time.
+    """Load of the system in the time in which processes were killed.
+
+    Attributes:
+        observations: number of observations sent.
+        seconds: length of this time [s].
+        retired: True if a retention process (deletion of old rows) removed a day in this time.
     """
 
     observations: int
@@ -149,9 +153,9 @@ def old_days(archive: Path) -> list[Path]:
 
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
-    """Return the names of the background jobs that have left results, which shows that they ran
-    during the kills. Compaction (sorting) of the old rows does not count, because it happened
-    before.
+    """Return the names of the background jobs whose results exist in the archive, which shows that
+    these jobs ran during the kills. Compaction (sorting) of the old rows does not count, because
+    they were sorted before the first kill.
     """
     old = old_days(archive)
     compacted = (file.parents[1] not in old for file in archive.glob("observations/*/*/*.parquet"))

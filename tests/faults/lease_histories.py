@@ -3,8 +3,9 @@ a checker of these histories.
 
 The product's `Lease` (exclusive ownership of the archive) runs unchanged on a bucket in memory.
 Every process has its own clock rate, wall clock and lease time. Processes are killed, frozen, cut
-off from the bucket, and lose their token. Requests are slow, and some take effect after the client
-gave up. All events follow from a seed.
+off from the bucket, or lose the liveliness token by which other processes see that they run.
+Requests to the bucket are slow, and some take effect after the process gave up. The seed of a
+random generator determines all events.
 
 A history records the life of every batch: uploaded by a service, acknowledged, known to each later
 owner when it begins to serve, and counted by a reader at the end.
@@ -62,9 +63,10 @@ class Verdict(NamedTuple):
 
 
 def judge_history(events: list[Event]) -> Verdict:
-    """Return the number of acknowledgements by a holder of the lease (ownership of the archive)
-    after its successor began to serve, and the batches that break a promise: acknowledged but
-    unknown to a later owner or to the reader, or counted twice.
+    """Check a simulated history of services that share an archive. Return the number of
+    acknowledgements by a holder of the lease (ownership of the archive) after its successor began
+    to serve. Return also the batches that break a promise: acknowledged but unknown to a later
+    owner or to the reader, or counted twice.
     """
     served = 0
     by_two = 0
@@ -370,8 +372,9 @@ class ServiceHistory:
             lease.release()
 
     def _begin_serving(self, lease: Lease) -> set[int]:
-        """List the objects in the bucket, write the fence (the batches of earlier holders that
-        count), and begin to serve. Return the batches of observations that the service knows.
+        """Let a service begin to serve under its new lease (ownership of the archive): list the
+        objects in the bucket, and write the fence (list of the objects of earlier holders that
+        count). Return the batches of observations that the service knows.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number
@@ -407,8 +410,9 @@ class ServiceHistory:
             self.events.append(Event("acknowledges", number, (batch,)))
 
     def _find_counted(self, names: Iterable[str]) -> list[str]:
-        """Return the names of the objects that count: those of the newest owner or of a later one,
-        and those in the newest owner's fence (list of valid older objects).
+        """Return those of the object `names` in the bucket that count as archived. An object counts
+        if its lease number is at least that of the newest owner, or if that owner's fence (list of
+        valid older objects) contains it.
         """
         newest = max(self._fences, default=0)
         before = self._fences.get(newest, frozenset())

@@ -236,8 +236,8 @@ def change_address(
     and the longest gap [s] between received messages.
 
     A router with a rate limit (`capped`) drops a message that arrives within 10 ms of the previous
-    one. With this limit, timing jitter of a busy machine would count as loss of the link, so it is
-    off by default.
+    one. The limit is off by default, because messages that a busy machine delays would then be
+    dropped and would count as losses of the link.
     """
     with open_namespaces(site.folder / f"address-{protocol}-{capped}") as there:
         there.start_router(capped=capped)
@@ -296,7 +296,9 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
 
 
 def block_udp(site: Site) -> float:
-    """Return the time [s] until a car's session is open over TLS when the link blocks UDP."""
+    """Return the time [s] until a car's Zenoh session is open over TLS on a link that blocks UDP
+    and therefore QUIC.
+    """
     with open_namespaces(site.folder / "udp") as there:
         for letter in "ab":
             there.start_router(letter)
@@ -309,8 +311,9 @@ def block_udp(site: Site) -> float:
 
 
 def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
-    """Return the longest time [s] until a car is connected again, after a router that served QUIC
-    and TLS was off for each of `outages_s` [s] and then came back with TLS only.
+    """Return the longest time [s] until a car is connected again after an outage of its router.
+    There is one outage for each length in `outages_s` [s]. The router served QUIC and TLS before,
+    and serves only TLS afterwards.
     """
     longest = 0.0
     with open_namespaces(site.folder / "back") as there:

@@ -119,7 +119,9 @@ def send(given: dict[str, Any]) -> None:
 
 
 def wait_for_link(session: zenoh.Session) -> list[str]:
-    """Wait until a session has a link, and return the link's transports."""
+    """Wait until a Zenoh session has a link to its router. Return the transports (such as QUIC) of
+    its links.
+    """
     watch = LinkWatch(session, "link")
     while not watch.protocols:
         time.sleep(0.005)
@@ -127,7 +129,9 @@ def wait_for_link(session: zenoh.Session) -> list[str]:
 
 
 def measure_opening(given: dict[str, Any]) -> None:
-    """Print the time [s] until a session was open, and its transport."""
+    """Open the session of this endpoint. Print the time [s] until it was open, and its transport
+    (QUIC or TLS).
+    """
     began = time.monotonic()
     with open_end(given) as session:
         took = time.monotonic() - began
@@ -135,7 +139,9 @@ def measure_opening(given: dict[str, Any]) -> None:
 
 
 def watch(given: dict[str, Any]) -> None:
-    """Print a line for each change of the link until stdin is closed."""
+    """Print a line each time when the link of this endpoint's session to the router is lost or
+    comes back, until stdin is closed.
+    """
     with open_end(given) as session:
         seen: list[LinkWatch] = []
 

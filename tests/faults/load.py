@@ -53,9 +53,9 @@ class Plan:
 
 
 def print_events(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
-    """Print a line for each batch to the journal: `sign vehicle boot kind region seq records time`.
-    The sign is `+` for a batch on disk and `-` for a settled (acknowledged or refused by the
-    service) batch.
+    """Write one line to the journal (standard output) for each batch in `events`: `sign vehicle
+    boot kind region seq records time`. The sign is `+` if the batch was stored on disk, and `-` if
+    it was settled (acknowledged or refused by the service).
     """
     at = f"{time.time():.3f}"
     for stream, seq, records in events:
@@ -86,8 +86,8 @@ class WatchedOutbox(Outbox):
 def make_visits(
     rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int
 ) -> RecordBlock:
-    """Return one synthetic visit (pass through a map cell) per element of `vehicle` (n,), all
-    ending at `now` [ns].
+    """Return one synthetic visit (pass through a map cell) for each vehicle number in `vehicle`
+    (n,). All visits end at the time `now` [ns].
     """
     n = len(vehicle)
     columns: Columns = {}
@@ -111,8 +111,9 @@ def make_visits(
 
 
 def offer_blocks(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
-    """Offer a block of observations to the publisher every BLOCK_S until `quiet` is set. Return the
-    number of blocks that were late by a whole block, and the longest delay [s].
+    """Offer a block of observations to the agent's publisher every BLOCK_S seconds, until the event
+    `quiet` is set. Return the number of blocks that were late by more than BLOCK_S, and the longest
+    delay [s].
     """
     rng = np.random.default_rng(plan.seed)
     per_block = plan.rate * BLOCK_S * len(plan.names)

@@ -91,8 +91,8 @@ _ENCODINGS: Final = (
 
 
 class Mutants:
-    """Source of malformed messages of the vehicles `rogue-NN`. Their time is `now` [ns], which a
-    test may set.
+    """Source of malformed messages of the vehicles `rogue-NN`. A test may set `now` [ns], which is
+    the time that the messages state.
     """
 
     def __init__(self, seed: int, now: int) -> None:
@@ -179,8 +179,8 @@ def _make_states() -> Any:  # noqa: ANN401
 
 
 def _shift_columns(place: int, rows: int) -> dict[str, Any]:
-    """Return the position and cell columns of a batch of `rows` rows, moved east by
-    `place` cells.
+    """Return the position and cell columns of a batch of `rows` rows. All rows have the same
+    position, which lies `place` times 2e-4 degrees east of the start.
     """
     longitude = LONGITUDE + 2e-4 * place
     return {

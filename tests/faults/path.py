@@ -1,11 +1,11 @@
 """Campaign on impossible positions: vehicles that report places where they cannot be, and two
 vehicles that report ice on roads where nobody else drives.
 
-Teleports: cars that drive honestly also report one distant place. It is in the same batch or in
-another batch, under another boot (start of the agent) or region, before or after their other
-reports, or reached in short leaps. Whether a report is impossible follows from its distance to the
-car's own path. Two cars: they report ice at 210 places along 400 km, either in leaps, or later as a
-backlog, or live at a plausible 65 m/s.
+Teleports: each car drives honestly, but also reports one distant place. The report of this place is
+in the same batch or in another batch, under another boot (start of the agent) or region, before or
+after the car's other reports, or at the end of many short leaps. Whether a report is impossible
+follows from its distance to the car's own path. Two cars: both report ice at 210 places along 400
+km. They report either in leaps, or all at once afterwards, or live at a plausible 65 m/s.
 """
 
 from __future__ import annotations
@@ -145,9 +145,9 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
 
 
 def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
-    """Return batches of the car `name` that report a place far from its path at about the time of
-    its true reports. `kind` is the way in which the false report is sent, for example in a batch of
-    its own.
+    """Return batches of the car `name` that report a place far from its path, at about the time of
+    its true reports. `kind` is the way of sending this false report, for example "walk" (reached in
+    many short steps) or "boot" (under another boot number).
     """
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
@@ -176,7 +176,9 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
 
 
 def _two_cars(site: Site, way: str) -> int:
-    """Return the number of places at which two cars raise an alert where nobody else drives."""
+    """Let two cars report ice on a road where nobody else drives, and return the number of places
+    at which they raise an alert. `way` is how they report: in "leaps", "live", or afterwards.
+    """
     start = time.time_ns() - 9000 * SECOND
     raised = set[int]()
     apart = SECOND // 1000 if way == "leaps" else int(STEP_M / SPEED * SECOND)

@@ -55,8 +55,8 @@ ICE: Final = 0.12
 
 
 class Trip(NamedTuple):
-    """Cells and heading sectors of a trip in the order in which the agent publishes them, one cell
-    per second.
+    """Cells and heading sectors of a car's trip, one per second, in the order in which the car's
+    agent publishes them.
     """
 
     cell: IntArray
@@ -64,9 +64,13 @@ class Trip(NamedTuple):
 
 
 class Pursuit(NamedTuple):
-    """Result of an attempt to follow a car. For each publication, `hits` is the probability that
-    the reader names the right place, and `chance` that of a random guess. `street` is the
-    probability that the reader names the right street.
+    """Result of one attempt of a reader to follow a car.
+
+    Attributes:
+        hits: for each publication of the map, the probability that the reader names the car's
+            place.
+        chance: the same probability if the reader guesses at random.
+        street: probability that the reader names the car's street.
     """
 
     hits: list[float]
@@ -75,7 +79,9 @@ class Pursuit(NamedTuple):
 
 
 def _trip(street: int, house: int) -> Trip:
-    """Return the trip from a house along its street and the main road to the road's end."""
+    """Return the trip of a car from house number `house` of side street number `street`, along this
+    street and then the main road, to the end of the main road.
+    """
     column, row = (int(v) for v in grid.deinterleave(np.int64(CELL)))
     junction = 10 * street + 5
     down = np.arange(LENGTH - house, 0, -1)
@@ -88,7 +94,7 @@ def _trip(street: int, house: int) -> Trip:
 
 def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> list[Message]:
     """Return the messages in which the car `name` reports the cells numbered `at` of a trip, one
-    message per region. The last of these cells is left at the time `when` [ns].
+    message per region. The car leaves the last of these cells at the time `when` [ns].
     """
     cell = trip.cell[at]
     latitude, longitude = grid.centre(cell)
@@ -154,8 +160,8 @@ class Town:
         return alerts
 
     def put(self, now: int) -> dict[int, tuple[pa.Table | None, pa.Table]]:
-        """Let the service publish the changed tiles. Return for each tile its table before (or
-        None) and after.
+        """Let the service publish the map tiles that have changed. Return, for each of these tiles,
+        its table before the publication (None if there was none) and after it.
         """
         out = {}
         for tile, payload in changed_tiles(self.engine.queries, now):
@@ -193,9 +199,9 @@ def _places(cells: IntArray) -> FloatArray:
 
 
 def pursue(town: Town, street: int) -> Pursuit:
-    """Simulate one attempt to follow a car. A car from side street number `street` drives away
-    alone at night. After each publication of the map, the reader guesses where the car is, as the
-    module's docstring describes. Return how often the guesses were right.
+    """Simulate one attempt of a map reader to follow a car that drives away alone at night from
+    side street number `street`. After each publication the reader takes the map cell that changed
+    most as the car's place. Return how often the guesses were right.
     """
     trip = _trip(street, 0)
     begin = town.day + 22 * HOUR
@@ -222,8 +228,8 @@ def pursue(town: Town, street: int) -> Pursuit:
 
 
 def _name_street(found: list[int], street: int) -> float:
-    """Return the probability that the reader names the right street from the first
-    suspected cells.
+    """Return the probability that a reader names the right side street, number `street`. The reader
+    takes the street that is nearest to the first three suspected cells in `found`.
     """
     if not found:
         return 1.0 / len(STREETS)
@@ -237,7 +243,9 @@ def _name_street(found: list[int], street: int) -> float:
 
 
 def _slippery_delay(folder: Path, public: int) -> float:
-    """Return the time [s] until both the map and an alert show ice that two cars measured."""
+    """Return the time [s] until both the map and an alert show ice that two cars have measured.
+    `public` is the number of vehicles that must visit a cell before it is shown.
+    """
     town = Town(folder, 0, public)
     with closing(town.engine):
         trip = _trip(0, 0)
@@ -256,8 +264,8 @@ def _slippery_delay(folder: Path, public: int) -> float:
 
 
 def run(site: Site) -> list[Figure]:
-    """Pursue a car of each street, and as a control a car on a map that shows every report at once;
-    return the figures.
+    """Let a reader of the map try to follow a car from each side street. As a control, repeat this
+    with a map that shows every report at once. Return the figures.
     """
     over: list[float] = []
     puts = 0
@@ -287,8 +295,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _control(folder: Path) -> float:
-    """Return, as a control of the method, by how much the share of right guesses of the car's place
-    exceeds that of chance if the map shows every report at once.
+    """Return the figure that shows that the method can follow a car. If the map shows every report
+    at once, the reader's guesses of the car's place are right more often than random guesses; the
+    figure is the difference of both shares.
     """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)

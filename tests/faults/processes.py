@@ -66,7 +66,9 @@ class Part:
         return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
 
     def line_with(self, start: str) -> str:
-        """Wait for the first line of output that begins with `start`, and return it."""
+        """Wait for the first line of the process's output that begins with `start`, and return this
+        line.
+        """
 
         def find_lines() -> list[str]:
             there = [line for line in self.read_lines() if line.startswith(start)]
@@ -188,8 +190,8 @@ class Stage:
                 self._await_news(patience_s)
 
     def _await_news(self, patience_s: float) -> None:
-        """Wait until a load generator has printed further lines, or all of them have ended. Raise
-        TimeoutError after `patience_s` without news.
+        """Wait until a load generator has printed a new line, or all load generators have ended.
+        Raise TimeoutError if neither happens within `patience_s` seconds.
         """
         told = sum(journal.stat().st_size for journal in self.journals)
 
@@ -202,8 +204,9 @@ class Stage:
 
 @contextmanager
 def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
-    """Yield a running router and service (`Stage`) when the service is ready. Every process is
-    ended after the `with` block.
+    """Start a router and a service as processes; the keywords `service` are settings of the
+    service. Yield both as a `Stage` when the service is ready. All processes are ended after the
+    `with` block.
     """
     there = Stage(folder, **service)
     try:

@@ -105,7 +105,7 @@ class World(NamedTuple):
         services: states of both services.
         number, holder, turn, released: content of the newest lease object in the bucket; turn
             counts its renewals.
-        objects: (batch, number) of each object in the bucket.
+        objects: batch and lease number of each object in the bucket.
         fence: lease number of the owner that wrote the fence, and the older objects that count for
             it.
         acked: batches that were acknowledged to the vehicle as durable.
@@ -167,15 +167,17 @@ def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tupl
 
 
 def list_counted(world: World) -> list[int]:
-    """Return the batches that a reader of the bucket must count in a state of the model; a batch
-    occurs twice if it is stored twice.
+    """Return the batches that count for a reader of the bucket in the model's state `world`. A
+    batch occurs twice in the list if it is stored twice and both objects count.
     """
     number, before = world.fence
     return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
 
 
 def find_problem(world: World) -> str:
-    """Return a message for the broken invariant, or "" if none is broken."""
+    """Return a message for the invariant that the model's state `world` breaks, or "" if it breaks
+    none.
+    """
     counted = list_counted(world)
     if len(counted) != len(set(counted)):
         return "a batch counts twice"
@@ -309,9 +311,10 @@ def _stand_by(world: World, me: int, rules: Rules, most_number: int) -> Iterator
 
 
 def _advance_clocks(world: World, slow: int, rules: Rules) -> World:
-    """Return the state after a tick: the clocks of all running services advance, except that of the
-    service `slow`. The clocks measure the age of a lease (ownership of the archive), the wait for a
-    lease, and the wait before a service reads the bucket's objects.
+    """Return the state of the model after one tick. The clocks of all running services advance,
+    except that of the service with the index `slow`. The clocks measure the age of a lease
+    (ownership of the archive), the wait for a lease, and the wait before a service reads the
+    bucket's objects.
     """
     out = []
     for me, one in enumerate(world.services):

@@ -67,8 +67,8 @@ def run(site: Site) -> list[Figure]:
 
 
 def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
-    """Fill the map: each vehicle visits 250 cells, one per second. Return the number of cells after
-    all reports are settled (acknowledged).
+    """Fill the map: each vehicle visits 250 cells, one per second. Return the number of cells when
+    all reports are acknowledged.
     """
     acked: set[str] = set()
     acks = session.declare_subscriber(
@@ -118,7 +118,9 @@ def _await_tile(session: zenoh.Session) -> None:
 
 
 def _time_light_queries(session: zenoh.Session, seconds: float) -> list[float]:
-    """Query one tile repeatedly for `seconds`; return the time [s] to each answer."""
+    """Query one map tile repeatedly for `seconds` seconds. Return, for each query, the time [s]
+    until its answer.
+    """
     waits = []
     end = time.monotonic() + seconds
     pause = threading.Event()

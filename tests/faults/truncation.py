@@ -108,8 +108,8 @@ def _list_expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 
 def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
     """Return the number of errors of a service on the archive: missing rows of older segments
-    (files of new rows), plus rows of the newest segment that the service counts as received
-    although they are missing or wrong.
+    (files of new rows), plus rows of the newest segment that are wrong, or that are missing
+    although the service counts them as received.
     """
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)}
     streams = SequenceTrackers()

@@ -80,7 +80,9 @@ BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
 
 
 class Receiver:
-    """HTTP server on loopback that fails in one way for its first connections."""
+    """HTTP server on this machine that receives alerts. It fails in one way for its first
+    connections, and some kinds fail for ever.
+    """
 
     def __init__(self, kind: str) -> None:
         self.heard: set[str] = set()
@@ -153,8 +155,8 @@ def make_stretch(number: int) -> StretchAlert:
 
 
 def run_kind(folder: Path, kind: str) -> tuple[int, int]:
-    """Send alerts to one kind of receiver. Return the number of alerts that arrived, and the number
-    lost without being counted.
+    """Send alerts by webhook to one kind of receiver. Return the number of alerts that arrived, and
+    the number of missing ones that the sender counts neither as lost nor as waiting.
     """
     receiver = Receiver(kind)
     said = list[str]()
@@ -174,7 +176,8 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
 
 def run(site: Site) -> list[Figure]:
     """Send alerts by webhook to all kinds of failing receivers at the same time, for some seconds.
-    Return as figures how many alerts arrived, and how many were lost without being counted.
+    Return as figures how many alerts arrived, and how many are missing although the sender counts
+    them neither as lost nor as waiting.
     """
     with ThreadPoolExecutor(len(BREAKS)) as pool:
         found = dict(

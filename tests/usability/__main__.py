@@ -66,8 +66,9 @@ class House:
         mistakes.prepare_files(folder)
 
     def follow_readme(self) -> dict[str, Any]:
-        """Run the commands of the README and of the tutorials once, in a network namespace of their
-        own. Return the failed commands and the judged maps; empty if the run itself failed.
+        """Run the commands of the README and of the tutorials in a separate network namespace, at
+        the first call only. Return the failed commands, and for each map whether it was populated.
+        The result is empty if the run itself failed.
         """
         if self._readme is None:
             folder = self.folder / "readme"
@@ -82,8 +83,8 @@ class House:
         return self._readme
 
     def print_measured(self, what: str, found: object) -> None:
-        """Print the name of a measured part, and the measurements from which its figures are
-        computed.
+        """Print the measurements `found` of the part named `what`; the figures are computed from
+        them.
         """
         print(f"{what}: {found}", flush=True)
 
@@ -179,8 +180,8 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Return the number of outputs in which a cell with only a lower bound has a value of friction
-    that could be shown as a colour.
+    """Return the number of outputs of the map that give a value of friction, which could be shown
+    as a colour, to a cell for which only a lower bound of the friction is known.
     """
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -301,8 +302,8 @@ def install_packages(house: House) -> float:
 
 
 def silent_reasons(house: House) -> float:
-    """Return for how many tested causes an agent that publishes nothing names the cause within five
-    seconds.
+    """Test how many causes an agent names within five seconds when it publishes nothing for a known
+    cause. Return this number.
     """
     path = "tests/edge_agent/app/test_publishing_reasons.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]
@@ -313,8 +314,8 @@ def silent_reasons(house: House) -> float:
 
 
 def bugs_of_the_list(house: House) -> float:
-    """Return the number of bugs on the list of bugs found by new users that occur again, or for
-    which there is no test.
+    """Return the number of listed bugs (bugs that new users found) that occur again or have no
+    test.
     """
     found = listed_bugs.find_open()
     house.print_measured("bugs", f"{len(listed_bugs.TESTS)} listed, open: {found}")

@@ -63,7 +63,8 @@ Places: TypeAlias = Set[tuple[int, int]]  # cell and heading sector
 
 
 class KnownIce:
-    """Archive of one icy night, its map, and the places that are known to be slippery.
+    """Archive of one icy night, the map that is computed from it, and the places that this map
+    knows to be slippery.
 
     Args:
         folder: folder for the archive and the outputs.
@@ -72,7 +73,7 @@ class KnownIce:
 
     Attributes:
         archive: folder of the archive, with a stored map (snapshot).
-        table: the map, in the schema of an answer.
+        table: the map, with the columns of an answer to a map query.
         places: cells and headings with P(slippery) above KNOWN, computed from the beliefs.
         unvalued: those of `places` for which no vehicle reported a value of its own.
     """
@@ -93,7 +94,7 @@ class KnownIce:
         snapshots.write_snapshot(self.archive, self.table, NOW)
 
     def batches(self) -> Iterator[tuple[int, pa.RecordBatch]]:
-        """Yield each tile of the map with its cells."""
+        """Yield (number of the tile, rows of its cells) for each tile of the map."""
         tile = np.asarray(grid.tile_of(self.table["cell"].to_numpy()))
         for one in np.unique(tile).tolist():
             (batch,) = self.table.filter(pa.array(tile == one)).combine_chunks().to_batches()
@@ -197,7 +198,8 @@ def _replayed_rows(ice: KnownIce, ending: str) -> list[dict[str, Any]]:
 
 def _hidden_by_style(ice: KnownIce) -> Places:
     """Return the known slippery places that the QGIS style does not draw, or draws only by its rule
-    for unknown cells. The filters of a rule are SQL, which the function evaluates.
+    for unknown cells. A rule of the style applies to the cells that satisfy its filter, an SQL
+    expression; the function evaluates this expression.
     """
     text = (ROOT / "deploy" / "examples" / "gripmap.qml").read_text()
     root = ET.fromstring(text[text.index("<qgis") :])
@@ -253,8 +255,8 @@ def _hidden_by_demo(ice: KnownIce) -> Places:
 
 
 def _hidden_by_watch(ice: KnownIce) -> Places:
-    """Return the known slippery places of those tiles for which `watch` counts fewer slippery or
-    measured cells than there are.
+    """Return the known slippery places in those tiles for which the command `watch` counts fewer
+    slippery or fewer measured cells than there are known slippery places.
     """
     found: set[tuple[int, int]] = set()
     for tile, batch in ice.batches():
@@ -276,7 +278,9 @@ def serve_page(ice: KnownIce) -> Iterator[str]:
 
 
 def _put_missing(router: zenoh.Session, tiles: dict[int, pa.RecordBatch], address: str) -> bool:
-    """Publish all tiles, and return True if the page has received all of them."""
+    """Publish all map tiles to the live page. Return True if the page has already received all of
+    them.
+    """
     for tile, batch in tiles.items():
         router.put(keys.map_key(tile), arrow_stream(batch))
     return tiles_of(address) == len(tiles)

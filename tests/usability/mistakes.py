@@ -146,7 +146,7 @@ def prepare_files(folder: Path) -> None:
 
 
 def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """Run mistaken command lines. Return their number, and those that were answered with a
+    """Run the mistaken command lines. Return their number, and a list of those that ended with a
     traceback or with exit code 0.
     """
     bad = []

@@ -62,7 +62,7 @@ LEAST_PX: Final = 200  # [px] least extent of the drawn map in one direction in 
 
 
 def list_blocks(text: str) -> list[tuple[str, str]]:
-    """Return language and text of each fenced block of a page."""
+    """Return the language and the text of each fenced code block of a Markdown page."""
     return [
         (m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     ]
@@ -138,7 +138,9 @@ def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
-    """Yield each command, or None and the maps to look at after the commands of a page."""
+    """Yield (command, no maps) for each command of the pages. After the last command of each page,
+    yield (None, the maps to look at).
+    """
     for page in PAGES:
         for command in list_commands(page.read_text(encoding="utf-8")):
             yield command, {}

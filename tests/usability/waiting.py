@@ -47,8 +47,8 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
     """Return the longest time [s] between two outputs of a command on a terminal, including start
     and end.
 
-    A command that runs until it is stopped is interrupted as soon as it prints `ready`; the time
-    until it has ended does not count.
+    `ready` is for a command that does not end by itself: it is interrupted as soon as it prints
+    this text. The time from then until its end does not count.
     """
     here, there = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}

@@ -9,9 +9,9 @@ receiver.
 An approach starts on road that is not slippery; a car that drives from snow onto ice is already on
 slippery road. A warning is in time if the car could stop before the stretch from the place of the
 warning, and if the warning is still active on arrival. Stopping takes 1.5 s of reaction, then
-braking with the true friction of the road before the stretch, at most with 3 m/s². A warning is
-false if nothing slippery lies within a lane's width of the path that the car then drove. The limit
-is not narrower, because the map's cells are not finer than a lane.
+braking at 3 m/s², or less if the true friction of the road before the stretch allows only less. A
+warning is false if nothing slippery lies within a lane's width of the path that the car then drove.
+The limit is not narrower, because the map's cells are not finer than a lane.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ START_NS: Final = 1_800_000_000 * NS
 
 @dataclass
 class Approaches:
-    """Counts of approaches to slippery stretches and of warnings, summed over all cars and
-    towns.
+    """Number of approaches to slippery stretches and number of warnings, each summed over all cars
+    and towns.
     """
 
     came: int = 0
@@ -68,8 +68,13 @@ class Approaches:
 
 @dataclass
 class _Raised:
-    """One warning: the time [s] at which it was raised, distance and length of the slippery stretch
-    then [m], and the time [s] at which the warning ended.
+    """One warning to a driver.
+
+    Attributes:
+        at: time at which the warning began [s].
+        distance: distance from the car to the slippery stretch at that time [m].
+        length: length of the slippery stretch [m].
+        ended: time at which the warning ended [s].
     """
 
     at: int
@@ -80,8 +85,9 @@ class _Raised:
 
 @dataclass
 class _Track:
-    """Record of one car: for each second the distance driven [m], speed [m/s], friction, and
-    smallest friction near the car; and the list of warnings given to the car.
+    """Record of one car. For each second it has the distance that the car has driven [m], the car's
+    speed [m/s], the friction under the car, and the smallest friction near the car. It also has the
+    warnings that the car gave its driver.
     """
 
     metre: list[float] = field(default_factory=list)
@@ -163,8 +169,8 @@ def drive_town(
 
 
 def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
-    """Return the smallest friction (N,) within BESIDE_M of the path that each vehicle drove in the
-    second before time t [s].
+    """Return, for each of N vehicles, the smallest friction (N,) within BESIDE_M of the path that
+    the vehicle drove in the second before the time `t` [s].
     """
     true = fleet.truth
     every = round(RATE_HZ / BESIDE_HZ)

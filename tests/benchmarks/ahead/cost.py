@@ -103,8 +103,8 @@ def drive_way(
     """Drive a random route of `metres` through the city; return (megabytes received, processor time
     divided by driving time).
 
-    `known` are the keys of all map places (cell·4 + heading sector) that the service knows. With
-    `routed`, the car knows its route.
+    `known` are the keys of all map places (cell·4 + heading sector) that the service knows. If
+    `routed` is True, the car knows its route.
     """
     corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))

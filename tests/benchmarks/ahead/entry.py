@@ -3,9 +3,9 @@ cell, delay caused by a wrong map, and effect on published records.
 
 The default estimator drives through random towns, and its beliefs and likelihoods are recorded ten
 times a second. The maps are applied afterwards, because the filter itself never uses a map. The
-maps come from `known_town`, with random errors of the stated standard deviation. A map is wrong in
-two places: where the scenario's black ice appears, because the old map still says dry; and on
-equally long dry stretches, where a fake map says ice.
+maps come from `known_town`, with random errors of the stated standard deviation. Two wrong maps are
+tested. The old map shows dry road where the scenario's black ice has appeared since. The fake map
+shows ice on equally long stretches that are dry.
 """
 
 from __future__ import annotations
@@ -44,9 +44,16 @@ FAKE_M: Final = 22.0  # half the length of a fake stretch
 
 @dataclass
 class FilterTrace:
-    """Records of N filters at T instants. `place` (T, N): map cell with heading sector; `own` (T,
-    N, 32): friction belief of the filter; `visit` (T, N, 32): log-likelihood of the measurements
-    since the vehicle entered the place; also the true friction (T, N).
+    """Records of N filters at T instants.
+
+    Attributes:
+        place: (T, N) map cell with heading sector, where each vehicle is.
+        own: (T, N, 32) logarithms of the probabilities that the filter gives to 32 values of
+            friction.
+        visit: (T, N, 32) log-likelihood of the same values from the measurements since the vehicle
+            entered the place.
+        truth: (T, N) true friction.
+        published: encoded log-likelihoods in the reports of the vehicles.
     """
 
     place: IntArray
@@ -57,9 +64,10 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return the figures over all towns: the error when a vehicle enters a cell and the delay
-    caused by a wrong map, each as the value with the map divided by the value without it; and the
-    largest change of a published likelihood that the map causes.
+    """Simulate a drive through one town per seed. Return three figures over all towns: the error of
+    the friction estimate when a vehicle enters a cell, and the delay that a wrong map causes, each
+    divided by the value without a map; and the largest change of a published likelihood that the
+    map causes.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
@@ -102,8 +110,9 @@ def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> l
 def record_beliefs(
     fleet: SimulatedFleet, seconds: float, prior: LocalMap | None = None
 ) -> FilterTrace:
-    """Drive a fleet and record the beliefs of the filters. With `prior`, each car also computes the
-    belief that results if its own is combined with that map.
+    """Drive a fleet and record the beliefs of its filters and the published reports. If a map
+    `prior` is given, each car also combines its belief with that map. The combined belief is not
+    recorded; it must not change the reports.
     """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -131,8 +140,9 @@ def record_beliefs(
 
 
 def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the absolute errors of the estimated median friction within FIRST_S of entering a cell
-    that the map knows, (n, 2): with and without the map as a prior.
+    """Return the absolute errors of the estimated median friction, (n, 2), first with and then
+    without the map `known` as a prior. The n samples are those within FIRST_S seconds after a
+    vehicle entered a cell of this map.
     """
     with_prior = with_map(trace, known, now)
     alone = _median_friction(np.exp(trace.own))
@@ -146,8 +156,9 @@ def entry_errors(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
 def arrival_times(
     trace: FilterTrace, wrong: LocalMap, right: LocalMap, now: int
 ) -> list[tuple[float, float]]:
-    """Return pairs of times [s] until the estimate is right, with and without the wrong map `wrong`
-    as a prior; one pair per stretch where it differs from `right`.
+    """Return, for each stretch of road where the map `wrong` differs from the map `right`, two
+    times [s] until a filter's friction estimate is right: with the wrong map as a prior, and
+    without a map.
 
     A time is counted from the entry of the stretch until the estimate differs by at most ARRIVED
     from the true friction; if it never does, the time spent on the stretch counts.
@@ -193,7 +204,9 @@ def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) 
 
 
 def with_map(trace: FilterTrace, known: LocalMap, now: int) -> FloatArray:
-    """Return the median friction (T, N) of the filters' recorded beliefs combined with a map."""
+    """Return the median friction (T, N) of the N filters at T instants, after their recorded
+    beliefs were combined with the map `known` as a prior.
+    """
     prior = MapPrior(trace.place.shape[1])
     out = np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
@@ -220,8 +233,8 @@ def _since_entry(place: IntArray) -> IntArray:
 
 
 def _maps_differ(place: IntArray, wrong: LocalMap, right: LocalMap, now: int) -> BoolArray:
-    """Return an array (T, N) that is True where only one of two maps shows a slippery road and
-    their median friction differs by more than 0.3.
+    """Return an array (T, N) that compares two maps at each `place` (T, N): True if only one of
+    them shows a slippery road and their median frictions differ by more than 0.3.
     """
     keys, inverse = np.unique(place, return_inverse=True)
     one, other = (known.look_up(keys, now).mu for known in (wrong, right))

@@ -20,8 +20,11 @@ SPREAD = 0.06  # standard deviation that the map states for a cell, and that of 
 
 
 class KnownPlaces(NamedTuple):
-    """Map places (one per cell and heading sector) through which the lanes of a scenario lead, each
-    once, (n,): key (cell·4 + heading sector), and smallest true friction.
+    """Map places (one per cell and heading sector) on the lanes of a scenario, each contained once.
+
+    Attributes:
+        key: (n,) cell·4 + heading sector of each place.
+        mu: (n,) smallest true friction in each place.
     """
 
     key: IntArray
@@ -46,11 +49,11 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the local map of a car that has received all places (one per map cell and heading
-    sector).
+    """Return the map of a car that has received all `places` (one per map cell and heading sector)
+    from the service at the time `now` [ns].
 
-    The friction in the map is the true one; with `rng`, random errors of standard deviation SPREAD
-    are added.
+    The friction in the map is the true one. If a random generator `rng` is given, errors of
+    standard deviation SPREAD are added.
     """
     off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
     mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)

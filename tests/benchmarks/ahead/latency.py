@@ -88,8 +88,8 @@ def latency_figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Fi
 def measure_alerts(
     rng: np.random.Generator, alerts: int, vehicles: int
 ) -> tuple[list[float], float, int]:
-    """Return (latency of each alert [s], processor share per car, number of alerts without a
-    warning).
+    """Publish `alerts` alerts on the roads of random cars. Return the latency of each warning [s],
+    the share of a processor core that each car takes, and the number of alerts without a warning.
     """
     names = [f"car-{k:04d}" for k in range(vehicles)]
     warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {

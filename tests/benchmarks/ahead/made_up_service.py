@@ -22,8 +22,9 @@ from schemas.wire import Alert
 
 
 def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
-    """Return the payload of a map tile in the form that a service sends, with the cells `key`
-    (cell·4 + heading sector) and their friction; `changes` replace columns of the tile's table.
+    """Return the bytes of a map tile as a service sends it. `key` are its places (cell·4 + heading
+    sector) and `friction` their friction. The keywords `changes` replace columns of the tile's
+    table.
     """
     n = len(key)
     mu = np.broadcast_to(friction, len(key))
@@ -67,8 +68,8 @@ class MadeUpService:
     """Simulated service with places of known friction (`mu` by cell·4 + heading sector) and active
     alerts; it records the queries.
 
-    The places were observed at the time `now`. With `kept`, its answers always state the ages that
-    the places had at `now`, like a store that repeats old messages.
+    All places were observed at the time `now` [ns]. An answer states how old these observations
+    are. If `kept` is True, this age never grows, as in a store that repeats old messages.
     """
 
     settings: ZenohSettings

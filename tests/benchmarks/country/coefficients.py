@@ -58,8 +58,9 @@ def measure_coefficients() -> Coefficients:
 
 
 def _measure_growth(kind: str) -> tuple[float, float, float]:
-    """Return the bytes of memory that a stream of messages added, the number of cells at the end,
-    and the bytes of the table of (cell, vehicle) pairs, measured in a new process.
+    """Run this module in a new process with the stream of messages called `kind`. Return three
+    numbers: by how many bytes the memory of a service grew, the number of map cells at the end, and
+    the mean size [bytes] of an entry in the table of (cell, vehicle) pairs.
     """
     command = [sys.executable, "-m", "tests.benchmarks.country.coefficients", kind]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
@@ -79,8 +80,9 @@ def _make_stream(kind: str) -> list[Message]:
 
 
 def main(kind: str) -> None:
-    """Let a service ingest simulated messages of the given kind, and print by how many bytes the
-    memory of its process has grown.
+    """Let a service ingest simulated messages of the given kind. Print by how many bytes the memory
+    of its process has grown, the number of map cells, and the mean size [bytes] of a (cell,
+    vehicle) pair.
     """
     sent = _make_stream(kind)
     with (
@@ -103,9 +105,9 @@ def main(kind: str) -> None:
 
 
 def _measure_pair(fusion: Fusion) -> float:
-    """Return the mean size [bytes] of an entry in the table of (cell, vehicle) pairs. Before that,
-    let a vehicle report a quarter of an hour later, so that all earlier visits are settled (moved
-    into this table).
+    """Return the mean size [bytes] of an entry in the table of (cell, vehicle) pairs. All visits
+    must be in this table, but the map moves them there only after a while. The function therefore
+    first adds a later visit.
     """
     later_s = (fusion.next_epoch - START) / SECOND + FORGOTTEN_EVERY_S
     fusion.update(make_visits(np.random.default_rng(SEED), 1, 1, later_s, 1.0))

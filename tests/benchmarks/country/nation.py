@@ -46,10 +46,14 @@ _TICKS: Final = os.sysconf("SC_CLK_TCK")
 class Look(NamedTuple):
     """Sample of the run at one moment.
 
-    `time` is the time since the beginning [s]. `memory` is the memory of each process except the
-    sender [MB]: the minimum since the previous sample, because writing a segment (file of new rows)
-    temporarily needs 20 MB. `spent` is the processor time of each process [s]. `cells`, `rows`
-    (admitted) and `queued` (waiting messages) are numbers per service.
+    Attributes:
+        time: time since the beginning of the run [s].
+        memory: memory of each process except the sender [MB]. It is the minimum since the previous
+            sample, because writing a segment (file of new rows) temporarily needs 20 MB.
+        spent: processor time of each process [s].
+        cells: number of map cells of each service.
+        rows: number of admitted rows of each service.
+        queued: number of messages that wait in each service.
     """
 
     time: float
@@ -185,8 +189,8 @@ def simulate_nation(
 
 
 def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
-    """Sample all processes every EVERY_S seconds while the sender runs, and return the samples. The
-    sender is the process that ends last.
+    """Sample all processes every EVERY_S seconds while the sender process runs, and return the
+    samples.
     """
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
@@ -221,14 +225,14 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return, for each process except the last (the sender), the smallest memory [MB] seen so far:
-    the smaller of its value in `before` and its memory now.
+    """Return, for each process in `parts` except the last (the sender), the smallest memory [MB]
+    seen so far. This is the smaller one of its value in `before` and its memory now.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
 
 def _last_line(sender: Part) -> dict[str, float]:
-    """Return the last complete line that the sending process printed, parsed from JSON."""
+    """Return the last complete line that the sender process printed, parsed from JSON."""
     whole = [line for line in sender.read_lines() if line.endswith("}")]
     said: dict[str, float] = json.loads(whole[-1])
     return said

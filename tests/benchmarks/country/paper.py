@@ -24,7 +24,7 @@ def estimate_million(found: Mapping[str, float]) -> list[Figure]:
     of which reports as often as a vehicle of the simulated country.
 
     Args:
-        found: measured figures of the country by name.
+        found: figures that were measured in the simulated country, by name.
     """
     rate = FACTOR * found["country.rate"]
     cells = FACTOR * found["country.cells"]

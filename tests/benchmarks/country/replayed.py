@@ -43,14 +43,16 @@ _CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # cells along a tile's s
 
 
 class Chunk(NamedTuple):
-    """ROWS successive visits of one vehicle (passes through cells), which are sent as one batch.
+    """ROWS successive visits (passes through map cells) of one vehicle, which it sends as one
+    batch.
 
     Attributes:
         message: the batch without vehicle, place and time.
         x, y: column and row of each position, counted in cells from the north-western tile of the
             town, with fractions.
-        cell_x, cell_y: column and row of the reported cells, counted in the same way.
-        enter, leave: times before the last visit's end, as a share of the time of all visits.
+        cell_x, cell_y: column and row of the reported cells, counted from the same tile.
+        enter, leave: begin and end of each visit, as the time until the end of the last visit
+            divided by the duration of all visits.
     """
 
     message: Any
@@ -99,8 +101,8 @@ class Country:
                 self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
 
     def _locate_region(self, zone: int, k: int) -> tuple[int, int]:
-        """Return column and row, in the world's grid of regions, of region k of a zone (map square
-        that one service serves).
+        """Return column and row of a region in the world's grid of regions. The region is number
+        `k` of the zone (map square that one service serves) number `zone`.
         """
         zone_x, zone_y = (int(side[0]) for side in self._home)
         return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
@@ -114,13 +116,13 @@ class Country:
         return ["/".join((*part[:2], "*")) for part in parts]
 
     def region_id(self, k: int) -> int:
-        """Return the quadint (number of a grid square) of region k of the country."""
+        """Return the quadint (number of a grid square) of region number `k` of the country."""
         x, y = self.regions[k]
         return int(grid.interleave(np.array([x]), np.array([y]))[0])
 
     def encode_report(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
-        """Return Zenoh key and bytes of the report that a vehicle sends in one turn (period of
-        PERIOD_S), dated now.
+        """Return the Zenoh key and the bytes of the report that the vehicle number `vehicle` sends
+        in turn (period of PERIOD_S) number `turn`. The report's last visit ends now.
         """
         drive = self.drives[self.drive[vehicle]]
         chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]

@@ -43,8 +43,9 @@ class Waits:
                 self.acked[first - 1 : last, vehicle] = now
 
     def summarize(self, since: float) -> dict[str, float]:
-        """Return the number of batches sent, the number that still wait for their acknowledgement,
-        and the 99 % quantile [s] of the waits that ended after `since`.
+        """Return by name the number of sent batches, the number of acknowledged ones, and the
+        longest time [s] for which a batch waits now. Return also the 99 % quantile [s] of the waits
+        of the acknowledged batches that were sent after `since`.
         """
         # Zenoh's callback changes `acked` meanwhile, so a copy is used.
         put = self.put

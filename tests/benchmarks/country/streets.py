@@ -59,7 +59,8 @@ class Streets(Scenario):
 
 
 def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
-    """Return the drives of the first `vehicles` vehicles whose path is long enough for `seconds`.
+    """Simulate traffic with SUMO. Return the drives of the first `vehicles` vehicles whose path is
+    long enough for a drive of `seconds` seconds.
 
     Raises:
         RuntimeError: there are too few such vehicles.
@@ -75,8 +76,8 @@ def simulate_drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[
 
 
 def _make_drive(rows: pd.DataFrame) -> Drive | None:
-    """Return the drive of one vehicle from the rows of its positions, or None if the vehicle jumped
-    or did not move.
+    """Return the drive of one vehicle, computed from its positions in SUMO's table `rows`. Return
+    None if the vehicle jumped or did not move.
     """
     x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
     step = np.hypot(np.diff(x), np.diff(y))

@@ -35,8 +35,8 @@ ESTIMATOR: Final = "aco-fckf"
 
 
 def true_errors(seed: int, car: int) -> dict[str, float]:
-    """Return the true sensor and vehicle errors of a simulated inaccurate car, by quantity of the
-    calibration.
+    """Return the true sensor and vehicle errors of the simulated inaccurate car number `car`, by
+    the name of the quantity that the calibration learns.
     """
     error = error_row(ROUGH_FLEET, GOTHENBURG, seed, car)
     mounted = error[ErrorColumn.MOUNTED :]
@@ -71,8 +71,8 @@ def _mass_radius_ratio(seed: int, car: int) -> float:
 
 
 class Narrowed(NamedTuple):
-    """Mean width of the 90 % interval of friction over some cars, and share of true frictions
-    inside it, without and with calibration.
+    """Friction estimates of some cars without calibration (`plain_…`) and with it: mean width of
+    the 90 % interval of friction, and coverage, the share of true frictions inside the interval.
     """
 
     plain_width: float
@@ -127,9 +127,9 @@ def _drive_fleet(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, Float
 
 
 def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
-    """Return three figures with and without a calibration of the cars: mean width of the friction
-    interval with calibration, this width divided by that without calibration, and the share of true
-    frictions inside the interval.
+    """Estimate the friction of `cars` inaccurate cars without and with their calibration. Return as
+    figures the mean width of the friction interval with calibration, this width divided by the one
+    without, and the share of true frictions inside the interval for both.
     """
     groups = [
         learn_and_narrow(min(CARS_AT_ONCE, cars - k), seed + k, judged_s)
@@ -147,8 +147,9 @@ def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
 
 
 def figures(cars: int, seed: int) -> list[Figure]:
-    """Return the RMS over cars of (learned − true value) / stated standard deviation, by quantity.
-    The four radii count as one quantity.
+    """Learn the calibration of `cars` simulated cars. Return as figures, for each calibrated
+    quantity, the RMS over the cars of (learned − true value) / stated standard deviation. The four
+    wheel radii count as one quantity.
     """
     away: dict[str, list[float]] = {}
     for first in range(0, cars, CARS_AT_ONCE):

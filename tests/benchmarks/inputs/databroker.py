@@ -1,8 +1,9 @@
-"""Simulated databroker: the interface kuksa.val.v2 over gRPC, with GetValue, Subscribe and
-PublishValue as specified.
+"""Simulated databroker (server of a vehicle's signals): the interface kuksa.val.v2 over gRPC, with
+GetValue, Subscribe and PublishValue as specified.
 
-Unknown paths give NOT_FOUND. A subscription first sends all known values, and then each update.
-Updates for a slow subscriber are buffered up to its `buffer_size`; then the oldest are dropped.
+A request for an unknown signal path is answered with NOT_FOUND. A subscription first sends all
+known values, and then each update. Updates for a slow subscriber are buffered up to its
+`buffer_size`; then the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ LONGEST_BUFFER = 1000
 
 
 class Databroker:
-    """gRPC server at the address host:port with the given paths, which have no values at the
-    start."""
+    """gRPC server of signals at the address host:port. It knows the given signal paths, which have
+    no values at the start.
+    """
 
     def __init__(self, address: str, paths: Sequence[str]) -> None:
         self._grpc = import_optional("grpc")

@@ -21,8 +21,8 @@ from schemas.thresholds import NS
 
 
 def as_log(path: Path, messages: Sequence[Any]) -> Path:
-    """Write CAN messages as a log with python-can; the suffix of the path selects the format.
-    Return the path.
+    """Write CAN messages as a log file with python-can, and return its path. The suffix of the path
+    selects the log format.
     """
     with import_optional("can").Logger(str(path)) as writer:
         for message in messages:
@@ -88,8 +88,9 @@ def as_bag(folder: Path, messages: Sequence[Any], storage: str = "mcap") -> Path
 
 
 def as_csv(path: Path, log: Path, *, mark: str = ",") -> Path:
-    """Write a signal log as CSV with full precision; `mark` is the character between columns.
-    Return the path."""
+    """Write the signal log `log` as CSV with full precision, and return the path of the CSV file.
+    `mark` is the character between columns.
+    """
     table = pq.read_table(log)
     names = table.column_names
     t = np.array(table["timestamp"].cast(pa.int64()))

@@ -36,10 +36,11 @@ START_S: Final = 1_700_000_000
 
 
 def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
-    """Return (number of values that differ from those of cantools, number of compared values).
+    """Decode CAN frames with this project's code and with cantools. Return (number of values that
+    differ, number of compared values).
 
-    The compared CAN frames have random bytes, for every shipped profile with a CAN database. Frames
-    of the log `recorded` are added if it is given.
+    The frames have random bytes, for every shipped profile with a CAN database. The frames of the
+    log `recorded` are added if it is given.
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)
@@ -65,8 +66,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
 
 
 def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 cantools has no types
-    """Return the data bytes of each frame of the CAN message `message` in a recorded log, on any
-    bus.
+    """Return the data bytes of each frame in a recorded CAN log, on any bus, that has the
+    identifier of the CAN message `message`.
     """
     wanted = (message.frame_id, message.is_extended_frame)
     return [
@@ -96,8 +97,8 @@ def _compare_decoders(
 
 
 def on_a_bus(drive: Recorded) -> list[Any]:
-    """Encode a drive as CAN frames, and return the frames. Each frame contains two channels of a
-    sample; it is left out if one of the two readings is missing.
+    """Encode the signals of a drive as CAN frames, and return the frames. Each frame contains two
+    channels of one sample. A frame is left out if one of its two readings is missing.
     """
     frames = []
     columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
@@ -118,8 +119,9 @@ def _make_frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401
 
 
 def a_minute(path: Path) -> Path:
-    """Write a log of one minute with MINUTE_FRAMES frames: four messages that the import must
-    decode, at 100 Hz, and OTHERS messages that it must ignore. Return the path.
+    """Write a CAN log of one minute with MINUTE_FRAMES frames, and return its path. It contains
+    four messages that the import must decode, at 100 Hz, and OTHERS messages that the import must
+    ignore.
     """
     rng = np.random.default_rng(1)
     others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
@@ -140,7 +142,7 @@ def import_file(path: Path, profile: Profile, out: Path) -> Path:
 
 
 def import_s(folder: Path) -> float:
-    """Return the time [s] to import one minute of a bus, the shortest of TRIES runs."""
+    """Return the time [s] to import a CAN log of one minute, the shortest of TRIES runs."""
     path = a_minute(folder / "minute.blf")
     profile = profile_of("can")
     spent = []

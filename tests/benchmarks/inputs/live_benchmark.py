@@ -94,8 +94,9 @@ def run_peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> It
 
 
 def peer_addresses(kind: str) -> tuple[str, str]:
-    """Return (address of the sender, command-line argument with which the agent opens it as a
-    source)."""
+    """Return two addresses of a test sender: the one at which it sends, and the command-line
+    argument with which the agent opens it as a source.
+    """
     (port,) = free_ports(1)
     if kind == "can":
         return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
@@ -105,8 +106,8 @@ def peer_addresses(kind: str) -> tuple[str, str]:
 
 
 def write_profile(kind: str, folder: Path) -> tuple[str, Path | None]:
-    """Write the profile and the CAN database for a sender; return their paths (or the name of a
-    shipped profile, and None).
+    """Write the profile (assignment of signals to channels) and the CAN database for a kind of test
+    sender, and return their paths. For "vss", return the name of the shipped profile and None.
     """
     if kind == "vss":
         return "vss", None
@@ -166,7 +167,8 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 
 
 def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
-    """Kill the source of running agents; return (reasons of agents that failed, number of kills).
+    """Kill the signal source of running agents, `kills` times for each kind of source. Return one
+    message per failure of an agent, and the number of kills.
 
     An agent fails if it does not report the loss or the return of its source, or does not end
     correctly.
@@ -242,8 +244,9 @@ def _shows_silence(
     silent: bool,
     patience_s: float = PATIENCE_S,
 ) -> bool:
-    """Wait until the health of a running agent reports a source as silent (or, if `silent` is
-    False, no longer does). Return False if this does not happen in time.
+    """Wait until the health page of a running agent reports `source` as silent. If `silent` is
+    False, wait until the page no longer reports this. Return False if it does not happen within
+    `patience_s` seconds.
     """
     deadline = time.monotonic() + patience_s
     while agent.poll() is None and time.monotonic() < deadline:

@@ -58,8 +58,8 @@ def drive_at(t: float) -> dict[str, float]:
 
 
 def profile_of(kind: str) -> Profile:
-    """Return the profile (assignment of signals to channels) of a test sender ("peer"). For a
-    databroker it is the shipped profile.
+    """Return the profile (assignment of signals to channels) with which an agent reads the signals
+    of a test sender ("peer") of this kind.
     """
     if kind == "can":
         return Profile(
@@ -79,7 +79,9 @@ def profile_of(kind: str) -> Profile:
 
 
 def pace_samples(samples: int, rate: float) -> Iterator[float]:
-    """Yield the time of each sample [s] at the moment when the sample must be sent."""
+    """Wait for the due time of each of `samples` samples at `rate` per second, and then yield its
+    time since the first sample [s].
+    """
     began = time.monotonic()
     for k in range(samples):
         time.sleep(max(0.0, began + k / rate - time.monotonic()))

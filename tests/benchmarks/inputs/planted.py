@@ -36,7 +36,9 @@ PLACE = [S.LATITUDE, S.LONGITUDE, S.YAW]
 
 
 class Recorded(NamedTuple):
-    """A recorded drive: times t (T,) [s], signals (T, 18), and the vehicle file."""
+    """A recorded drive: times t (T,) [s], signals (T, 18) in the order of the channels, and the
+    parameters of the vehicle.
+    """
 
     t: FloatArray
     signals: FloatArray
@@ -47,8 +49,8 @@ Spoil: TypeAlias = Callable[[Recorded], Recorded]
 
 
 class Planted(NamedTuple):
-    """A recording fault that is added to a drive, and the finding (channel and kind) that the
-    signal doctor must report for it.
+    """A recording fault that can be added to a drive by the function `spoil`. The signal doctor
+    (check of recorded signals) must report it with this channel and this kind of fault.
     """
 
     spoil: Spoil
@@ -57,8 +59,8 @@ class Planted(NamedTuple):
 
 
 def scale_columns(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
-    """Return a function that multiplies columns of a drive by a factor, which may depend on the
-    wheel radius.
+    """Return a function that multiplies the signal columns `columns` of a drive by `factor`: a
+    number, or a function that computes it from the wheel radius [m].
     """
 
     def scale_drive(drive: Recorded) -> Recorded:
@@ -70,7 +72,7 @@ def scale_columns(columns: Sequence[int], factor: float | Callable[[float], floa
 
 
 def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
-    """Return a function that adds an offset to columns of a drive."""
+    """Return a function that adds `offset` to the signal columns `columns` of a drive."""
 
     def offset_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -81,7 +83,7 @@ def offset_columns(columns: Sequence[int], offset: float) -> Spoil:
 
 
 def delay_columns(columns: Sequence[int]) -> Spoil:
-    """Return a function that delays columns of a drive by LATE samples."""
+    """Return a function that delays the signal columns `columns` of a drive by LATE samples."""
 
     def delay_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -93,7 +95,9 @@ def delay_columns(columns: Sequence[int]) -> Spoil:
 
 
 def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
-    """Return a function that exchanges two groups of columns of a drive."""
+    """Return a function that exchanges the signal columns `one` of a drive with the columns
+    `other`.
+    """
 
     def swap_drive(drive: Recorded) -> Recorded:
         signals = drive.signals.copy()
@@ -126,8 +130,8 @@ def other_tyre(drive: Recorded) -> Recorded:
 
 
 def rim_speed_factor(unit: str) -> Callable[[float], float]:
-    """Return a function of the wheel radius [m]; it returns the factor that converts a wheel speed
-    [rad/s] to a speed at the rim in `unit`.
+    """Return the function that converts a wheel radius [m] into a factor. A wheel speed [rad/s]
+    times this factor is the speed of the wheel's rim in `unit`.
     """
     return lambda radius: radius / SPEED[unit]
 
@@ -191,10 +195,11 @@ RADII_ALIKE: Final = ({"km/h", "radius", "mph", "kn"},)
 def drives(
     count: int, seed: int, *, rough: bool, winter: bool = False, seconds: int = DRIVE_S
 ) -> list[Recorded]:
-    """Return simulated drives through the demonstration town. With `rough`, the town has hills and
-    the cars have inaccurate sensors.
+    """Return simulated drives through the demonstration town. If `rough` is True, the town has
+    hills and the cars have inaccurate sensors.
 
-    With `winter`, the drives are in a winter town drawn by the seed, with winter equipment.
+    If `winter` is True, the drives are in a random winter town that `seed` determines, and the cars
+    have winter equipment.
     """
     scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
     fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
@@ -204,8 +209,9 @@ def drives(
 
 
 def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
-    """Let the signal doctor (a check of recorded signals) examine a drive. Return two booleans:
-    True if it names the added fault `planted`, and True if it reports no fault at all.
+    """Add the fault `planted` to a drive, and let the signal doctor (a check of recorded signals)
+    examine it. Return two booleans: True if the doctor names this fault, and True if it reports no
+    fault at all.
     """
     diagnosis = diagnose(*planted.spoil(drive))
     found = {(finding.channel, finding.kind) for finding in diagnosis.findings}
@@ -259,8 +265,8 @@ def _share_of(held: Iterable[bool]) -> float:
 
 
 def _accused_share(clean: Sequence[Diagnosis]) -> float:
-    """Return the share of all channels of faultless drives in which the signal doctor (a check of
-    recorded signals) reports a fault.
+    """Let the signal doctor (a check of recorded signals) report on drives without faults. Return
+    the share of all their channels in which it nevertheless reports a fault.
     """
     channels = sum(
         len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings)

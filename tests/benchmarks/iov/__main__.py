@@ -110,8 +110,8 @@ def _route(engine: routes.Valhalla, request: dict[str, Any]) -> dict[str, Any] |
 
 
 def _time(engine: routes.Valhalla, shape: np.ndarray[Any, Any]) -> float:
-    """Return the travel time [s] that the route planner Valhalla computes for a given route (its
-    points) without friction costs.
+    """Return the travel time [s] of the route along the points `shape` [deg]. The route planner
+    Valhalla computes it without costs of low friction.
     """
     points = [{"lat": a, "lon": b} for a, b in shape.tolist()]
     answer = engine.ask(

@@ -160,8 +160,8 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
 
 
 def _encode_speedup(bodies: list[bytes]) -> float:
-    """Return the processor time in which the library asn1tools encodes these DENM (hazard
-    messages), divided by that of our encoder.
+    """Encode the given DENM (hazard messages) with the library asn1tools and with our encoder.
+    Return the processor time of asn1tools divided by ours.
     """
     general = compiled_denm()
     contents = [general.decode("DENM", body) for body in bodies]
@@ -176,8 +176,9 @@ def _encode_speedup(bodies: list[bytes]) -> float:
 
 
 def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
-    """Return the number of wrong results of the interchange's filter `quadTree LIKE '%,DIGITS%'`:
-    events that it selects outside the square with these digits, or leaves out inside.
+    """Test the filter `quadTree LIKE '%,DIGITS%'` by which a receiver at the interchange selects
+    events in a square; DIGITS is the number of the square. Return the number of its errors: events
+    that it selects outside the square, or omits inside.
     """
     wrong = 0
     squares = set[tuple[int, int]]()

@@ -80,12 +80,12 @@ def measure_foreign(_folder: Path, quick: bool) -> list[Figure]:
 def _alerted(
     places: list[tuple[float, float]], *own: dict[str, float], foreign: bool = False
 ) -> tuple[int, int]:
-    """Return the number of places under alert, and the number of foreign reports that were
-    accepted.
+    """Let a service receive reports about `places`. Return the number of places with an alert, and
+    the number of foreign reports that the service accepted.
 
     Args:
         places: latitude and longitude [deg].
-        own: friction that each own vehicle measures at all places.
+        own: one entry per enrolled vehicle at each place: the friction values that it reports.
         foreign: True if a publisher warns of ice at all places.
     """
     under_alert = set[int]()

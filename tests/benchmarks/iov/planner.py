@@ -25,8 +25,9 @@ STRAIGHT: Final = 1000  # [m] length of the straight road
 
 
 def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
-    """Simulate drives onto ice of unknown friction that the map knows with a 90 % interval. Return
-    the shares of drives that can stop within sight, with and without the agent's speed limit.
+    """Simulate drives onto ice. The map knows the friction of the ice only within a 90 % interval.
+    Return as figures the shares of drives that can stop within sight, with and without the agent's
+    speed limit.
     """
     draw = np.random.default_rng(SEED)
     drives = 200 if quick else 2000
@@ -60,8 +61,8 @@ def measure_planner(_folder: Path, quick: bool) -> list[Figure]:
 
 
 def _speed_at(begin: int, speed: float, safe: FloatArray, *, limited: bool) -> float:
-    """Return the speed [m/s] at position `begin` [m] of a car that obeys the speed limit after a
-    delay and with gentle braking.
+    """Return the speed [m/s] of a car when it reaches the position `begin` [m]. If `limited` is
+    True, the car obeys the agent's speed limit after a delay, by gentle braking.
     """
     limit = SteadyLimit()
     obeyed = math.inf

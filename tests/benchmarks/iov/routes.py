@@ -41,8 +41,8 @@ class StreetTown:
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return a street of the town as a directed polyline, in the form that the computation of
-        route costs takes.
+        """Return the street between two crossings as a polyline in this direction. The computation
+        of route costs takes streets in this form.
         """
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
@@ -162,8 +162,8 @@ class Valhalla:
         self._run("valhalla_build_tiles", "-c", str(self.config), str(pbf))
 
     def ask(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer of the route planner Valhalla to a routing request. An answer without a
-        route has an `error_code`.
+        """Send a routing request (`action` is its kind) to the route planner Valhalla, and return
+        the answer. If Valhalla finds no route, the answer has an `error_code`.
         """
         done = self._call("valhalla_service", str(self.config), action, json.dumps(request))
         line = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
