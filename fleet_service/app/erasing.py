@@ -136,7 +136,9 @@ def _reload_service(
 
 
 def run_erasure_process(root: Path, request: dict[str, Any]) -> dict[str, Any]:
-    """Carry out the part of an erasure that runs in the separate process; return its result.
+    """Remove the vehicle's rows that `request` names from the archive, and save a checkpoint (saved
+    state of the service) without them. This part of an erasure runs in a separate process. Return
+    the number of removed rows and the changed files.
 
     Raises:
         InputError, OSError: a file is damaged, or cannot be read or written.

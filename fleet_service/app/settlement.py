@@ -39,7 +39,7 @@ class Settlement:
     Args:
         shared: state of the service.
         intake: owner of the waiting acknowledgements.
-        log: segment log with the rows that wait for the disk.
+        log: segment log (queue) with the rows that wait for the disk.
         holding: ownership of the archive.
         counts: counters of the service.
 

@@ -2,8 +2,8 @@
 measured costs per vehicle, cell, pair of vehicle and cell, and observation.
 
 The costs of processor, network and disk come from `make country-bench` (100 000 vehicles for ten
-minutes on two cores). The costs of memory are fitted to engines with 10⁴ to 10⁵ vehicles, of which
-`make bench ONLY=sizing` measures two again.
+minutes on two cores). The costs of memory are fitted to engines (services without network) with 10⁴
+to 10⁵ vehicles, of which `make bench ONLY=sizing` measures two again.
 """
 
 from __future__ import annotations

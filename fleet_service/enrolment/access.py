@@ -11,10 +11,10 @@ here. Pure (no I/O).
 | router  | messages that others may publish, between routers | the same                      |
 
 NAME is the name in the certificate. PRIVATE stands for the keys ahead/NAME and vss/NAME: the road
-ahead of a vehicle, and the friction at the vehicle. Zenoh decides by the common name of the
-certificate. It reads the list only at its start. The sender is not informed about denials.
-Publishing on a wildcard counts as publishing on every matching key, so a rule must allow all of
-them.
+ahead of a vehicle, and the friction at the vehicle. An owner reads the PRIVATE keys of the vehicles
+that it owns. Zenoh decides by the common name of the certificate. It reads the list only at its
+start. The sender is not informed about denials. Publishing on a wildcard counts as publishing on
+every matching key, so a rule must allow all of them.
 """
 
 from __future__ import annotations

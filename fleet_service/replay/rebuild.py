@@ -259,7 +259,7 @@ def replay(
         root: folder of the archive.
         fusion: a new fusion (beliefs about the friction of all cells), or one that contains
             everything before `since`.
-        since: selection of rows.
+        since: selection of the rows to replay.
         damaged: called with each damaged file.
         heard: function that returns the context in which a group of observations is fused.
     """

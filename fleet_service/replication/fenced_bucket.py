@@ -13,14 +13,14 @@ from fleet_service.replication.fence import Fence, Term, fence_of, put_fence
 
 
 class FencedBucket:
-    """Bucket of a replica, with the lease of its owner if there is one, and with the fence (list of
-    valid objects) against former owners.
+    """Bucket of a replica, with the lease (ownership limited in time) of its owner if there is one,
+    and with the fence (list of valid objects) against former owners.
 
     Attributes:
         objects: the bucket.
         may_write: function that returns True if this service certainly has the lease.
-        assert_alone: function that checks in the bucket that no later lease exists; None without
-            a lease. It raises CopyError if a later lease exists or the check fails.
+        assert_alone: function that checks in the bucket that no later lease exists; None without a
+            lease. It raises CopyError if a later lease exists or the check fails.
     """
 
     def __init__(self, objects: ObjectBucket) -> None:

@@ -95,8 +95,8 @@ class BucketReplica:
     def sync_under_lease(
         self, service: str | None, term: Term | None = None, *, succeeds: bool = False
     ) -> int:
-        """Synchronise like `sync_without_lease`, but under the `term` of a lease: files that a
-        former holder of the lease uploads later are ignored.
+        """Synchronise folder and bucket like `sync_without_lease`, but under the `term` of a lease
+        (ownership): files that a former holder of the lease uploads later are ignored.
 
         Args:
             service: name of the service; None for a standby (waiting service), which follows the

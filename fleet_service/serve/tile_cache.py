@@ -42,8 +42,9 @@ class ShownTile(NamedTuple):
         payload: all cells as an Arrow stream, from south to north, which shares memory with
             `cells`; empty if the cells have another order and are used for one query only.
         least: smallest number of vehicles that visited any of the cells.
-        common: box (west, south, east, north) that all cells touch, if the cells are ordered from
-            south to north.
+        common: box (west, south, east, north) [deg]. If the box of a query touches it, this query's
+            box overlaps all cells in longitude. It is used only if the cells are ordered from south
+            to north.
         made: time at which this tile was made [ns].
         change: number of the newest change of the map that this tile includes.
     """

@@ -98,8 +98,8 @@ def expression(t: Table) -> Table:
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return a table with one row per band of road temperature (estimated from the air temperature)
-    and one per part of the day: how often the road changes per hour, the 90 % interval of this
-    rate, and the numbers of data on which the rate is based.
+    and one per part of the day: how often per hour the road becomes slippery or recovers, the 90 %
+    interval of this rate, and the numbers of data on which the rate is based.
 
     If `stations` is given, temperatures are those of the nearest station, else those that vehicles
     reported.
