@@ -34,8 +34,8 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 @dataclass(frozen=True)
 class MadeUp:
-    """Synthetic output of an estimator bank (filters of N vehicles). A test sets its values, which
-    do not depend on the vehicles' signals.
+    """Made-up output of an estimator bank (filters of N vehicles). A test sets its values; they are
+    not computed from signals.
     """
 
     vx: FloatArray
@@ -52,9 +52,7 @@ class MadeUp:
     jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
-        """Return the part of this synthetic output that belongs to the samples of the slice
-        `rows`.
-        """
+        """Return a copy of this output with only the samples of the slice `rows`."""
         cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
         return replace(self, **cut)
 
@@ -62,7 +60,7 @@ class MadeUp:
 def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
-    """Return random estimates, or with `mu` estimates of this friction with a narrow interval.
+    """Return made-up estimates: random ones, or with `mu` a narrow interval around this friction.
     Every sample has a random log-likelihood of friction.
     """
     rng = np.random.default_rng(seed)
@@ -98,8 +96,8 @@ def ground(
 
 
 def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
-    """Return a block (signals of some samples) of vehicles that turn at random and now and then
-    receive no position; every third vehicle has no yaw signal.
+    """Return a block (signals of some samples) of vehicles that turn at random. Now and then a
+    vehicle receives no position; every third vehicle has no yaw signal.
     """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
@@ -116,13 +114,11 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """State of several vehicles that a test keeps from one block of samples to the next.
+    """State of several simulated vehicles between one block of samples and the next.
 
-    Attributes:
-        tracks: for each vehicle the cell in which it is (state of the cell tracking).
-        open: for each vehicle the visit that has not ended. A visit is the passage of a map cell;
-            it ends when the vehicle leaves the cell.
-        config: settings of the agent.
+    Attributes: tracks: for each vehicle the cell in which it is (state of the cell tracking). open:
+    for each vehicle the visit that has not ended. A visit is the passage of a map cell; it ends
+    when the vehicle leaves the cell. config: settings of the agent.
     """
 
     tracks: RecordArray
@@ -156,7 +152,9 @@ def part(block: Block, rows: slice) -> Block:
 
 
 def a_log(samples: int) -> dict[str, Any]:
-    """Return random columns of a log at 100 Hz with every channel, similar to straight coasting."""
+    """Return random columns of a signal log at 100 Hz with every channel. The signals are similar
+    to those of a car that coasts straight ahead.
+    """
     rng = np.random.default_rng(4)
     columns: dict[str, Any] = {name: rng.normal(0.0, 0.1, samples) for name in CHANNELS}
     columns |= {
@@ -167,8 +165,8 @@ def a_log(samples: int) -> dict[str, Any]:
 
 
 def make_log_writer(**changes: object) -> Callable[[Path], object]:
-    """Return a function that writes a log of five samples. `changes` replaces columns, or removes
-    those that are None.
+    """Return a function that writes a signal log of five samples. `changes` replaces columns of the
+    log; a column whose new value is None is left out.
     """
 
     def write(path: Path) -> None:

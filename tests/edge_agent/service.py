@@ -58,8 +58,8 @@ class Router:
 
 @dataclass
 class Service:
-    """Simulated service that stores received messages. It acknowledges them while the event
-    `answer` is set; the function `refuse(batch)` may return a reason to reject a batch.
+    """Simulated service that stores received messages. It acknowledges them while `answer` is True.
+    The function `refuse(batch)` may return a reason to reject a batch instead.
     """
 
     router: Router
@@ -103,7 +103,7 @@ class Service:
         self.session.put(keys.ack_key(vehicle), payload, encoding=ACK_ENCODING)
 
     def wait(self, condition: Callable[[list[Batch]], bool]) -> None:
-        """Wait until the batches that this service received satisfy the condition."""
+        """Wait until `condition` is true for the list of batches that this service has received."""
         with self._changed:
             assert self._changed.wait_for(lambda: condition(self.batches), DEADLINE_S), (
                 f"{len(self.batches)} batches"

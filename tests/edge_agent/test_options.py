@@ -252,8 +252,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
-    """The tables name, for some options, a test in another module. Each named test must use its
-    option. This test reads the source of the named tests.
+    """The tables name, for some options, a test in another module that shows the effect. The source
+    of each named test must contain its option.
     """
     texts = [
         path.read_text()
@@ -274,8 +274,8 @@ def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with two drives, their vehicle files, a file of memberships (parameters of
-    fuzzy sets) and a configuration file.
+    """Return a folder with input files: two drives, their vehicle files, a file of memberships
+    (parameters of fuzzy sets) and a configuration file.
     """
     folder = tmp_path_factory.mktemp("given")
     for k in (0, 1):
@@ -336,8 +336,8 @@ def test_every_option_of_a_live_command_changes_what_is_driven(
 
 @cache
 def run_search(folder: Path, *words: str) -> tuple[object, list[str]]:
-    """Run a quick search for good memberships (parameters of fuzzy sets). Return its result (the
-    memberships found, scores and budget) and the names of the files that it wrote.
+    """Run a quick search for good memberships (parameters of fuzzy sets). Return its result
+    (memberships, scores and budget) and the names of the files that it wrote.
     """
     folder.mkdir(parents=True)
     with contextlib.chdir(folder):
@@ -464,8 +464,8 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 def test_every_number_of_the_vehicle_file_changes_what_is_estimated(
     estimator: str, name: str
 ) -> None:
-    """The estimates must change if the number `name` of the vehicle file is increased by
-    a fifth.
+    """The estimates must change if the number `name` in the vehicle file is increased by a
+    fifth.
     """
     t, signals, vehicle = drive("pulses", 0.6, seconds=3.0)
     broken = signals.copy()

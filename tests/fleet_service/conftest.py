@@ -23,7 +23,7 @@ PUT_S = 0.1
 
 @dataclass
 class Running:
-    """Service that runs in a thread of this process."""
+    """Service that runs in a thread of the test's process."""
 
     service: Service
     lines: list[str]
@@ -84,7 +84,9 @@ def service(router: ZenohSettings, tmp_path: Path) -> Iterator[Running]:
 
 @pytest.fixture
 def start(router: ZenohSettings) -> Callable[..., object]:
-    """Return a function that starts a service on an archive: `with start(root): ...`."""
+    """Return a function that starts a service on the archive in the folder `root`: `with
+    start(root): ...`.
+    """
     return lambda root, **changed: running(router, root, **changed)
 
 

@@ -28,15 +28,15 @@ Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.in
 
 
 def value(mu: Numbers, std: float = STD) -> FloatArray:
-    """Return log-likelihoods (n, 32) of visits (passages of a cell) that measured the friction `mu`
-    (n,) with standard deviation `std`.
+    """Return log-likelihoods (n, 32) of visits (passages of a cell). Each visit measured a friction
+    of `mu` (n,) with the standard deviation `std`.
     """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 
 
 def at_least(used: Numbers) -> FloatArray:
-    """Return log-likelihoods (n, 32) of visits (passages of a cell) that used the grip `used` and
-    measured no upper limit of friction.
+    """Return log-likelihoods (n, 32) of visits (passages of a cell). Each visit used a grip of
+    `used`, which proves only that the friction is at least as large.
     """
     return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
 
@@ -48,8 +48,8 @@ def observations(
     cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
-    """Return observations of visits (n,) to a cell at the times START + `seconds`; their sequence
-    numbers follow this order.
+    """Return observations of visits (n,) to `cell`, at the times START + `seconds`. The sequence
+    numbers rise in the given order.
     """
     n = len(seconds)
     whole = np.zeros(n, np.int64)
@@ -75,8 +75,8 @@ def observations(
 
 
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
-    """Return the log-likelihood (32,) of friction that the service assumes for a report with an
-    interval but without a likelihood.
+    """Return the log-likelihood (32,) of friction that the service computes for a report that
+    contains a friction interval but no likelihood.
     """
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns: dict[str, NDArray[Any]] = dict(
@@ -89,8 +89,8 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:
-    """Return the belief (32 probabilities of μ) about one cell of a `Fusion` at the time of its
-    last observation, or at `now`.
+    """Return the belief of a `Fusion` about one cell (32 probabilities of μ), at the time of its
+    last observation, or at the time `now`.
     """
     slot = fusion.slots_of(np.array([cell]), np.array([sector]))
     assert slot[0] >= 0, "nobody was there"
@@ -120,10 +120,11 @@ def batch(
     used: float | None = None,
     **changed: object,
 ) -> Batch:
-    """Return a batch of observations of one cell, one second apart and ending at `now` [ns].
-    `changed` replaces columns.
+    """Return a batch of observations of one cell, with the friction values `mu`. The observations
+    are one second apart and end at `now` [ns]; `changed` replaces columns.
 
-    Without `used` the vehicle used all of the grip, so that the observations are measurements.
+    Without `used` the vehicle used all of the grip, so that the observations are measurements. If
+    `told` is False, the batch contains no log-likelihoods.
     """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
@@ -159,8 +160,8 @@ def key(vehicle: str) -> str:
 
 
 def send(session: zenoh.Session, sent: Batch, place: str | None = None) -> None:
-    """Publish a batch on its vehicle's key, or on `place`. The call waits for a busy link, because
-    by default Zenoh would drop the message after a millisecond.
+    """Publish a batch on the key of its vehicle, or on the key `place`. The call waits for a busy
+    link, because by default Zenoh would drop the message after a millisecond.
     """
     session.put(
         place or key(sent.vehicle),

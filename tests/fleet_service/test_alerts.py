@@ -1,5 +1,6 @@
-"""Tests of alerts per road section: neighbouring cells form one alert, which keeps its id while it
-grows and ends, and webhooks deliver each alert in order or report its loss.
+"""Tests of alerts per road section. Neighbouring cells with ice must form one alert, which keeps
+its id while it grows and until it ends. Webhooks (HTTP calls) must deliver alerts in order or
+report their loss.
 """
 
 from __future__ import annotations
@@ -115,8 +116,8 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
 
 @contextmanager
 def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Yield the address of a real HTTP server, and the webhooks that it received. It first refuses
-    `refuse` requests.
+    """Yield the address of a real HTTP server, and the list of webhooks (HTTP calls) that it
+    received. The server refuses the first `refuse` requests.
     """
     heard: list[dict[str, Any]] = []
     left = [refuse]

@@ -70,7 +70,9 @@ def test_help_comes_without_what_commands_need() -> None:
 
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
-    """Return a fleet of three cars whose reports of ice the service has acknowledged."""
+    """Return a client that has published ice reports of three cars. The service has acknowledged
+    the reports.
+    """
     fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
     return fleet

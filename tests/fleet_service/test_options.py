@@ -233,8 +233,8 @@ class Done(NamedTuple):
 
 
 def place(folder: Path) -> dict[str, str]:
-    """Create two different archives, and the files that commands need. Return their
-    paths by name.
+    """Create two different archives and the other files that commands need, below `folder`. Return
+    their paths by name.
     """
     names = {name: folder / name for name in ("a", "b", "out", "fleet", "fleet2", "warm", "cold")}
     for name in ("a", "b"):
@@ -255,8 +255,8 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """Return a text for a file's content that is equal in every run: its hash, for certificates
-    their days of validity, and "" for private keys and READMEs.
+    """Return a text that describes a file's content and is equal in every run. It is the content's
+    hash, for certificates their days of validity, and "" for private keys and READMEs.
     """
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
@@ -267,7 +267,7 @@ def content(path: Path, folder: Path) -> str:
 
 
 def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
-    """Run a command in a new folder with test files, and return its result."""
+    """Run the command `words` in a new folder with test files, and return the command's result."""
     names = place(folder)
     code = main([word.format(**names) for word in words])
     said = capsys.readouterr()
@@ -298,8 +298,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("command", SHOWN_BELOW)
 def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
-    """This test reads other tests instead of running them: each option must occur in its test
-    module or below the tables of this module.
+    """Each listed option must occur in the test that shows its effect. The present test searches
+    the source of the command's test module, and of this module below the tables.
     """
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]
@@ -419,8 +419,8 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """Return a batch of the vehicle `name` with friction `mu` whose observations lie in another
-    tile of the same region.
+    """Return a batch of the vehicle `name` that reports the friction `mu`. Its cell lies in another
+    tile of the same region than the usual cell.
     """
     cell = int(grid.cell_of(*FAR))
     return batch(
@@ -430,8 +430,8 @@ def there(name: str, mu: float) -> wire.Batch:
 
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
-    """Return a fleet whose reports the service has acknowledged: three cars on ice, and later one
-    on a dry road elsewhere.
+    """Return a client whose reports the service has acknowledged: three cars reported ice, and
+    later one car reported a dry road elsewhere.
     """
     fleet = Fleet(session).await_services()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))

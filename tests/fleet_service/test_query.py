@@ -1,5 +1,5 @@
-"""Tests that a query distinguishes an empty map from a missing service, and that answers are
-written in the format that the file's name selects.
+"""Tests of the command that queries the map. It must distinguish an empty map from a missing
+service, and write the answer in the format that the file's name selects.
 """
 
 from __future__ import annotations

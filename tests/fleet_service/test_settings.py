@@ -36,9 +36,9 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine (service without network) with the setting under test. It has ingested four
-    reports of three cars: one second and five minutes old, ten minutes old, and dated a minute
-    ahead.
+    """Yield an engine (service without network) with the setting under test, after four reports of
+    three cars. Two are one second and ten minutes old, one is dated a minute ahead. The last, of
+    the first car again, is five minutes old.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()
@@ -102,8 +102,9 @@ def count_queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """Return two numbers from ten simulated passes of the service's main loop, 0.3 s each: segments
-    (files of new rows) written, and rounds in which tiles are published.
+    """Simulate ten passes of the service's main loop, 0.3 s each. Return the number of segments
+    (files of new rows) that the service writes, and the number of rounds in which it publishes
+    tiles.
     """
     clock = [time.monotonic()]
     calls = {"begin_flush": 0, "take_dirty": 0}
@@ -129,8 +130,8 @@ def turns(made: Service) -> tuple[int, int]:
 
 
 def count_far_moves(config: ServiceConfig, root: Path) -> int:
-    """Return the number of reports that are excluded as implausible moves if one sender reports two
-    distant places at once.
+    """Let one sender report two distant places at the same time, and return the number of reports
+    that the service counts as implausible moves.
     """
     now = time.time_ns()
     with closing(Engine(config, root)) as engine:

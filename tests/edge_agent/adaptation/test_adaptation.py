@@ -1,5 +1,5 @@
-"""Tests of the fuzzy adaptation: the measurement noise R grows within bounds when innovations
-(measurement minus prediction) are too large, and invalid tables are refused.
+"""Tests of the fuzzy adaptation. The measurement noise R must grow within its bounds when
+innovations (measurement minus prediction) are too large, and invalid rule tables must be refused.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of fuzzy sets whose lower vertices (corners of the set) are free parameters: a vertex
-changes the output only between its neighbours, and sets that leave a gap are refused.
+"""Tests of fuzzy sets whose lower vertices (corners of the set) are free parameters. A vertex may
+change the output only between its neighbours. Sets that leave values uncovered must be refused.
 """
 
 from __future__ import annotations

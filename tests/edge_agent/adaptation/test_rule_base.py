@@ -1,5 +1,5 @@
-"""Tests of the fuzzy rules: the membership (degree to which a value belongs to a fuzzy set) rises
-between foot and peak of the set, and each rule has the effect that its table states.
+"""Tests of the fuzzy rules. The membership (degree to which a value belongs to a fuzzy set) must
+rise between foot and peak of the set. Each rule must have the effect that its table states.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""Tests of two adaptation rules. The rule table of paper 001 must give its entries at the peaks of
-the sets. The noise estimate of paper 002 must find the variance of white noise; it weights the last
-innovations (measurement minus prediction) by their size.
+"""Tests of two adaptation rules. At the peaks of the fuzzy sets, the rule table of paper 001 must
+give its entries. The noise estimate of paper 002 must find the variance of white noise. It weights
+the last innovations (measurement minus prediction) by their size.
 """
 
 from __future__ import annotations

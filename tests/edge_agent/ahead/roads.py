@@ -34,8 +34,8 @@ def line(
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """Return the keys (cell · 4 + heading sector), (n,), along the road that `line` returns, each
-    once and in driving order.
+    """Return the keys (cell · 4 + heading sector), (n,), of the cells along the road that `line`
+    returns. Each key occurs once; the keys are in driving order.
     """
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]
@@ -44,8 +44,8 @@ def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) ->
 def cells(
     key: IntArray, mu: float, *, width: float = 0.1, basis: int = local_map.MEASURED, at: int = NOW
 ) -> ReceivedCells:
-    """Return cells in the form in which a car receives them; all have the friction `mu` with an
-    interval of ± `width`. `basis` is the kind of evidence, such as MEASURED.
+    """Return cells with the keys `key` in the form in which a car receives them. All have the
+    friction `mu`, an interval of ± `width`, and the kind of evidence `basis`, such as MEASURED.
     """
     said = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
@@ -71,7 +71,9 @@ def make_local_map(parts: list[ReceivedCells]) -> LocalMap:
 
 
 def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
-    """Return an alert of ice for a map place, given as key (cell · 4 + heading sector)."""
+    """Return an alert of ice for the cell and heading sector of `key` (cell · 4 + heading
+    sector).
+    """
     cell, sector = divmod(int(key), grid.SECTORS)
     latitude, longitude = grid.centre(cell)
     return Alert(

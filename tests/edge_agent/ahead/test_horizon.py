@@ -1,5 +1,6 @@
-"""Tests of the horizon (friction of the road ahead of a car): metres along the road become cells,
-unknown cells stay unknown, old values age, and the safe speed follows from them.
+"""Tests of the horizon, the friction of the road ahead of a car. Distances along the road become
+cells, unknown cells must stay unknown, old values must age, and the safe speed must follow from the
+cells.
 """
 
 from __future__ import annotations
@@ -85,9 +86,9 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
 def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
-    """A car must count as on its route although its heading differs from that of the route's
-    beginning. A navigation system leaves out the part already driven, so the route may begin at the
-    next corner.
+    """A car must count as on its route although its heading differs from the direction in which the
+    route begins. A navigation system leaves out the part already driven, so the route may begin at
+    the next corner.
     """
     path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
     assert path is not None
@@ -231,8 +232,8 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
 
 
 def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
-    """The car must always know the road some way ahead. It receives only the map boxes that it
-    requested, so it must request a box before it arrives there.
+    """The car must always know the road some way ahead. It receives only the map boxes (areas) that
+    it requested, so it must request a box before it arrives there.
     """
     road = keys_on(1500.0)
     cache = LocalMap()

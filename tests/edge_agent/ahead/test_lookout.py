@@ -1,6 +1,6 @@
 """Tests of cars that look ahead, that is, receive the map of the road ahead over real Zenoh
-sessions. They must give warnings from alerts and from the map, also after a lost router, and none
-from forged messages.
+sessions. They must give warnings from alerts and from the map, also after the router was lost.
+Forged messages must give no warning.
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ class Driving:
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Report the car's pose repeatedly until its outlook (warnings, and friction of the road
-        ahead) meets the condition, and return this outlook.
+        """Report the car's pose (position, heading, speed) repeatedly, until the car's outlook
+        meets the condition. The outlook is its warnings and the friction of the road ahead. Return
+        this outlook.
         """
 
         def has_outlook() -> bool:
@@ -96,7 +97,7 @@ def driving(router: Router) -> Iterator[Driving]:
 
 @pytest.fixture
 def town(router: Router) -> Iterator[MadeUpService]:
-    """Yield a simulated fleet service for a map in which no cell is icy at first."""
+    """Yield a simulated fleet service. No cell of its map is icy at first."""
     with MadeUpService(router.settings, time.time_ns()) as town:
         yield town
 
@@ -354,8 +355,8 @@ def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
 
 
 class Liar(MadeUpService):
-    """Simulated malicious service that answers map queries with different invalid tiles, one after
-    the other, and then with an empty tile.
+    """Simulated malicious service. It answers map queries with different invalid tiles, one after
+    the other, ending with an empty tile.
     """
 
     said = 0

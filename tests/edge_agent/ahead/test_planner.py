@@ -1,5 +1,6 @@
-"""Tests of the speed limit for a planner: a car can stop within sight on ice, the limit falls at
-once and rises after a while, and a ROS decoder reads the message.
+"""Tests of the speed limit for a planner. A car that keeps the limit must be able to stop on ice
+within sight. The limit must fall at once and rise only after a while, and a ROS decoder must read
+the message.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def test_a_ros_decoder_reads_the_message(limit: float) -> None:
 
 
 def enter_ice(speed: float, mu: float, metres: int, *, limited: bool) -> float:
-    """Return the speed [m/s] with which a car that starts `metres` before ice enters it, with or
-    without the limit.
+    """Return the speed [m/s] at which a car enters ice of friction `mu`, if it starts `metres`
+    before the ice at `speed` [m/s]. If `limited`, the driver keeps the speed limit.
     """
     safe = np.full(metres + 50, np.nan)
     safe[metres:] = stopping_speed(mu, SIGHT_M)

@@ -1,5 +1,5 @@
-"""Tests of the map as a prior of the friction estimate: it is used at entry to a cell, dropped if
-it is wrong, and never part of a published report.
+"""Tests of the map as a prior of the friction estimate. The car must use the map when it enters a
+cell and drop it if it is wrong. A published report must never contain it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FLAT = np.zeros((1, mugrid.BINS))
 
 
 def sharp(mu: float, std: float = 0.06) -> FloatArray:
-    """Return the map's belief about a cell: probabilities (32,) on the friction grid with median
+    """Return a map's belief about a cell: probabilities (32,) on the friction grid, with median
     `mu` and a 90 % interval of `mu` ± 1.6·`std`.
     """
     said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
@@ -32,8 +32,8 @@ def sharp(mu: float, std: float = 0.06) -> FloatArray:
 
 
 def saying(mu: float, std: float = 0.08) -> FloatArray:
-    """Return a Gaussian log-likelihood of a measurement `mu` with standard deviation `std` on the
-    friction grid, (1, 32).
+    """Return the log-likelihood (1, 32) of a friction measurement `mu` with a normal error of
+    standard deviation `std`, on the friction grid.
     """
     log = -0.5 * ((mugrid.CENTRES - mu) / std) ** 2
     return np.asarray((log - log.max())[None])
@@ -97,9 +97,9 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
 
 
 def test_a_map_says_nothing_twice() -> None:
-    """A car drives through many cells for which the map has the same belief. After the second such
-    cell, the combined friction interval must not become narrower, because the map's belief must not
-    count repeatedly.
+    """A car drives through many cells for which the map has the same belief. The belief must not
+    count repeatedly. Therefore, after the second such cell, the car's friction interval must not
+    become narrower.
     """
     prior = MapPrior(1)
     widths = []

@@ -1,5 +1,6 @@
-"""Tests of warnings: each is given once, and early enough to stop even if the friction is at the
-lower end of its interval. The warning is then updated and ended. There are no false warnings.
+"""Tests of warnings. Each must be given once, and early enough to stop even if the friction is at
+the lower end of its interval. The warning must then be updated and ended, and no warning may be
+false.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
 
 def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """The map's knowledge of ice may fade until only a lower bound of friction is left, while the
-    alert is still active. The warning must then state the friction of the alert.
+    alert of this ice is still active. The warning must then state the friction in the alert.
     """
     cache = make_local_map([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():

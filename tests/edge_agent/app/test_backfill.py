@@ -1,5 +1,5 @@
-"""Tests of the replay of many recorded drives: each drive's estimates are written to a file of
-their own, several run at a time, and a bad drive does not stop the others.
+"""Tests of the replay of many recorded drives. Each drive's estimates must be written to a file of
+their own, several drives must run at a time, and a bad drive must not stop the others.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
 
 
 def piped_tasks(drives: Path, folder: Path) -> list[Task]:
-    """Return the tasks of the drives, with vehicle files that are named pipes: each drive that
-    begins waits for its pipe.
+    """Return one estimation task per drive. Each task's vehicle file is a named pipe, so that a
+    started task waits until the test closes this pipe.
     """
     tasks = [
         task._replace(vehicle=folder / task.vehicle.name)

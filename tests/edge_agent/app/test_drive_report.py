@@ -1,4 +1,6 @@
-"""Tests of reports of a drive: the plots show the estimates, and unknown values have no colour."""
+"""Tests of reports of a drive. The plots must show the estimates, and unknown values must have no
+colour.
+"""
 
 from __future__ import annotations
 

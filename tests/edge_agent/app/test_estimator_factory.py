@@ -1,6 +1,6 @@
-"""Tests of the function that creates an estimator bank (filters of N vehicles) by name: the tuned
-estimator uses the memberships (parameters of fuzzy sets) of its file, and an unknown name is
-refused.
+"""Tests of the function that creates an estimator bank (filters of N vehicles) by name. The tuned
+estimator must use the memberships (parameters of fuzzy sets) in its file, and an unknown name must
+be refused.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of the provider that writes friction to a Kuksa databroker, with a real gRPC server: all
-values arrive, unknown values are cleared, and a broker that starts late gets the latest values.
+"""Tests of the provider that writes friction to a Kuksa databroker, with a real gRPC server. All
+values must arrive, and unknown values must be cleared. A broker that starts late must get the
+latest values.
 """
 
 from __future__ import annotations

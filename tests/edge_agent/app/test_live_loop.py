@@ -1,5 +1,5 @@
-"""Tests of the pipeline and the live loop: visits (passes through map cells) are closed at the end,
-delay behind real time is counted, and the loop stops on request.
+"""Tests of the pipeline and the live loop. At the end, the open visits (passes through map cells)
+must be closed. The delay behind real time must be counted, and the loop must stop on request.
 """
 
 from __future__ import annotations
@@ -131,8 +131,9 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The published observations must contain the ABS flag of a car that brakes with ABS now and
-    then. The flag must be unknown for a car whose flag is always on, and for a car without a flag.
+    """A simulated car brakes with ABS now and then: its published observations must contain the ABS
+    flag. For a car whose flag is always on, and for a car without a flag, the published flag must
+    be unknown.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):
@@ -179,8 +180,8 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
 
 
 class WaitingClock(threading.Event):
-    """Simulated clock that is also the event on which the live loop waits. Only waiting advances
-    it, as if all computation took no time.
+    """Simulated clock, on which the live loop also waits as on an event. Only waiting advances the
+    clock, as if all computation took no time.
     """
 
     def __init__(self) -> None:

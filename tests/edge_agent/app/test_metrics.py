@@ -1,6 +1,6 @@
-"""Tests of an agent's metrics and health: they show how many reports were sent, were settled
-(acknowledged or refused by the service) and are waiting, and they report problems such as a lost
-router or delay behind real time.
+"""Tests of an agent's metrics and health. They must show the numbers of reports that were sent,
+settled (acknowledged or refused by the service) and are waiting. They must report problems such as
+a lost router or delay behind real time.
 """
 
 from __future__ import annotations

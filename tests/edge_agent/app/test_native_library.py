@@ -1,5 +1,5 @@
-"""Tests of the agent's shared library of kernels (compiled functions): it gives the results of
-Numba, and Numba takes its place if the library cannot be built or loaded.
+"""Tests of the agent's shared library of kernels (compiled functions). It must give the results of
+Numba. If it cannot be built or loaded, Numba must take its place.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def run_python(code: str, *words: str) -> list[str]:
 @pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
-    bit by bit. The agent that uses the library must not load the heavy modules. It must refuse a
-    library for other sources.
+    bit by bit. The process that uses the library must not load the heavy modules. A library
+    compiled from other sources lies in its folder, and must not be used.
     """
     write_library(tmp_path / "kernels", f"edge_agent-0123456789abcdef-{LEVEL}.so")
     t, signals = SimulatedFleet("hills", VEHICLES, 3, 100.0, rough=0.5, winter=0.5).step(2000)

@@ -70,8 +70,11 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
-    """Return the lines that the printer of reasons (why nothing is published) prints in `seconds`
-    of simulated time.
+    """Return the lines that the agent prints in `seconds` of simulated time about why it publishes
+    nothing.
+
+    Args: source: block of signals that arrives every 0.1 s. find: function that returns the present
+    reasons.
     """
     clock = Clock()
     lines = list[str]()

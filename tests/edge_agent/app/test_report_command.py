@@ -1,5 +1,6 @@
-"""Tests of the option of `edge-agent replay` that adds further estimators to a report for
-comparison: they appear in the report, and the option is refused without a report.
+"""Tests of the option of `edge-agent replay` that adds further estimators to a drive's report. The
+added estimators must appear in the report, and the option must be refused if no report is
+requested.
 """
 
 from __future__ import annotations

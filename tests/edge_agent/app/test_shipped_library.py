@@ -1,5 +1,5 @@
-"""Tests of the shared libraries of compiled kernels in the installed package: an agent uses a
-library only if it was compiled from the present sources and for its processor.
+"""Tests of the shared libraries of compiled kernels in the installed package. An agent may use a
+library only if it was compiled from the present sources and for the agent's processor.
 """
 
 from __future__ import annotations

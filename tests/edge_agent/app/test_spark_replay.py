@@ -1,5 +1,5 @@
-"""`make spark-test`: drives estimated on Spark give the same bytes as on this machine, also if
-tasks or workers die.
+"""`make spark-test`: tests that drives estimated on Spark give the same bytes as on this machine,
+also if tasks or workers of Spark die.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of a live trip: nothing is published before the signals have passed the signal doctor (a
-check for sensor faults), and the next trip uses the calibration that this trip learned.
+"""Tests of a live trip. Nothing may be published before the signals have passed the signal doctor
+(a check for sensor faults). The next trip must use the calibration that the previous one learned.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Pass the samples of a recorded drive through a live trip, and wait for the result of the
-    signal doctor (a check for sensor faults). Return two lists with one item per block of samples:
-    True if its records may be published, and the block that the estimator received.
+    """Pass the samples of a recorded drive through a live trip, block by block. Wait for each
+    result of the signal doctor (a check for sensor faults). Return two lists with one item per
+    block: True if its records may be published, and the block as the estimator received it.
     """
     admitted = []
     blocks = []

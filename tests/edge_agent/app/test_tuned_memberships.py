@@ -1,5 +1,5 @@
-"""Tests of files with tuned memberships (parameters of fuzzy sets): they state their origin, and an
-invalid file is refused with the name of the field.
+"""Tests of files with tuned memberships (parameters of fuzzy sets). They must state their origin,
+and an invalid file must be refused with the name of its wrong field.
 """
 
 import json
@@ -161,9 +161,10 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
 
 @pytest.mark.campaign
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
-    """The present filter with the shipped memberships must reach the interval score that the file
-    states for the held-out drives. If the filter was changed after the tuning, this test fails.
-    Then repeat the tuning with the command in the file (`provenance.command`).
+    """The present filter with the shipped memberships (parameters of fuzzy sets) must reach the
+    interval score that their file states for the held-out drives. If the filter was changed after
+    the tuning, this test fails. Then repeat the tuning with the command in the file
+    (`provenance.command`).
     """
     document = load_tuned(FOLDER / "aco-fckf.json").document
     found = scores_of(

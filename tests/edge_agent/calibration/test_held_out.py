@@ -1,5 +1,5 @@
-"""Tests of the validation of a calibration on drives that were not used for learning: a group of
-corrections that makes these drives worse is left out.
+"""Tests of the validation of a calibration on drives that were not used for learning. If a group of
+corrections makes the estimates of these drives worse, it must be left out.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ def drive() -> Recorded:
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Return a made-up score of a vehicle's calibration on a drive, in place of a real prediction
-    error. A calibrated offset of a_x improves the score, and calibrated wheel radii make it worse.
+    """Return a made-up score of the calibration in a vehicle file, in place of a real prediction
+    error on a drive. A calibrated offset of a_x improves the score, and calibrated wheel radii make
+    it worse.
     """
     known = vehicle.calibration
     if known is None:

@@ -1,5 +1,5 @@
-"""Tests of the calibration: errors that were put into a simulated car's sensors are found from its
-drives and corrected.
+"""Tests of the calibration. The test puts errors into a simulated car's sensors; the calibration
+must find them from the car's drives and correct them.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
 
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
-    """The slip of driven wheels looks like a smaller radius. If the vehicle file names the driven
-    axle, the radius errors must be smaller than without this entry. Without it, the stated
-    uncertainty must be larger.
+    """Slip makes the driven wheels look smaller. If the vehicle file names the driven axle, the
+    errors of the learned radii must be smaller than without this entry. Without this entry, the
+    stated uncertainty must be larger.
     """
     drive = drives(3, 32, rough=False, seconds=300)[2]  # a van with rear-wheel drive
     assert drive.vehicle.drive_split_front == 0.0

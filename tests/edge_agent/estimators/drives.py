@@ -19,8 +19,8 @@ OMEGA = slice(S.OMEGA, S.OMEGA + 4)
 def drive(
     name: str, mu: float | None, seed: int = 1, seconds: float | None = None
 ) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return times t (T,) [s], signals (T, 18) and nominal vehicle of a manoeuvre with ordinary
-    sensors. If `mu` is None, the road has the friction that the manoeuvre defines.
+    """Return times t (T,) [s], signals (T, 18) and vehicle data of the named manoeuvre, driven with
+    ordinary sensors. The road has the friction `mu`, or the manoeuvre's own if `mu` is None.
     """
     log, vehicle = simulate_manoeuvre(
         name, mu=mu, seed=seed, duration_s=seconds, setup=DriveSetup(sensors="mems")
@@ -45,9 +45,9 @@ def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatAr
 
 
 def drive_over_joints() -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return times, signals and vehicle of a drive of gentle acceleration over joints in a dry
-    motorway, without torque signals. At each joint the wheel speeds of an axle jump by 3 to 4 % for
-    50 ms.
+    """Return times, signals and vehicle data of a gentle acceleration on a dry motorway, without
+    torque signals. The road has joints. At each joint the wheel speeds of an axle jump by 3 to 4 %
+    for 50 ms.
 
     The recorded minute tests/data/rav4.blf has such jumps at 1.7 and 38.4 s.
     """

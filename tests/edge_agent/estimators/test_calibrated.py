@@ -1,5 +1,5 @@
-"""Tests that a calibrated vehicle file narrows the priors of the calibrated states, and changes
-nothing else.
+"""Tests that a calibrated vehicle file narrows the estimator's priors of the calibrated states, and
+changes nothing else.
 """
 
 from __future__ import annotations

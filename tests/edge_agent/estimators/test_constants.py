@@ -43,8 +43,8 @@ SHORT: dict[str, float | None] = {
 
 
 class Move(NamedTuple):
-    """Expected direction in which a figure of a drive (mean interval width, for example) changes
-    when a constant of the estimator is multiplied by `times`.
+    """Expected change of one figure of one drive (mean interval width, for example) when a constant
+    of the estimator is multiplied by `times`.
     """
 
     figure: str
@@ -180,7 +180,7 @@ MOVES = {
 
 @cache
 def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return times t (T,) [s], signals (T, 18) and vehicle of a drive by name."""
+    """Return times t (T,) [s], signals (T, 18) and vehicle data of the drive with this name."""
     if name in SHORT:
         t, signals, vehicle = drive(name, SHORT[name])
         t = t[:SAMPLES]
@@ -219,8 +219,8 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 
 def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """Return times, signals and vehicle of a drive with signals that the simulator cannot produce:
-    a stop with slipping wheels, a standing car, or side force without yaw.
+    """Return times, signals and vehicle data of a drive with signals that the simulator cannot
+    produce: a stop with slipping wheels, a standing car, or side force without yaw.
     """
     t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
     signals = np.zeros((len(t), len(CHANNELS)))
@@ -239,8 +239,9 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
 
 @cache
 def figures(place: str, name: str | None, times: float) -> dict[str, float]:
-    """Run the default estimator on the drive `place` with its constant `name` multiplied by
-    `times`. Return figures of this run: means of outputs and of internal states, by name.
+    """Run the default estimator on the drive named `place`, with its constant `name` multiplied by
+    `times` (unchanged if `name` is None). Return means of its outputs and of its internal states,
+    by name.
     """
     t, signals, vehicle = make_drive(place)
     constants = Constants()
@@ -259,8 +260,9 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
 
 
 def summarize_reports(estimates: Estimates) -> dict[str, float]:
-    """Return the means of the estimator's outputs over one drive, by name: interval of friction,
-    standard deviations, statistics of measurement minus prediction.
+    """Return the means of the estimator's outputs over one drive, by name. They include the ends of
+    the friction interval, standard deviations, and statistics of the innovations (measurement minus
+    prediction).
     """
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,

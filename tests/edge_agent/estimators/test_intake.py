@@ -1,5 +1,5 @@
-"""Tests of two inputs of the papers' filters that are prepared from samples: the largest grip used
-in the last second, and the cosines of the steering angles now and before.
+"""Tests of two inputs of the papers' filters that are computed from samples. They are the largest
+grip used in the last second, and the cosines of the present and previous steering angles.
 """
 
 from __future__ import annotations

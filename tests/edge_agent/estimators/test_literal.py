@@ -1,5 +1,6 @@
-"""Tests of the friction filters of papers 000 and 003 as printed: they must reach the errors that
-the papers print. The effects of numerical precision and of the tyre model are also checked.
+"""Tests of the friction filters of papers 000 and 003, programmed as printed. They must reach the
+errors that the papers print. Further tests check the effects of numerical precision and of the tyre
+model.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def turn() -> tuple[GivenMotion, FloatArray]:
 
 
 def one_sample(speed: float) -> GivenMotion:
-    """Return the true motion of a car at one sample at `speed` [m/s], with slip at all wheels, as
-    input of the papers' filters.
+    """Return one sample of a car's true motion at `speed` [m/s], with slip at all wheels, as input
+    of the papers' filters.
     """
     signals = np.zeros((1, len(CHANNELS)))
     signals[0, [S.AX, S.AY, S.YAW_RATE]] = 1.0, 2.0, 0.2

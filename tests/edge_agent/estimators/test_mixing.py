@@ -1,5 +1,5 @@
-"""Tests of road changes at the end of a slide: only a wheel that grips again under load shows that
-the ice has ended.
+"""Tests of the end of a slide, when the belief changes from ice to another road. Only a wheel that
+grips again under load may show that the ice has ended.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that compare the parts of a group of nodes (filters of one friction hypothesis each) with
-textbook formulas. The parts are update, prediction, mixing and tyre curve.
+"""Tests that compare the computations of a group of nodes (filters of one friction hypothesis each)
+with textbook formulas. The computations are update, prediction, mixing and tyre curve.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def covariances(seed: int) -> FloatArray:
 
 
 def whole(covariance: FloatArray, lane: int) -> FloatArray:
-    """Return the full covariance matrix of one SIMD lane, of which `covariance` stores only the
-    lower half.
+    """Return the full covariance matrix of the node in SIMD lane `lane` (position in a vector).
+    `covariance` stores only the lower half.
     """
     lower = np.tril(covariance[..., lane])
     return np.asarray(lower + np.tril(lower, -1).T)

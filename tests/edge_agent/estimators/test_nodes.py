@@ -1,6 +1,6 @@
-"""Tests of mathematical identities of the friction mixture (grid of friction hypotheses): uniform
-prior, conserved probability at a road change, and a likelihood of the visit that equals the
-evidence by which the test has updated the filter.
+"""Tests of mathematical identities of the friction mixture (grid of friction hypotheses). The prior
+must be uniform, and a road change must conserve probability. The likelihood that a visit (passage
+of a map cell) reports must equal the likelihood that entered the filter.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of novelty: the degree (0 to 1) to which the force or the lateral slip in a block (some
+"""Tests of novelty, the degree (0 to 1) to which the lateral force or slip in a block (some
 samples) differs from its usual value.
 """
 
@@ -54,10 +54,9 @@ class Bend:
         self.memory["friction"]["median"] = mu
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
-        """Drive for `seconds` with the lateral force `force`, and with the lateral slip that the
-        filter expects at the force `slip`; both forces are divided by the load. Return the degree
-        (0 to 1) to which the last block of samples belongs to the fuzzy set "new", that is, differs
-        from the usual.
+        """Drive for `seconds` with the lateral force `force`. The lateral slip is the one that the
+        filter expects at the force `slip`. Both forces are divided by the load. Return the degree
+        (0 to 1) to which the last block of samples counts as new, that is, differs from the usual.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S
@@ -75,8 +74,8 @@ class Bend:
 
     @property
     def ice_ended(self) -> float:
-        """Return the degree (0 to 1) of membership in the fuzzy set "the ice has ended" after the
-        last block of samples.
+        """Return the degree (0 to 1), after the last block of samples, to which the filter believes
+        that the ice has ended.
         """
         return float(self.memory["slip"]["axle_ended"][0])
 

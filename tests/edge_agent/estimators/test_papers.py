@@ -1,5 +1,5 @@
-"""Tests of the papers' estimators on short drives: they find the motion, use no future samples,
-give no NaN, and each of their settings has an effect.
+"""Tests of the papers' estimators on short drives. They must find the car's motion, use no future
+samples and give no NaN. Each of their settings must have an effect.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Tests of the default estimator on sloping roads, and with sensors that are misaligned or not
-synchronous: none of these may look like ice.
+synchronous. It must not take any of these for ice.
 """
 
 from __future__ import annotations

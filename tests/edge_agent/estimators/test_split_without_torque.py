@@ -24,7 +24,8 @@ SNOW = 0.3
 
 def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
     """Return true v_x (T,) [m/s] and the estimates of a stop on a split road (different friction
-    left and right) without torque signals. If `mirrored`, the snow is on the left.
+    left and right), without torque signals. Snow lies on one side: on the left if `mirrored`,
+    otherwise on the right.
     """
     log, vehicle = simulate_manoeuvre("split-braking", seed=seed)
     signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)

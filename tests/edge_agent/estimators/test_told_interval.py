@@ -1,5 +1,5 @@
-"""Tests of the reported interval of friction: its ends are the intended quantiles of the belief,
-and a possible ice patch lowers only the lower end.
+"""Tests of the reported interval of friction. Its ends must be the intended quantiles of the
+belief. A possible ice patch must lower only the lower end.
 """
 
 from __future__ import annotations

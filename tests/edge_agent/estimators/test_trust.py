@@ -1,6 +1,6 @@
-"""Tests of trust in the vehicle model: strain (deviation of the estimated vehicle states from their
-prior) separates cars that match their vehicle file from others. Contradictions between model and
-measurements are found per axle, and ice causes none.
+"""Tests of trust in the vehicle model. The strain (deviation of the estimated vehicle states from
+their prior) must separate cars that match their vehicle file from others. Contradictions between
+model and measurements must be found per axle, and ice must cause none.
 """
 
 from __future__ import annotations

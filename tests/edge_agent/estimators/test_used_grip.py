@@ -1,6 +1,6 @@
-"""Tests of the reported grip in use (share of the friction that the tyres use): it follows the
-acceleration and never exceeds the limit of a tyre. Torque known on one axle must not harm the speed
-estimate.
+"""Tests of the reported grip in use (the part of the friction that the tyres use, as a friction
+value). It must follow the acceleration and never exceed the limit of a tyre. Torque known on one
+axle only must not harm the speed estimate.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> float:
-    """Return the RMS error of the estimated v_x [m/s] in a stop without the signals (columns) in
-    `missing`. If `engine_only`, the known torque does not include the brakes.
+    """Return the RMS error of the estimated v_x [m/s] in a stop on a road of friction `mu`, without
+    the signals in the columns `missing`. If `engine_only`, the torque signals do not include the
+    brakes.
     """
     t, signals, vx = stop(mu)
     signals = signals.copy()

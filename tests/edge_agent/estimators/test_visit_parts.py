@@ -1,5 +1,5 @@
-"""Tests of the likelihood of a visit (pass through one cell): it is reported in two parts if the
-friction jumps during the visit, and in one part otherwise.
+"""Tests of the likelihood that the estimator reports for a visit (pass through one cell). It must
+have two parts if the friction jumps during the visit, and one part otherwise.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ DEFAULT = "aco-fckf"
 
 
 def one_visit(name: str, mu: float | None, seed: int) -> tuple[np.ndarray, Estimates]:
-    """Return times (T,) [s] and estimates of a drive within one cell."""
+    """Return times (T,) [s] and estimates of the named manoeuvre, as if the whole drive lay within
+    one cell.
+    """
     t, signals, vehicle = drive(name, mu, seed)
     closes = np.zeros((len(t), 1), np.bool_)
     closes[0] = closes[-1] = True

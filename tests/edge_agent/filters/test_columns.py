@@ -1,5 +1,5 @@
-"""Tests that the cubature filter that stores its points in columns equals the one that stores them
-in rows: same points, same prediction.
+"""Tests that two forms of the cubature filter give the same points and the same prediction: one
+stores its points in columns, the other in rows.
 """
 
 from __future__ import annotations

@@ -33,7 +33,8 @@ def textbook(
     mean: FloatArray, cov: FloatArray, system: System, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (n,) and covariance (n, n) after one step of the textbook Kalman filter with the
-    measurement `z`. The textbook filter computes with full covariances, not with their factors.
+    measurement `z`. `system` is the linear system. The filter computes with full covariances, not
+    with their Cholesky factors.
     """
     f, q, h, noise = system
     mean = f @ mean

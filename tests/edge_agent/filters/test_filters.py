@@ -188,8 +188,9 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_measurement() -> None:
 def _textbook(
     rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean (2,) and covariance (2, 2) after one step of the cubature filter with full
-    covariances, for the pendulum of `swing` and `look`.
+    """Return mean (2,) and covariance (2, 2) of a pendulum (functions `swing` and `look`) after one
+    step of the cubature filter with the measurement `z`. The filter computes with full covariances,
+    not with their factors.
     """
     points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
     mean = points.mean(axis=0)
@@ -203,14 +204,16 @@ def _textbook(
 
 
 def swing(x: FloatArray) -> FloatArray:
-    """Return the states (n, 2), angle and rate, of a damped pendulum 50 ms after the states x (n,
-    2).
+    """Return the states (n, 2) of a damped pendulum, angle and rate, 50 ms after it had the states
+    `x` (n, 2).
     """
     return np.stack([x[:, 0] + 0.05 * x[:, 1], 0.99 * x[:, 1] - 0.5 * np.sin(x[:, 0])], axis=1)
 
 
 def look(x: FloatArray) -> FloatArray:
-    """Return the measurements (n, 2) of a pendulum: horizontal position, and rate times height."""
+    """Return the measurements (n, 2) of a pendulum in the states `x`: horizontal position, and rate
+    times height.
+    """
     return np.stack([np.sin(x[:, 0]), x[:, 1] * np.cos(x[:, 0])], axis=1)
 
 

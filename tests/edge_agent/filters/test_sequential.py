@@ -1,5 +1,5 @@
-"""Tests that the update of a Cholesky factor by one scalar measurement after the other equals
-textbook and orthogonal algorithms.
+"""Tests of the update of a Cholesky factor, in which one scalar measurement is processed after the
+other. The result must equal that of textbook and orthogonal algorithms.
 """
 
 from __future__ import annotations

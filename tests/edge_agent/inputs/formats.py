@@ -1,5 +1,6 @@
-"""Paths of the test recording (one minute of a Toyota RAV4: CAN log, GNSS log and vehicle file in
-tests/data), its CAN frames, and the functions that write the frames in other log formats.
+"""Test recording: one minute of a Toyota RAV4, with CAN log, GNSS log and vehicle file in
+tests/data. The module has their paths, the recorded CAN frames, and functions that write the frames
+in other log formats.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that a small compressed recording that expands to a very large one is refused with an error
-and does not exhaust memory.
+"""Tests that a small compressed recording which expands to a very large one is refused with an
+error, before it fills the memory.
 """
 
 from __future__ import annotations

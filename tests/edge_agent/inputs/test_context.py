@@ -1,5 +1,5 @@
-"""Tests of context signals (controllers, temperature, wipers): each kind of source fills them, old
-logs stay unchanged, and a value that is too old is unknown.
+"""Tests of context signals (controllers, temperature, wipers). Each kind of source must fill them,
+logs without them must stay unchanged, and a value that is too old must count as unknown.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def told_at(t: float) -> dict[str, float]:
 
 
 def frames_of(name: str) -> list[can.Message]:
-    """Return the CAN frames of a drive of the car that the shipped profile `name` (assignment of
-    signals to channels) describes, with all messages of its CAN database.
+    """Return the CAN frames of a drive with all messages of a car's CAN database. `name` is the
+    shipped profile (assignment of signals to channels) of this car.
     """
     cantools = pytest.importorskip("cantools")
     database = cantools.database.load_file(FOLDER / f"{name}.dbc", strict=False)
@@ -106,8 +106,8 @@ def frames_of(name: str) -> list[can.Message]:
 
 
 def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
-    """Import a recording as a signal log, without checking that the signals that an estimator needs
-    exist.
+    """Import a recording as a signal log, without a check that it has the signals that an estimator
+    needs.
     """
     database = None if profile.dbc is None else read_dbc(FOLDER / profile.dbc)
     merged = merge_recordings(
@@ -124,8 +124,8 @@ def import_log(path: Path, profile: Profile, out: Path) -> SignalLog:
 
 
 def assert_filled(log: SignalLog) -> None:
-    """Assert that a log contains all context signals (such as temperature and wipers) with their
-    true values.
+    """Assert that a log contains all context signals (such as temperature and wipers), and that
+    their values are the true ones.
     """
     assert log.context is not None
     assert len(log.t) > 500
@@ -156,8 +156,8 @@ def test_a_bus_fills_the_context_that_its_profile_reads(
 
 
 def plain_profile(names: dict[str, str]) -> Profile:
-    """Return a profile (assignment of signals to channels) that reads context channels, and one
-    wheel, from signals with these names.
+    """Return a profile (assignment of signals to channels). `names` gives, for each channel, the
+    name of the signal from which it is read.
     """
     return Profile(
         name="p", channels={channel: Channel(signal=signal) for channel, signal in names.items()}
@@ -232,8 +232,8 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
-    """Return the context signals (T, 5) that `LiveRows` makes if a 50 Hz source sends `values` in
-    every `every`-th message.
+    """Return the context signals (T, 5) in the first `blocks` blocks that `LiveRows` makes from a
+    live source. The source sends messages at 50 Hz, and `values` in every `every`-th of them.
     """
     clock = Steered()
     feed = Scripted("bus", clock)

@@ -1,5 +1,5 @@
-"""Tests of CAN decoding: every frame is decoded exactly as by cantools, and small errors in a
-database do not prevent the decoding of the rest.
+"""Tests of CAN decoding. Every frame must be decoded exactly as by the library cantools. A small
+error in a CAN database must not prevent the decoding of the rest.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the signal doctor (a check of recorded signals): it names deliberate faults, accepts
-correct drives and the recorded minute, and proposes right corrections.
+"""Tests of the signal doctor (a check of recorded signals). It must name faults that the test adds,
+accept correct drives and the recorded minute, and propose right corrections.
 """
 
 from __future__ import annotations

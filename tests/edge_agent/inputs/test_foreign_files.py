@@ -1,5 +1,5 @@
-"""Tests with files of other programs: each is read with the right units, or refused with the right
-reason.
+"""Tests with files of other programs. Each file must be read with the right units, or refused with
+the right reason.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of `edge-agent import`: a drive in any format becomes the same log, clocks are aligned, and
-damaged files cause no crash.
+"""Tests of `edge-agent import`. A drive in any format must become the same log, the clocks of its
+sources must be aligned, and damaged files must cause no crash.
 """
 
 from __future__ import annotations
@@ -355,7 +355,9 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
 
 
 def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
-    """Return the bytes of a file, damaged as by a failing or hostile recorder."""
+    """Return the bytes `data` of a file, damaged in the way `kind`, as by a failing or hostile
+    recorder.
+    """
     if kind == "cut":
         return data[: int(rng.integers(len(data)))]
     if kind == "full":

@@ -1,5 +1,5 @@
-"""Tests of the lags of devices: the bicycle model and the correlation over shifts equal their
-definitions, and a known delay is found.
+"""Tests of the delays of sensors. The bicycle model and the correlation over time shifts must equal
+their definitions, and a known delay must be found.
 """
 
 from __future__ import annotations

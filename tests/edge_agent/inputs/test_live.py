@@ -1,5 +1,5 @@
-"""Tests of live sources of signals: the values that they read share one clock, losses are reported,
-and no error ends the program.
+"""Tests of live sources of signals. The values from all sources must share one clock, losses must
+be reported, and no error may end the program.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of live rows (samples made from live signals): all sources share one clock, readings are
-interpolated, late positions are assigned to their time, and lost sources are opened again.
+"""Tests of live rows (samples made from live signals). All sources must share one clock, readings
+must be interpolated, and late positions must be assigned to their time. Lost sources must be opened
+again.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of reading a signal log: channels come in their order, missing optional columns count as
-missing readings, and a bad log is refused in one line that names the fault.
+"""Tests of reading a signal log. Channels must come in their order, and a missing optional column
+must count as missing readings. A bad log must be refused in one line that names the fault.
 """
 
 from __future__ import annotations

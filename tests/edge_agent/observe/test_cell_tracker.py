@@ -1,6 +1,6 @@
-"""Tests of the division of a drive into visits (passes through a map cell in one heading sector):
-each visit begins where the previous one ends, position noise at a border starts no visit, and there
-is no visit without a position.
+"""Tests of the division of a drive into visits (passes through a map cell in one heading sector).
+Each visit must begin where the previous one ends. Position noise at a border must start no visit,
+and without a position there must be no visit.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def test_the_visited_cell_is_that_of_the_position_but_for_the_margin() -> None:
 
 
 def test_jitter_at_a_border_does_not_start_a_visit_with_every_fix() -> None:
-    """A standing car on the border of two cells, whose receiver scatters by 0.3 m, must begin
-    hardly any visits (passages of a cell).
+    """A standing car on the border of two cells must begin hardly any visits (passages of a cell),
+    although its receiver's position scatters by 0.3 m.
     """
     rng = np.random.default_rng(3)
     west, south, _, north = (float(v) for v in grid.bounds(grid.cell_of(57.70, 11.97)))

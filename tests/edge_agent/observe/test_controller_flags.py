@@ -1,5 +1,5 @@
-"""Tests of controller flags (ABS and others): implausible flags are set to unknown, others are
-passed on unchanged.
+"""Tests of the flags of slip controllers (ABS and others). Implausible flags must be set to
+unknown, and others must be passed on unchanged.
 """
 
 from __future__ import annotations

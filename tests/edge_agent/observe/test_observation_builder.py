@@ -1,5 +1,5 @@
-"""Tests of the observation builder: it makes one observation per visit (pass through a cell), and
-one state per reporting interval, for any division of the drive into blocks of samples.
+"""Tests of the observation builder. It must make one observation per visit (pass through a cell),
+and one state per reporting interval, for any division of the drive into blocks of samples.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 
 def join_records(records: list[RecordBlock]) -> dict[str, np.ndarray]:
-    """Join the records of several blocks of samples; return their columns, with the additional
-    columns `vehicle` and `urgent`.
+    """Join the records of several blocks of samples, and return their columns by name. The
+    additional columns are the vehicle numbers (`vehicle`) and the flags `urgent`.
     """
     columns = {
         name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns
@@ -136,9 +136,9 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
-    """The observation of a visit must be urgent (sent at once) only if the upper end of its
-    interval lies below 0.4, or if its median does and enough grip was used. The reported interval
-    is mu ± 0.05.
+    """The observation of a visit (pass through a cell) is urgent if it must be sent at once. It
+    must be urgent only if the upper end of its interval, mu ± 0.05, lies below 0.4, or if its
+    median does and enough grip was used.
     """
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)
@@ -148,8 +148,8 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
 
 
 def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
-    """Braking that ends just before the border must not count as grip used in the next cell,
-    although the estimator reports the largest grip of the last second.
+    """A car stops braking just before it enters the next cell. The braking must not count as grip
+    used in this cell, although the estimator reports the largest grip of the last second.
     """
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
@@ -166,9 +166,9 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """Braking on dry road before a cell must not count as grip on the ice in this cell. The
-    estimator reports the largest grip of the last second, and at 14 m/s a car crosses a cell in
-    less time, so this value may belong to the cell before.
+    """A car brakes on dry road before a cell with ice. The braking must not count as grip in the
+    icy cell. The estimator reports the largest grip of the last second, and at 14 m/s a car crosses
+    a cell in less time.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
@@ -194,8 +194,9 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
-    """Return the used grip (share of friction) reported for each visit (passage of a cell) of a car
-    that drives east along `east` (T, 1) [m] at 100 Hz and uses a grip of `observed` (T,).
+    """Return the used grip reported for each visit (passage of a cell) of a car. The car drives
+    east along `east` (T, 1) [m] at 100 samples per second; its acceleration shows a used grip of
+    `observed` (T,).
     """
     flat = np.zeros_like(east)
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
@@ -216,8 +217,8 @@ def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
 
 
 def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
-    """Braking that is closer to the border than the position error must count for neither cell.
-    Braking further inside must count for its own cell.
+    """Braking that is closer to the border of two cells than the position error must count for
+    neither cell. Braking further inside a cell must count for this cell.
     """
     east = np.arange(450)[:, None] * 0.1
     flat = np.zeros_like(east)
@@ -248,9 +249,9 @@ def test_the_noise_of_accelerometers_is_no_grip() -> None:
 def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     cut: int | None,
 ) -> None:
-    """The road changes from ice to dry within the vehicle's passage through the second cell. The
-    observation must allow both frictions. Its used grip must be that of the ice, although the
-    brakes used 0.7 before the change was detected.
+    """The road changes from ice to dry while the car passes through the second cell. The
+    observation of this cell must allow both frictions. Its used grip must be that of the ice,
+    although the brakes used 0.7 before the estimator detected the change.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 0.5

@@ -1,5 +1,5 @@
-"""Tests of trip privacy: nothing is published near the start and the end of a trip, and everything
-is published in between.
+"""Tests of trip privacy: the agent must publish nothing near the start and the end of a trip, and
+everything in between.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def states(time: IntArray, vehicle: int = 0) -> RecordBlock:
 
 
 def list_passed_times(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
-    """Return the times [s] of those states that are published of a trip of `seconds` at SPEED with
-    one state per second; the filter `ends` removes the others.
+    """Return the times [s] of the states that the filter `ends` publishes. The simulated trip lasts
+    `seconds` at SPEED, with one state per second.
     """
     out = []
     steps = round(1.0 / 0.1 * block_s)

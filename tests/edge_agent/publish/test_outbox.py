@@ -1,6 +1,6 @@
-"""Tests of the outbox, the agent's store of unacknowledged messages: consecutive numbers, storage
-on disk first, settlement (removal after an answer) by ranges, retries at growing intervals, a size
-limit, and use by one agent only.
+"""Tests of the outbox, the agent's store of unacknowledged messages. They cover consecutive
+numbers, storage on disk first, settlement (removal after an answer) by ranges, retries at growing
+intervals, a size limit, and use by one agent only.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def draft(
     records: int = 1,
     size: int = 0,
 ) -> Draft:
-    """Return a batch whose payload contains its sequence number (`seq`) and the lowest stored
-    number (`first_held`).
+    """Return a batch that has no number yet. Its payload will contain its sequence number (`seq`)
+    and the lowest stored number (`first_held`).
     """
     return Draft(
         vehicle,
@@ -149,8 +149,8 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store batches (messages) that no service answers, until the outbox (store of unacknowledged
-    messages) regards the route as silent. Return the simulated time [s] at that moment.
+    """Store messages that no service answers, until the outbox (store of unacknowledged messages)
+    regards the route as silent and only probes it. Return the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:
@@ -287,8 +287,8 @@ def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> Non
 
 
 def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -> None:
-    """A settled (acknowledged) batch whose deletion a crash undid must be sent again. The service
-    knows the batch and acknowledges it again.
+    """A crash may undo the deletion of a settled (acknowledged) batch. The outbox must then send
+    the batch again; the service knows it and acknowledges it again.
     """
     script = f"""
 import os, pathlib, signal
@@ -365,8 +365,8 @@ def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
 
 @pytest.mark.campaign
 def test_waiting_batches_take_little_memory_and_leave_none_behind(path: Path) -> None:
-    """Waiting batches must need little memory, and settled (acknowledged) ones none. One vehicle's
-    reports of a day are 170 000 batches.
+    """Batches that wait in the outbox must need little memory, and settled (acknowledged) ones
+    none. The reports of one vehicle in a day are 170 000 batches.
     """
     count = 20_000
     outbox = Outbox(path, boot=BOOT)

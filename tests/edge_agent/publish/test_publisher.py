@@ -1,5 +1,5 @@
-"""Tests of the publisher on real sessions: every record arrives once under its vehicle's name and
-is settled (removed from the outbox) by an answer.
+"""Tests of the publisher on real sessions. Every record must arrive once under its vehicle's name,
+and be settled (removed from the outbox) by an answer.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Make = Callable[..., Publisher]
 
 
 def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
-    """Return the records (observations and states) of a random simulated drive by three
-    vehicles.
+    """Return the observations and the states (two blocks of records) of a random simulated drive by
+    three vehicles.
     """
     _, observations, states = Watch.of(3).step(
         wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8)
@@ -41,8 +41,8 @@ def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
 
 
 def rows(batches: list[Batch], kind: Kind) -> int:
-    """Return the number of received records of a kind; a batch that arrives repeatedly
-    counts once.
+    """Return the number of records of a kind in the received batches. A batch that arrived
+    repeatedly counts once.
     """
     return sum(
         {(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values()
@@ -298,7 +298,9 @@ def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[t
 
 
 def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
-    """Return the first records of one vehicle, changed so that they lie in one cell."""
+    """Return the first `records` observations of one vehicle, changed so that they all lie in one
+    cell.
+    """
     observations, _ = drive(samples=3000)
     chosen = np.flatnonzero(observations.vehicle == 0)[:records]
     assert len(chosen) == records

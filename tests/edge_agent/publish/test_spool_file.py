@@ -1,5 +1,5 @@
-"""Tests of a damaged outbox file (the agent's store of unacknowledged messages): it is renamed and
-counted, its readable batches are recovered, and the agent continues.
+"""Tests of a damaged outbox file (the agent's store of unacknowledged messages). The agent must
+rename and count it, recover its readable batches, and continue.
 """
 
 from __future__ import annotations

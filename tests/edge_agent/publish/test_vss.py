@@ -1,5 +1,6 @@
-"""Tests of friction as VSS signals: values are percentages within the allowed range, unknown values
-are absent, and the command prints the values that it publishes over a session.
+"""Tests of friction as VSS signals (Vehicle Signal Specification). Values must be percentages
+within the allowed range, and unknown values must be absent. The command must print the values that
+it publishes over a session.
 """
 
 from __future__ import annotations

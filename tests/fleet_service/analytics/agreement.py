@@ -1,5 +1,5 @@
-"""Comparison of the answers of two query engines: the same rows, floating-point numbers within the
-stated error.
+"""Comparison of the answers of two query engines. The answers must have the same rows, and
+floating-point numbers that agree within RELATIVE and ABSOLUTE.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """Return a description of the first difference between the answers of two query engines (DuckDB
-    and Spark) to a question (predefined query), or None if they agree.
+    """Compare two answers to the same question (predefined query), one from DuckDB and one from
+    Spark. Return a description of their first difference, or None if they agree.
     """
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return (
@@ -65,8 +65,8 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
 
 
 def roads_along(cells: IntArray) -> pa.Table:
-    """Return a road network with links of forty cells along every row of cells, and one link that
-    no vehicle visited, as a table with the columns that `fleet-service roads` writes.
+    """Return a road network as a table with the columns that `fleet-service roads` writes. Each row
+    of the given cells becomes links of forty cells; one more link lies where no vehicle drove.
     """
     x, y = grid.deinterleave(cells)
     found = []

@@ -46,8 +46,8 @@ def fill(root: Path, world: SyntheticFleet) -> None:
 
 
 def rebuilt_map(out: Path) -> pa.Table:
-    """Read the map that was rebuilt zone by zone (in squares of zoom 7); return it as one table,
-    with rows in the order of a complete map.
+    """Return the map that was rebuilt zone by zone (in squares of zoom 7), as one table with its
+    rows in the order of a complete map.
     """
     parts = [
         pq.read_table(path, partitioning=None)
@@ -58,8 +58,9 @@ def rebuilt_map(out: Path) -> pa.Table:
 
 
 def difference(ours: pa.Table, theirs: pa.Table) -> float:
-    """Return the largest difference between numbers of two maps, or infinity if their cells or
-    their nulls differ.
+    """Return the largest difference between the numbers of the same cell in two maps. Return
+    infinity if the maps have different cells, kinds of evidence or times, or null values in
+    different places.
     """
     if not all(
         ours[name].equals(theirs[name])
@@ -76,7 +77,9 @@ def difference(ours: pa.Table, theirs: pa.Table) -> float:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return the content of every file below a folder, by relative path."""
+    """Return the content of every file below a folder as a dictionary, by the file's path relative
+    to the folder.
+    """
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")

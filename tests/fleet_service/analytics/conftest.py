@@ -37,8 +37,8 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return the row numbers (n,) of those cells and heading sectors in a `Fusion` (beliefs about
-    all cells) that a vehicle visited.
+    """Return row numbers (n,) of a `Fusion` (beliefs about all cells). The rows are those of pairs
+    of cell and heading sector that a vehicle visited.
     """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 
@@ -63,8 +63,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def rows(archive: Path) -> pd.DataFrame:
-    """Return all rows of the archive. `time` is in whole seconds, and `value` is True if mu was
-    measured (at least 0.6 of mu was used).
+    """Return all observations of the archive. Column `time` is in whole seconds. Column `value` is
+    True if the vehicle measured the friction mu, that is, used at least 0.6 of it.
     """
     frame = (
         pa.concat_tables(reading.read_tables(archive, Kind.OBSERVATION))

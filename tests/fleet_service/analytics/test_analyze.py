@@ -97,8 +97,8 @@ def test_roads_name_the_roads_of_an_answer(
 
 
 def test_trend_compares_months_in_the_same_cells() -> None:
-    """The trend must show that one cell becomes 0.2 more slippery. Another cell has reports of only
-    one month and must not count.
+    """The answer to the question `trend` must show that one cell became 0.2 more slippery from one
+    month to the next. A second cell has reports of only one month and must not count.
     """
     rows = [
         ("2026-01-10", 1, "a", 0.8),

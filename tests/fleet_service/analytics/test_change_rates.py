@@ -25,8 +25,9 @@ PI = 0.3  # share of slippery roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
-    """Return counts of simulated pairs of readings of a road that changes at the rate `rate` [1/s]:
-    an array (bins of elapsed time, 4) with the columns that `fit` takes.
+    """Return statistics of simulated pairs of readings of one road's state, slippery or not. The
+    road changes at the rate `rate` [1/s]. Row: bin of the time between the two readings. Columns
+    (4,): number of pairs, pairs that differ, slippery readings, sum of times [s].
     """
     apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
     first = rng.random(count) < PI
@@ -62,8 +63,8 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 @pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
-    """The interval must contain the true rate RATE in most trials, although the rates of single
-    days differ widely, so that pairs of the same day are not independent.
+    """The 90 % interval of the rate must contain the true rate RATE in most trials. The rates of
+    single days differ widely, so that pairs of the same day are not independent.
     """
     held = 0
     trials = 20
@@ -102,7 +103,7 @@ def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.Da
 
 def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
     """The synthetic roads freeze at four o'clock and thaw at eight. The answer must contain changes
-    and their rate for the morning, and neither for the afternoon.
+    and their rate for the hours 6 to 12, and neither for the hours 12 to 18.
     """
     for options in ({}, {"stations": stations}):
         found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])

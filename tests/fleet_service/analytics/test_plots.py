@@ -1,5 +1,5 @@
-"""Tests that plots of answers show the parts needed by a reader: roads, days, times, names, and the
-contracted level as a line.
+"""Tests that plots of answers show everything a reader needs: roads, days, times, names, and a line
+at the contracted friction.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that a map rebuilt zone by zone (in squares of zoom 7) equals a replay of the whole
-archive, and that its roll-ups (hourly statistics) equal the stored ones.
+"""Tests that a map rebuilt zone by zone (in squares of zoom 7) equals the map from a replay of the
+whole archive. The rebuild's roll-ups (hourly statistics) must equal those in the archive.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of jumps of the system clock: honest vehicles are not refused because of a jump, before and
-after a restart.
+"""Tests of jumps of the system clock: the service must not refuse honest vehicles because of a
+jump, neither before nor after a restart of the service.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests that an acknowledged report is stored on disk and in the bucket. It must survive the loss
-of the disk, a bucket that does not answer, and the end of the service between the two writes.
+"""Tests that an acknowledged report is stored on disk and in the bucket (object store). The report
+must survive three faults: the disk is lost, the bucket does not answer, or the service ends after
+the first of the two writes.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ def take(engine: Engine, sent: list[Batch]) -> None:
 
 
 def read_image(engine: Engine) -> dict[str, pa.Table]:
-    """Return the whole state of an engine (service without network) that a service restores after a
-    restart: map, trust in vehicles, known batches and alerts.
+    """Return the engine's state that a service restores after a restart: map, trust in vehicles,
+    known batches and alerts. The engine is a service without network.
     """
     return dict(engine._image().tables)
 
@@ -170,8 +171,8 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
 def service(
     router: ZenohSettings, folder: Path, bucket: BucketServer
 ) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Yield a service process with a bucket copy that is ready, and the address of its health page.
-    The process is ended after the `with` block.
+    """Yield a ready service process that copies its archive to a bucket (object store), and the
+    address of its health page. End the process after the `with` block.
     """
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
@@ -205,8 +206,8 @@ def health(address: str) -> str:
 
 
 def drive(fleet: Fleet, sent: list[Batch]) -> bool:
-    """Send those of the batches `sent` again that are not acknowledged yet, as a vehicle's outbox
-    (store of unacknowledged messages) does. Return True if all batches are acknowledged.
+    """Send those batches of the list `sent` again that the service has not acknowledged yet, as a
+    vehicle's outbox (store of unacknowledged messages) does. Return True if all are acknowledged.
     """
     for one in fleet.list_unsettled(sent)[:20]:
         fleet.publish(one)

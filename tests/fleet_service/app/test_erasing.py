@@ -46,8 +46,8 @@ MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 
 def sent_by(vehicle: str, seq: int) -> Batch:
-    """Return a batch with two visits (passes through cells): one where all vehicles drive, and one
-    where only the vehicle that the test erases drives.
+    """Return a vehicle's batch with two visits (passes through cells). All vehicles of the test
+    visit the first cell. Only the vehicle that the test erases visits the second.
     """
     now = time.time_ns() - SECOND
     latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])
@@ -61,7 +61,9 @@ def pseudonyms_of(root: Path) -> list[str]:
 
 
 def count_shown(session: zenoh.Session) -> dict[int, int]:
-    """Query the map, and return the number of observations of each cell."""
+    """Query the map over the session, and return the number of observations of each cell, by cell
+    number.
+    """
     found: dict[int, int] = {}
     for reply in session.get(keys.map_key(TILE)):
         if reply.ok is not None:
@@ -147,8 +149,8 @@ def fill_engine(root: Path, *names: str) -> Engine:
 
 
 def answer_requests(engine: Engine, root: Path) -> None:
-    """Carry out the waiting requests to erase a vehicle in a background thread, while this thread
-    plays the service's worker (the thread that processes messages).
+    """Carry out the pending requests to erase a vehicle in a background thread. Meanwhile the
+    calling thread acts as the service's worker, which processes messages.
     """
     thread = threading.Thread(
         target=erasing.handle_requests, args=(engine, ServiceConfig(), root, threading.Event())

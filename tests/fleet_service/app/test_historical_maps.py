@@ -137,7 +137,7 @@ def test_the_answer_of_the_other_process_is_that_of_this_one(
 
 @pytest.fixture
 def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
-    """Return a list to which each process that the service starts is appended."""
+    """Return a list. During the test, every process that the service starts is appended to it."""
     found: list[subprocess.Popen[bytes]] = []
 
     real = subprocess.Popen

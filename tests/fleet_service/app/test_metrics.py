@@ -1,5 +1,5 @@
-"""Tests of the metrics of a running service: they count accepted, refused (by reason) and waiting
-messages, and health reports each problem.
+"""Tests of the metrics of a running service. The metrics must count accepted, refused (by reason)
+and waiting messages, and the health page must report each problem.
 """
 
 from __future__ import annotations

@@ -58,9 +58,9 @@ class Fleet:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", self._record_alert)
 
     def await_services(self, *regions: int) -> Fleet:
-        """Wait until, for each region number in `regions` (default: REGION), a fleet service
-        receives the observations, vehicle states and map queries that this object sends. Return
-        this object.
+        """Wait until a fleet service listens in each region of `regions` (region numbers, default
+        REGION). It must receive observations, vehicle states and map queries of this client. Return
+        this client.
         """
         for region in regions or (REGION,):
             for name in (
@@ -119,8 +119,8 @@ def fleet(service: Running, session: zenoh.Session) -> Fleet:
 def ask(
     session: zenoh.Session, parameters: str = "", where: str = "**"
 ) -> list[tuple[str, str, bytes]]:
-    """Return key, encoding and payload of every reply to a map query. An error reply fails the
-    test.
+    """Query the map, and return (key, encoding, payload) of every reply. The test fails on an error
+    reply.
     """
     replies = list(
         session.get(f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else ""))
@@ -234,8 +234,8 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def seconds() -> Iterator[int]:
-    """Return an iterator of times [ns], one second apart, for successive reports of vehicles. The
-    last time is not in the future.
+    """Return an iterator of times [ns] for successive reports of vehicles. The times are one second
+    apart, begin 30 s ago, and end before the present.
     """
     return iter(range(now() - 30 * SECOND, now(), SECOND))
 
@@ -262,7 +262,9 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
-    """Query the active alerts as a client that starts late does, and return them."""
+    """Query the service for all active alerts, as a client does that connects after they were
+    raised. Return the alerts.
+    """
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]

@@ -1,5 +1,5 @@
-"""Tests of the times at which a service writes segments (files of new rows): rows wait no longer
-than the configured period, and on a slow disk the service pauses between writes.
+"""Tests of the times at which a service writes segments (files of new rows). A row must wait at
+most the configured period. On a slow disk the service must pause between writes.
 """
 
 from __future__ import annotations

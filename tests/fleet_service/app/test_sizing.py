@@ -1,4 +1,6 @@
-"""Tests of the sizing calculator: estimates grow as the costs do, and an error names bad input."""
+"""Tests of the sizing calculator, which estimates a service's needs. The estimates must grow with
+the number of vehicles and other inputs, and an error must name a bad input.
+"""
 
 from __future__ import annotations
 

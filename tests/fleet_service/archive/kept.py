@@ -60,15 +60,15 @@ COLUMNS: Final = (
 
 
 def now_of(turn: int) -> int:
-    """Return the time [ns] at which the service receives the messages of a round (step of the
-    simulated drive).
+    """Return the time [ns] at which the service receives the messages of the round number `turn`. A
+    round is one step of the simulated drive.
     """
     return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
 
 
 def make_observations(turn: int, vehicle: int) -> Batch:
-    """Return the observations that a vehicle sends in a round (step of the simulated drive): ice in
-    every second cell, and only lower bounds from every third vehicle.
+    """Return the observations that a vehicle sends in round `turn` (step of the simulated drive).
+    Every second cell is icy; every third vehicle reports only lower bounds of friction.
     """
     rng = np.random.default_rng([turn, vehicle])
     latitude, longitude = PLACES[vehicle % 2]
@@ -92,8 +92,8 @@ def make_observations(turn: int, vehicle: int) -> Batch:
 
 
 def make_state(turn: int, vehicle: int) -> Batch:
-    """Return the state (position and motion) that a vehicle sends in a round (step of the simulated
-    drive).
+    """Return the state (position and motion) that a vehicle sends in round `turn` (step of the
+    simulated drive).
     """
     latitude, longitude = PLACES[vehicle % 2]
     values = {
@@ -110,7 +110,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
 
 
 def messages(turn: int) -> Iterator[Message]:
-    """Yield all messages that the vehicles send in one round (step of the simulated drive)."""
+    """Yield all messages that the vehicles send in round `turn` (step of the simulated drive)."""
     for vehicle in range(VEHICLES):
         for one, key in (
             (make_observations(turn, vehicle), keys.observation_key),
@@ -143,8 +143,8 @@ def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
 
 
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
-    """Return the map at a time: for every cell its columns and its belief, sorted by cell and
-    heading sector.
+    """Return the map at the time `at`: for every cell its columns and its belief (probabilities of
+    friction), sorted by cell and heading sector.
     """
     fusion = engine.state.fusion
     slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))

@@ -1,5 +1,5 @@
-"""Common tools that read an archive. Each is a function that returns the number of rows, the mean
-of mu, the number of rows with a likelihood, and the zones (map squares of zoom 7).
+"""Common tools that read an archive. Each function returns four results of one tool: the number of
+rows, the mean of mu, the number of rows with a likelihood, and the zones (map squares of zoom 7).
 
 A tool that is not installed is left out. Spark has a separate test, because it needs Java and
 twenty seconds.
@@ -16,8 +16,8 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """Result of a tool that has read the observations of an archive: counts, mean of mu, and zones
-    (map squares of zoom 7).
+    """Results of one tool that has read the observations of an archive: number of rows, mean of mu,
+    rows with a likelihood, and zones (map squares of zoom 7).
     """
 
     rows: int

@@ -19,7 +19,8 @@ PLACES = ((57.7, 11.97), (48.1, 11.6))  # places in two zones
 
 def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
     """Return `count` rows of observations or states within twenty minutes around midnight, in cells
-    of two zones (map squares of zoom 7). Among the rows of one seed, (vehicle, seq, row) is unique.
+    of two zones (map squares of zoom 7). No two rows of a call have the same vehicle, seq (number
+    of the batch) and row.
     """
     rng = np.random.default_rng(seed)
     place = np.array(PLACES)[rng.integers(0, 2, count)] + rng.normal(0.0, 1e-4, (count, 2))
@@ -65,8 +66,8 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 
 
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return the sorted identities of all rows in an archive: boot (start of the agent) and seq
-    (number of the batch).
+    """Return one pair (boot, seq) for every row of an archive, sorted. `boot` is the start of the
+    agent, and `seq` is the number of the batch.
     """
     return sorted(
         (row["boot"], row["seq"])

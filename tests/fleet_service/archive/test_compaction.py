@@ -41,8 +41,8 @@ class DiedError(BaseException):
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
-    """Return the identities (boot, seq) of the rows that are visible to a foreign program, which
-    reads only the compacted (sorted) files.
+    """Return one pair (boot, seq) for every row that a foreign program finds. Such a program reads
+    only the compacted (sorted) files. `boot` is the start of the agent, `seq` the batch number.
     """
     paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
     found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]
@@ -104,8 +104,8 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
 
 
 def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
-    """Return a list in which all following operations that change the disk are recorded. Before
-    operation number `die_at`, an exception simulates the death of the process.
+    """Record all later disk operations of the service in a list, and return the list. Operation
+    number `die_at` raises an exception instead, which simulates the death of the process.
     """
     seen: list[str] = []
 

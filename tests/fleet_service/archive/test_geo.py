@@ -38,8 +38,8 @@ def a_map(cells: int = 300) -> pa.Table:
 
 
 def failures(path: Path) -> list[str]:
-    """Return the names of those tests of the GeoParquet validator that a file fails. Assert that
-    the validator applied all required tests.
+    """Return the names of the tests of the GeoParquet validator that a file fails. Assert that the
+    validator applied all required tests.
     """
     report = geoparquet_validator.check(str(path))
     passed = [outcome["id"] for outcome in report["outcomes"] if outcome["status"] == "pass"]

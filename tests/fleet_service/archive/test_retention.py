@@ -1,5 +1,5 @@
-"""Tests of the removal of old raw rows, of keys and of one vehicle's rows: the removed data does
-not come back, and all other data remains.
+"""Tests of three removals: of old raw rows, of old pseudonym keys, and of one vehicle's rows.
+Removed data must not come back, and all other data must remain.
 """
 
 from __future__ import annotations
@@ -163,8 +163,8 @@ ERASED = "time: the data of this month or vehicle were erased; delete the batch"
 
 
 def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """Ingest a batch, write a segment (file of new rows), and return the kinds of acknowledgement
-    that the batch received.
+    """Let the engine process the batch `sent`, and write a segment (file of new rows). Return the
+    kinds of acknowledgement that the batch received.
     """
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [
@@ -182,9 +182,9 @@ def rows_kept(root: Path) -> int:
 
 
 def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """A batch of an erased month must be refused, also after restarts. The archive no longer has
-    the batch, but a vehicle's outbox (store of unacknowledged messages) may still send it if its
-    acknowledgement was lost.
+    """A batch of a month whose data are erased must be refused, also after restarts. The archive
+    cannot recognise such a batch any more. A vehicle's outbox (store of unacknowledged messages)
+    may send it again if the acknowledgement was lost.
     """
     old = batch("car-001", 1, NOON, [0.8])
     away = batch("car-002", 1, NOON - DAY, [0.8])
@@ -211,8 +211,9 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
 
 
 def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
-    """Erased rows of a vehicle must be refused, also after restarts. A vehicle's outbox (store of
-    unacknowledged messages) restored from a backup may send rows that were acknowledged long ago.
+    """Reports of an erased vehicle must be refused, also after restarts. A vehicle's outbox (store
+    of unacknowledged messages), restored from a backup, may send reports that were acknowledged
+    long ago.
     """
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)

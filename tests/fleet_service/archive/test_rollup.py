@@ -1,5 +1,5 @@
-"""Tests that roll-ups (hourly statistics per cell) equal a direct sum over the rows, however the
-rows are divided into files.
+"""Tests that roll-ups (hourly statistics per cell) equal sums over all rows, however the rows are
+divided into files.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ JOIN: dict[str, Callable[..., Any]] = {
 
 
 def merge_parts(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
-    """Return the statistics of each (cell, heading sector, hour), merged from all files (parts) of
-    the hourly statistics (roll-up).
+    """Return the hourly statistics (roll-up) by (cell, heading sector, hour). The statistics are
+    merged from all files that contain a part of them.
     """
     out: dict[tuple[int, int, int], dict[str, Any]] = {}
     for path in (root / rollup.TABLE).rglob("*.parquet"):

@@ -53,11 +53,11 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """Assert that a map equals the stored one. Rounding errors of single precision, and of another
-    machine's logarithm, are allowed.
+    """Assert that the map `found`, computed now, equals the stored map `made`. Rounding errors of
+    single precision, and of another machine's logarithm, are allowed.
 
-    The stored beliefs were computed with the present rules. A commit that changes the results of
-    these rules must store them again and give the reason.
+    The stored beliefs (probabilities of friction) come from the present fusion rules. A commit that
+    changes the results of these rules must store them again and give the reason.
     """
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
@@ -144,8 +144,8 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
 def rewrite_file(
     path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
 ) -> None:
-    """Rewrite an archive file as a file of another format version: `change` is applied to its
-    table, and `said` replaces entries of its footer.
+    """Rewrite an archive file in place as a file of another format version: `change` is applied to
+    its table, and `said` replaces the entries of its footer.
     """
     found = read_content(path)
     assert found is not None

@@ -1,5 +1,6 @@
-"""Tests of slippery road sections as DATEX II: publications are valid, a changed section gets a new
-version, and an ended alert ends its section. The absence of a service ends no section.
+"""Tests of slippery road sections as DATEX II (a traffic data standard). Publications must be
+valid, a changed section must get a new version, and an ended alert must end its section. If no
+service answers, no section may end.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ EVERYONE = {*ROUTERS, SERVICE, READER, WEATHER, *VEHICLES}
 
 
 def at(folder: Path, days: float = 0.0, **terms: float) -> Registry:
-    """Return the certificate registry of a folder as it would be opened `days` days later."""
+    """Return the certificate registry of a folder, opened as if `days` days had passed."""
     return Registry(folder, Terms(**terms), NOW + timedelta(days=days))
 
 

@@ -1,5 +1,6 @@
-"""Tests of the belief about one cell: it stays a probability distribution, with time it returns to
-the prior, and a single vote (effect of one visit) changes each probability by a limited factor.
+"""Tests of the belief about one cell (probabilities of friction). It must stay a probability
+distribution and return to the prior with time. A single vote (effect of one visit) may change each
+probability only by a limited factor.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of lower bounds: the lower end of a cell's friction interval exceeds the largest grip used
-by at most the error of that report, for any order and number of reports.
+"""Tests of lower bounds. The lower end of a cell's friction interval may exceed the largest grip
+that any vehicle used, but at most by the error of this report. The order and number of the reports
+must not matter.
 """
 
 from __future__ import annotations

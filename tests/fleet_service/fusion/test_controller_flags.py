@@ -1,5 +1,6 @@
-"""Tests of slip-controller flags: they support an alert but change no belief, and count only if the
-vehicle's earlier flags agreed with friction values of other vehicles.
+"""Tests of the flags by which vehicles report that their slip controller acted. A flag may support
+an alert, but changes no friction belief. It counts only if the vehicle's earlier flags agreed with
+friction values of other vehicles.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
     """Return a fusion (beliefs about all cells) after 30 minutes in which vehicles visited dry
     cells.
 
-    The vehicle FLAGGED brakes gently every second time, with its flag on if `claims_on_dry`. In its
-    other visits it reports friction values, so that it becomes trusted.
+    The vehicle FLAGGED brakes gently in every second visit; with `claims_on_dry`, its slip
+    controller's flag is then on. In its other visits it reports friction values, so that the fusion
+    learns to trust it.
     """
     fusion = Fusion(120.0)
     for minute in range(30):
@@ -42,9 +44,9 @@ def make_acquainted(claims_on_dry: bool) -> Fusion:
 
 
 def ice_with(fusion: Fusion, *, flag: bool) -> bool:
-    """Return True if two visits (passages of a cell) raise an alert: one vehicle reports the
-    friction of ice, and the vehicle FLAGGED uses little grip, with the flag of its slip controller
-    as given by `flag`.
+    """Let two vehicles visit a cell, and return True if their reports raise an alert. One vehicle
+    reports the friction of ice. The vehicle FLAGGED uses little grip, and `flag` is the flag of its
+    slip controller.
     """
     who = np.array([3, FLAGGED])
     likelihood = np.concatenate([value(np.array([ICY]), 0.02), at_least(np.array([0.1]))])

@@ -15,9 +15,9 @@ LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)
 
 
 def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, Updated]]]:
-    """Process a live report, and after it a backlog of one hour, in the given order and divided
-    into `parts` parts. Return the `Fusion` (beliefs about all cells), and for each part of the
-    backlog the row numbers of its observations and the outcome of their update.
+    """Process a live report, and after it a backlog (old reports) of one hour, in the order `order`
+    and divided into `parts` parts. Return the `Fusion` (beliefs about all cells). Return also, for
+    each part, the row numbers of its observations and the outcome of their update.
     """
     fusion = Fusion(120.0)
     fusion.update(LIVE)

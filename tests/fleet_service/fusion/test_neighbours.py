@@ -33,8 +33,8 @@ UNTESTED = at_least([0.3])  # lower bound from one gentle driver
 
 
 def east(steps: int, north: int = 0) -> int:
-    """Return the number of the cell that lies `steps` cells east and `north` cells north of
-    CELL.
+    """Return the number of the cell that lies `steps` cells to the east and `north` cells to the
+    north of the cell CELL.
     """
     return int(grid.interleave(np.array([X + steps]), np.array([Y - north]))[0])
 

@@ -1,4 +1,6 @@
-"""Test of the normal distribution by comparison with a library's, far into both tails."""
+"""Test that the package's normal distribution function and its logarithm equal those of SciPy, far
+into both tails.
+"""
 
 from __future__ import annotations
 

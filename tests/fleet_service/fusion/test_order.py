@@ -40,8 +40,8 @@ def drive(seed: int, n: int, duration_s: float) -> Observations:
 
 
 def delay_arrivals(o: Observations, most_s: float, seed: int) -> IntArray:
-    """Return an order of arrival (indices of the observations) in which each is at most `most_s`
-    [s] late.
+    """Return a random order of arrival (indices of the observations `o`) in which each observation
+    arrives at most `most_s` [s] late.
     """
     return np.argsort(
         o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64)
@@ -57,8 +57,8 @@ def fold_in(
 
 
 def difference(a: Fusion, b: Fusion) -> float:
-    """Return the largest difference between two `Fusion` objects in any probability of any cell's
-    belief.
+    """Return the largest difference between the beliefs of two `Fusion` objects, over all cells and
+    probabilities.
     """
     assert a.size == b.size
     there = b.slots_of(a.cell[: a.size], a.sector[: a.size])

@@ -1,5 +1,5 @@
-"""Tests of the values that reports state: they are described as they were received, before the
-service corrects them.
+"""Tests of the description of reported friction values: it contains the values that vehicles sent,
+without the corrections that the service makes before it uses them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of errors that all vehicles in one cell have in common: reports of more vehicles must not
-average them out, but reports from different manoeuvres must.
+"""Tests of errors that all vehicles in one cell have in common. Many reports from the same
+manoeuvre must not make such an error look smaller. Reports from different manoeuvres must.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
-    """Return the width [1] of a cell's 90 % interval of friction after thirty vehicles have
-    reported the friction `mu`, using the grip `used` in the given manoeuvres.
+    """Return the width [1] of a cell's 90 % interval of friction after thirty reports. Each reports
+    the friction `mu` from a vehicle that used the grip `used`; `manoeuvres` are the kinds of
+    manoeuvre.
     """
     fusion = Fusion(120.0)
     n = len(manoeuvres)

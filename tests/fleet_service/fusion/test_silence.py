@@ -1,5 +1,5 @@
-"""Tests of visits (passages of a cell) without a friction value: they weaken a belief of ice, but
-never show grip.
+"""Tests of visits (passages of a cell) in which a vehicle measured no friction. They weaken a
+belief of ice, but never prove grip.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
 
 
 def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
-    """Return a fusion (beliefs about friction) after visits (passages) of one cell. First, vehicles
-    report the friction values `noticed`, a minute apart; then QUIET other vehicles pass and use a
-    grip of 0.05, which is too little to measure friction.
+    """Return a fusion (beliefs about friction) after visits (passages) of one cell, a minute apart.
+    First, vehicles report the friction values `noticed`. Then QUIET other vehicles use a grip of
+    0.05, which is too little to measure friction; `limited` is the flag of their slip controller.
     """
     fusion = Fusion(120.0)
     n = len(noticed)

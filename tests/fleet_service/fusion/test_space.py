@@ -1,5 +1,5 @@
-"""Tests that the report of a visit (passage of a cell) with an uncertain position is divided among
-cells and never counted twice.
+"""Tests of visits (passages of a cell) with an uncertain position: the report is divided among the
+cells that the vehicle may have visited, and counts only once in all.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def information(p: FloatArray) -> float:
 
 
 def read_beliefs(fusion: Fusion) -> FloatArray:
-    """Return the beliefs (cells, 32) of all cells from their own reports, without neighbours."""
+    """Return the belief (32 probabilities of friction) of each cell, from reports of this cell
+    alone, without its neighbours.
+    """
     kept = fusion.live.belief[: fusion.size].astype(float)
     return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 

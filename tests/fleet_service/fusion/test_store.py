@@ -1,5 +1,5 @@
-"""Tests of the memory of a fusion (beliefs about all cells): hash tables of any length find every
-stored key, and unused rows are freed.
+"""Tests of the memory of a fusion (beliefs about all cells). Its hash tables must find every stored
+key, whatever their length, and rows that are no longer used must become free.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
 
 
 def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
-    """A fusion (beliefs about all cells) that dropped the memory of unused cells must give the same
-    results for later observations as one that did not drop them.
+    """A fusion (beliefs about all cells) may drop cells that are unused and back at the prior. It
+    must then compute the same results from later observations as a fusion that dropped none.
     """
     fusion = Fusion(LATENESS_S)
     whole = Fusion(LATENESS_S)
@@ -110,9 +110,9 @@ def test_old_cells_back_at_the_prior_are_dropped_without_other_effect() -> None:
 
 
 def count_pairs_after(evidence: FloatArray, hours: float) -> tuple[int, int]:
-    """Return the number of remembered pairs (vehicle and cell) `hours` after the only visit of a
-    vehicle, while another vehicle drives elsewhere; and the number of vehicles counted in the cell
-    when the first vehicle has returned.
+    """Let vehicle 1 visit a cell once, while vehicle 2 drives elsewhere. Return the number of pairs
+    (vehicle and cell) remembered for the cell after `hours`. Return also the number of vehicles
+    counted in the cell after a second visit of vehicle 1.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations([0.0], [1], evidence, CELL))
@@ -140,10 +140,10 @@ def test_bounds_are_remembered_for_an_hour_and_values_for_three(
 
 
 def repeat_after_settling(evidence: FloatArray, *, forgets: bool) -> Fusion:
-    """Return a fusion (beliefs about all cells) in which 300 vehicles passed a cell and one of
-    them, number 0, repeats its report 40 minutes later. If `forgets`, all settled pairs (compact
-    records of a vehicle's earlier reports in a cell) are deleted before vehicle 0 repeats its
-    report.
+    """Return a fusion (beliefs about all cells) after 300 vehicles passed a cell and vehicle 0
+    repeated its report 40 minutes later. A settled pair is a compact record of one vehicle's
+    earlier reports in a cell. If `forgets`, all settled pairs are deleted before vehicle 0 repeats
+    its report.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations(0.1 * np.arange(300), np.arange(300), evidence.repeat(300, 0), CELL))
@@ -173,8 +173,8 @@ def test_a_vehicle_with_a_settled_pair_stays_one_witness(evidence: FloatArray) -
 @settings(max_examples=10)
 @given(st.integers(0, 10**6), st.integers(1, 400))
 def test_settling_has_no_effect_on_any_cell_in_any_order(seed: int, parts: int) -> None:
-    """Pairs (vehicle and cell) settle, that is, move into a compact table, after each batch in one
-    fusion and never in the other. All cells must be the same in both.
+    """A pair (vehicle and cell) settles when it moves into a compact table. In one fusion pairs
+    settle after each batch, in the other never. All cells must have the same belief in both.
     """
     o = drive(seed, 1500, 3000.0)
     straight = Fusion(LATENESS_S)

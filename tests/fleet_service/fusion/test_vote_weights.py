@@ -1,5 +1,5 @@
-"""Tests of two kinds of parameters that the service learns about its vehicles: the weight of each
-vehicle, and how much a reported friction falls if the vehicle used little of the grip.
+"""Tests of two properties of vehicles that the service learns: the weight of each vehicle's
+reports, and the amount by which a friction value is too low if the vehicle used little of the grip.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ VEHICLES = 30
 def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
-    """Return a fusion (beliefs about all cells) that has received forty minutes of reports about
-    ten cells, from a fleet whose vehicles have constant relative errors of standard deviation
-    `gain_std`. Each reported friction value is too low by `slope` times the unused part of μ.
-    `gain_in_use` is True if the error also affects the used grip.
+    """Return a fusion (beliefs about all cells) after forty minutes of reports about ten cells.
+    Each vehicle has a constant relative error, of standard deviation `gain_std` over the fleet.
+    Each reported friction value is too low by `slope` times the unused part of μ. If `gain_in_use`,
+    the reported used grip has the same relative error.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
@@ -63,17 +63,17 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """A gain error (relative error) that changes a vehicle's friction values and its used grip
-    alike must not be learned as a slope, the error of a value per unit of unused grip. In a
-    comparison between vehicles it looks like a slope cov(value, use)/var(use) ≥ 0.3; in a
-    comparison of one vehicle's visits it cancels.
+    """A gain error is a relative error that changes a vehicle's friction values and its used grip
+    alike. It must not be learned as a slope, which is the error of a value per unit of unused grip.
+    Between vehicles it looks like a slope cov(value, use)/var(use) ≥ 0.3. Between visits of one
+    vehicle it cancels.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 
 
 def road_after(slope: float, used: float) -> FloatArray:
-    """Return the belief (32 probabilities of μ) about a new cell after three reported values of 0.5
-    from vehicles that used a grip of `used`, in a fleet whose values are too low by `slope` per
+    """Return the belief (32 probabilities of μ) about a new cell after three vehicles reported a
+    friction of 0.5 and a used grip of `used`. The values of this fleet are too low by `slope` per
     unit of unused μ.
     """
     fusion = make_acquainted(slope)
@@ -102,9 +102,9 @@ def test_shape_is_the_slope_and_a_doubt() -> None:
 
 
 def test_doubt_of_an_alarm_ends_once_the_shape_is_known() -> None:
-    """Before the service raises an alert, it assumes a larger error for values measured with little
-    grip use. This extra error must become small once the service has learned the errors of its
-    fleet.
+    """Before the service raises an alert, it assumes an additional error for values that vehicles
+    measured with little grip. The additional error must become small once the service has learned
+    the errors of its fleet.
     """
     unknown = shared.UNKNOWN_SHAPE
     assert unknown.alarm == pytest.approx(0.5, abs=0.01)
@@ -142,9 +142,9 @@ def test_gentle_value_a_little_below_grip_may_be_a_soft_tyre(used: float, witnes
 
 
 def count_witnesses(mu: float, used: float, tail: float) -> int:
-    """Process one vehicle's friction value `mu`, measured with the grip `used`. Return the number
-    of vehicles (0 or 1) whose report then supports an alert of ice. `tail` is the log-likelihood
-    [nat] that the report gives to dry road.
+    """Process one vehicle's friction value `mu`, measured while it used the grip `used`; `tail` is
+    the log-likelihood [nat] that its report gives to a dry road. Return 1 if the report may support
+    an ice alert, otherwise 0.
     """
     fusion = Fusion(120.0)
     tailed = np.maximum(value([mu], 0.03), np.where(mugrid.CENTRES > 0.5, tail, -12.0))

@@ -1,6 +1,6 @@
-"""Tests of the influence of votes (effects of single visits) on the belief about a cell: many
-vehicles count more than many visits of one, a changed road is believed after few visits, and a
-vehicle that always disagrees loses its vote.
+"""Tests of votes (effects of single visits) on the belief about a cell. Visits of many vehicles
+must count more than as many of one vehicle, and a changed road must be believed after few visits. A
+vehicle that always disagrees with others must lose its influence.
 """
 
 from __future__ import annotations

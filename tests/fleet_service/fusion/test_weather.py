@@ -31,12 +31,10 @@ STEADY = (15.0, np.nan, 0.0)
 
 
 def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGION) -> w.Reports:
-    """Return weather reports.
+    """Return a table of weather reports.
 
-    Args:
-        rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation
-            [mm/h])).
-        region: region of the reports.
+    Args: rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation
+    [mm/h])) of each report. region: number of the region of the reports.
     """
     air, road, water = np.array([row[1] for row in rows]).T
     time = np.array([START + int(row[0] * HOUR) for row in rows])
@@ -51,8 +49,9 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
 
 
 def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
-    """Return two road times [h] (times weighted by the weather) between two times [h after START]:
-    that of the friction's drift, and that of its sudden change.
+    """Return two road times [h] between `begin` and `end` [h after START]. A road time is elapsed
+    time weighted by the weather: the first weights the slow drift of friction, the second its
+    sudden change.
     """
     drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0

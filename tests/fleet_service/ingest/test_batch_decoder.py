@@ -29,8 +29,8 @@ _FLOAT = st.floats(width=32)
 @st.composite
 # protobuf messages have no types.
 def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
-    """Return a random message of a `kind` (observations or states): records with some of the
-    columns and arbitrary values.
+    """Return a random message of the given kind, observations or states. Its records have some of
+    the columns, with arbitrary values.
     """
     rows = draw(st.integers(1, 4))
     message = MESSAGES[kind](

@@ -1,5 +1,5 @@
-"""Tests of the limits of one valid car: it counts as one vehicle and cannot fill a service,
-whatever it sends.
+"""Tests of limits for one car with a valid certificate. Whatever the car sends, it must count as
+one vehicle and must not fill the service's memory or disk.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def engine(tmp_path: Path) -> Iterator[Engine]:
 
 
 def months(now: int) -> tuple[int, int]:
-    """Return two times [ns] around the beginning of the month of `now`: one second before it, and
-    two seconds after it.
+    """Return two times [ns]: one second before the beginning of the month of `now`, and two seconds
+    after this beginning.
     """
     first = datetime.fromtimestamp(now / SECOND, UTC).replace(
         day=1, hour=0, minute=0, second=0, microsecond=0
@@ -109,9 +109,9 @@ def test_batches_with_unhashed_starts_are_recognised_again(
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
-    """One car must not raise an alert with batches that reach back into the last month. The
-    pseudonym of a batch belongs to the month of its first record, so these batches would count as
-    those of a second vehicle.
+    """One car must not raise an alert alone by sending batches that begin in the last month. A
+    vehicle has another pseudonym in each month, and the first record of a batch decides the month.
+    Such batches would therefore count as those of a second vehicle.
     """
     now = time.time_ns()
     for seq in range(1, 40):
@@ -186,7 +186,9 @@ def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
 
 
 def everywhere(seq: int, count: int, now: int) -> Batch:
-    """Return a batch that reports `count` new adjacent cells, one after the other at 12 m/s."""
+    """Return a batch in which a car reports `count` new adjacent cells, one after the other, at a
+    speed of 12 m/s.
+    """
     at = np.arange(count) + seq * count
     latitude = 57.60 + 2e-4 * (at // 400)
     longitude = 11.75 + 2e-4 * (at % 400)

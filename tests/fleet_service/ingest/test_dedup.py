@@ -1,5 +1,5 @@
-"""Tests of the removal of duplicate batches: admitted batches equal those found with a plain set,
-and the number of remembered batches is bounded.
+"""Tests of the removal of repeated batches. The admitted batches must equal those that a plain set
+admits, and the number of remembered batches must stay bounded.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the check for impossible positions: a vehicle's path is followed over rows, batches,
-boots (starts of its agent) and regions, in any order of arrival.
+"""Tests of the check for impossible positions. The check follows the path of a vehicle over rows,
+batches, boots (starts of its agent) and regions, whatever the order of arrival.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ CAR = 7
 def find(
     known: VehiclePaths, seconds: Iterable[float], east_m: Iterable[float], vehicle: int = CAR
 ) -> list[bool]:
-    """Return, for each report of a vehicle on the equator, True if its position is implausible.
+    """Return, for each position that a vehicle on the equator reports, True if the check finds it
+    implausible.
 
-    Args:
-        known: paths of the vehicles so far.
-        seconds: times after START [s].
-        east_m: positions [m].
-        vehicle: the vehicle's number.
+    Args: known: paths of the vehicles so far, which the check extends. seconds: times of the
+    reports, after START [s]. east_m: positions along the equator [m]. vehicle: the vehicle's
+    number.
     """
     time = START + (np.array(list(seconds)) * SECOND).astype(np.int64)
     east = np.array(list(east_m), float) * METRE

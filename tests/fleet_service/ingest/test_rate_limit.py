@@ -1,5 +1,6 @@
-"""Tests of rate limits: a vehicle may send a burst and then its rate, a sender with too much
-traffic takes nothing from others, and invented names fill no memory.
+"""Tests of rate limits. A vehicle may send a burst, and after it only messages at its permitted
+rate. A sender with too much traffic must take nothing from others, and invented vehicle names must
+not fill memory.
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ def test_a_wrong_weather_file_is_refused_with_row_and_column(
 
 
 def drive(engine: Engine, begin: int, seq: int) -> None:
-    """Let the engine (service without network) process one observation of each of three vehicles at
-    the time `begin` [ns].
+    """Let the engine (service without network) process one observation of each of three vehicles.
+    `begin` is the time [ns] of the first, `seq` the number of each batch.
     """
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])

@@ -1,5 +1,5 @@
-"""Tests of the ageing of a dry road's belief: the lower end falls with time, and faster near
-freezing.
+"""Tests of the ageing of the belief that a road is dry: the lower end of its friction interval
+falls with time, and faster in rain and near freezing.
 """
 
 from __future__ import annotations

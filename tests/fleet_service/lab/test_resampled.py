@@ -1,5 +1,6 @@
-"""Tests of errors resampled from drives: all reports of a town's vehicle come from one vehicle of
-the drives, are from a similar road, and are scaled to the friction of the town.
+"""Tests of simulated reports whose errors are taken from recorded drives. All reports of a town's
+vehicle must use errors of one recorded vehicle, from roads of similar friction, scaled to the
+friction of the town.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ MINUTES = 6
 
 
 def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
-    """Return made-up visits (passages of cells) on roads with friction `mu`. They alternately use
-    little grip, and enough to measure μ; vehicle k then reports `low[k]` times the true friction.
+    """Return made-up visits (passages of cells) on roads with friction `mu`, by the vehicles
+    `vehicle`. Vehicle k reports `low[k]` times the true friction. Every second visit uses enough
+    grip to measure friction; the others use little.
     """
     excited = np.arange(len(mu)) % 2 == 1
     reading = mu * low[vehicle]

@@ -15,7 +15,7 @@ from schemas.numeric import FloatArray
 
 
 def town_that_freezes(minute: float) -> town.Town:
-    """Return a dry town whose first road turns to ice at the time `minute`."""
+    """Return a dry town in which the first road turns to ice after `minute` minutes."""
     mu: FloatArray = np.full((value.MINUTES + 1, town.CELLS), 0.8)
     mu[int(minute) :, : town.LENGTH] = 0.15
     changed = np.full(town.CELLS, np.inf)

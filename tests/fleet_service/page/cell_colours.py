@@ -1,4 +1,6 @@
-"""Colour of a cell as the live page must draw it: a second implementation, for tests."""
+"""Colours in which the live page must draw cells. They are computed a second time here, so that
+tests can compare them with the page.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,8 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def colour_of(mu: float, lower: float, upper: float, p_slippery: float = 0.0) -> str:
-    """Return the colour of a cell with a measured mu, its 5 % and 95 % quantiles, and its
-    probability of being slippery.
+    """Return the colour of a cell with a measured friction `mu`, the 5 % and 95 % quantiles `lower`
+    and `upper` of its friction, and its probability of being slippery.
     """
     width = round(upper - lower, 6)  # the grid of the records has steps of .005
     if upper < SLIPPERY_MU or width < NARROW:

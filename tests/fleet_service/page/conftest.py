@@ -22,7 +22,7 @@ from tests.waiting import until
 
 @dataclass
 class RunningPage:
-    """Running page with its address, its service and its archive folder."""
+    """Running page: its address, the service behind it, and the folder of the service's archive."""
 
     address: str
     service: Running | None
@@ -57,7 +57,7 @@ def bare(router: ZenohSettings) -> Iterator[str]:
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """Yield a page with a service that stores the map (a snapshot) each second."""
+    """Yield a page, with a service that stores a snapshot of the map each second."""
     archive = tmp_path / "archive"
     with (
         running(router, archive, snapshot_s=1.0) as service,
@@ -71,8 +71,8 @@ Drive = Callable[..., None]
 
 @pytest.fixture
 def drive(session: zenoh.Session, page: RunningPage) -> Drive:
-    """Return a function that lets the cars drive over named parts of the crossing; the function
-    returns when the service has acknowledged their reports.
+    """Return a function that lets the test's cars drive over named parts of the street crossing.
+    The function returns when the service has acknowledged the cars' reports.
     """
     seq = 1
 

@@ -27,15 +27,17 @@ def contrast(first: str, second: str, sight: str) -> float:
 
 
 def read_colours(theme: str) -> dict[str, str]:
-    """Return the named colours of a theme in the page's style sheet."""
+    """Return the colours that the page's style sheet defines for a theme, light or dark, by
+    name.
+    """
     style = (STATIC / "style.css").read_text()
     block = style[style.index(theme) :].partition("}")[0]
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block))
 
 
 def text_contrasts(theme: str, sight: str) -> dict[str, float]:
-    """Return the contrast of each pair of text and background colour in a theme, for a kind of
-    colour vision.
+    """Return the contrast of each pair of text and background colour in a theme (light or dark), as
+    seen with a kind of colour vision.
     """
     named = read_colours(theme)
     return {
@@ -44,8 +46,8 @@ def text_contrasts(theme: str, sight: str) -> dict[str, float]:
 
 
 def class_contrasts(theme: str, sight: str) -> dict[str, float]:
-    """Return the contrast of fill or edge of each map class against the background, in a theme and
-    for a kind of colour vision.
+    """Return the contrast of each map class against the background in a theme (light or dark), as
+    seen with a kind of colour vision. A class counts with its fill or its edge.
     """
     named = read_colours(theme)
     edged = re.search(r"EDGED = \[([\d, ]+)\]", (STATIC / "ribbons.js").read_text())

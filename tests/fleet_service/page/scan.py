@@ -14,8 +14,8 @@ MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with 
 
 
 def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
-    """Return the page's serious accessibility findings, one text per finding, or None if axe-core
-    is not installed.
+    """Return one text per serious accessibility finding on the page's panels `tabs`. Return None if
+    axe-core is not installed.
     """
     source = file_of("axe-core", "axe.min.js")
     if source is None:

@@ -1,5 +1,5 @@
-"""Crossing of two streets on which six cars drive: dry, snow, ice, and a part where no car uses
-much grip.
+"""Crossing of two streets on which six cars drive. The parts of the streets have dry road, snow,
+ice or wet road; in one part no car uses much grip.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def put(
     first_seq: int = 1,
     cars: Sequence[str] = CARS,
 ) -> int:
-    """Publish the observations of cars that drive over parts of the street, there and back, with
-    the last observation at `now` [ns]. Return the next free sequence number.
+    """Publish the observations of cars that drive over the named parts of the street, there and
+    back. The last observation is at `now` [ns]. Return the next free sequence number of each car.
     """
     place, heading, mu = _drive([PARTS[name] for name in parts])
     time = now - (len(place) - 1 - np.arange(len(place))) * VISIT_NS
@@ -109,8 +109,8 @@ def _report(
 
 
 def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return cell, heading sector and mu of each visit as arrays (n,), in the order of a drive:
-    east, west, north, south.
+    """Return cell, heading sector and friction (NaN if not measured) of each visit as arrays (n,).
+    The visits are in the order of one drive over the parts: east, west, north, south.
     """
     found = []
     for heading in (EAST, WEST, NORTH, SOUTH):

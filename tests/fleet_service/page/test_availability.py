@@ -1,5 +1,5 @@
-"""Tests that one client cannot use up the page's past maps, event streams or connections, so that
-others would get none.
+"""Tests that one client cannot use up the page's past maps, event streams or connections. Other
+clients must still get answers.
 """
 
 from __future__ import annotations
@@ -98,14 +98,14 @@ def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
 
 
 class Transport:
-    """Simulated connection that records that it was closed."""
+    """Simulated network connection that records whether the server closed it."""
 
     def __init__(self, host: str) -> None:
         self._host = host
         self.is_aborted = False
 
     def abort(self) -> None:
-        """Record that the simulated connection was closed."""
+        """Record that the server closed the simulated connection."""
         self.is_aborted = True
 
     def get_extra_info(self, name: str) -> Any:  # noqa: ANN401 as in asyncio
@@ -116,8 +116,8 @@ class Transport:
 def accept(
     open_ones: set[Any], timers: list[Any], host: str = ""
 ) -> tuple[BoundedProtocol, Transport]:
-    """Return a new simulated connection of a browser to the server, and its transport, which
-    records whether it was closed.
+    """Let the server accept a simulated connection from a browser at address `host`. Return the
+    server's protocol object and the connection, which records whether the server closed it.
     """
     protocol = BoundedProtocol.__new__(BoundedProtocol)
 
@@ -196,8 +196,8 @@ def test_connection_that_does_not_end_its_second_request_is_closed(
 
 
 def test_web_server_sends_each_part_of_an_answer_at_once() -> None:
-    """TCP_NODELAY must be set. Otherwise each part of an answer waits up to 40 ms for the
-    acknowledgement of the previous part.
+    """The page's server must set the socket option TCP_NODELAY. Otherwise each part of an answer
+    waits up to 40 ms for the acknowledgement of the previous part.
     """
 
     async def accept() -> int:

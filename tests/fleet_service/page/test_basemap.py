@@ -1,5 +1,5 @@
-"""Tests of a base map from a file of the operator: its tiles are served and shown below the map
-without a network, and other files are refused.
+"""Tests of a base map from a file of the operator. The page must show the file's tiles below the
+map without using a network, and must refuse files of another form.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
 
 
 def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str = "png") -> Path:
-    """Write an MBTiles file with tiles by (zoom, column, row from the north), and
-    return its path.
+    """Write an MBTiles file (map tiles in one database) that contains the given tiles, by (zoom,
+    column, row counted from the north). Return its path.
     """
     with closing(sqlite3.connect(path)) as table, table:
         table.execute("create table metadata (name text, value text)")
@@ -57,7 +57,9 @@ def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str 
 
 
 def town(path: Path) -> Path:
-    """Write an MBTiles file with one blue tile that contains the point AT, and return its path."""
+    """Write an MBTiles file (map tiles in one database) with one blue tile that contains the point
+    AT. Return its path.
+    """
     x, y = (int(v) for v in grid.deinterleave(grid.parent(int(grid.cell_of(*AT)), ZOOM)))
     return tiles_in(path, {(ZOOM, x, y): png(BLUE)})
 
@@ -126,9 +128,9 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
-    """The file's picture must be visible below the map, enlarged beyond the file's deepest zoom
-    level. At low zoom levels the page must request no tile of the file, and at no level anything
-    from another host.
+    """The picture in the operator's map file must be visible below the map. It must be enlarged
+    beyond the file's deepest zoom level. At low zoom levels the page must request no tile of the
+    file, and it must never request anything from another host.
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,

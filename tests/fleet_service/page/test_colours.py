@@ -32,7 +32,8 @@ DARK = (*DARK_FOUR, *DARK_TWO, DARK_LITTLE, DARK_GROUND)
 
 def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
     """Return six colours in order of danger: ice, snow, rather slippery, wet, rather not slippery,
-    good grip. The two "rather" classes come from `two`, the others from `four`.
+    good grip. The colours of the two "rather" classes are those of `two`; the other colours are
+    those of `four`.
     """
     return (four[0], four[1], two[0], four[2], two[1], four[3])
 
@@ -54,8 +55,9 @@ def test_any_two_classes_and_the_ground_are_told_apart(
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_lightness_is_the_order_of_danger(sight: str) -> None:
-    """The most dangerous class must be the darkest on a light background and the lightest on a dark
-    background. The order must also hold when printed in grey.
+    """The colour of the most dangerous class must be the darkest on a light background and the
+    lightest on a dark background. The order of lightness must be the order of danger, so that it
+    remains in a grey print.
     """
     for ladder, sign in ((in_danger(FOUR, TWO), 1.0), (in_danger(DARK_FOUR, DARK_TWO), -1.0)):
         light = [sign * float(to_lab(colour, sight)[0]) for colour in ladder]

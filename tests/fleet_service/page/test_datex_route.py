@@ -1,5 +1,5 @@
-"""Tests of the DATEX II publication of the page: it is valid, follows the alerts, and continues
-after a restart of the page.
+"""Tests of the page's DATEX II publication (road traffic data in XML). It must be valid, follow the
+alerts, and continue after a restart of the page.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ CELLS = [(TILE << 14) + k for k in range(3)]
 
 @contextmanager
 def made_up_service(session: zenoh.Session) -> Iterator[None]:
-    """Act as a service for the `with` block: answer map queries for one cell of the region, so that
-    the page regards the region as served.
+    """Act as a fleet service during the `with` block. Map queries for one cell of the region get an
+    answer, so that the page regards the region as served.
     """
     fusion = Fusion(120.0)
     fusion.update(observations([0.0], [1], value([0.3])))
@@ -107,8 +107,8 @@ def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
 
 
 def pull(address: str) -> Callable[[], bytes]:
-    """Return a function that fetches the page's DATEX II publication, or returns NOTHING while the
-    page has none yet.
+    """Return a function that fetches the DATEX II publication of the page at `address`. The
+    function returns NOTHING while the page has no publication yet.
     """
 
     def fetch_publication() -> bytes:

@@ -44,7 +44,9 @@ def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 g
 
 
 def fetch_document(page: RunningPage, path: str) -> dict[str, Any]:
-    """Return a JSON document of the page; fail if it does not exist."""
+    """Return the JSON document at the path `path` of the page; fail if the page does not have
+    it.
+    """
     status, headers, body = ask(page.address, path)
     assert status == 200, body
     assert "json" in headers["content-type"]
@@ -60,8 +62,8 @@ def drive_parts(page: RunningPage, drive: Drive, *parts: str) -> None:
 
 
 def count(page: RunningPage) -> int:
-    """Return the number of features (map cells with heading) that the page offers, or 0 while it
-    knows no service.
+    """Return the number of features (map cells with heading) that the page offers. Return 0 while
+    the page knows no service.
     """
     status, _, body = ask(page.address, ITEMS)
     assert status in (200, 503), body

@@ -34,7 +34,7 @@ ICE_DRAWN: Final = f"document.body.dataset.kinds?.split(',')[0] == {street.count
 
 
 def look(seen: Opened, name: str) -> None:
-    """Store a screenshot of the page, so that a person can inspect it."""
+    """Store a screenshot of the page under the name `name`, so that a person can inspect it."""
     PICTURES.mkdir(exist_ok=True)
     seen.page.screenshot(path=PICTURES / f"{name}.png")
 
@@ -43,8 +43,8 @@ def look(seen: Opened, name: str) -> None:
 def open_map(
     page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False
 ) -> Iterator[Opened]:
-    """Yield the page when it is ready. At the end assert that it made no request to another host
-    and wrote nothing to the console.
+    """Open the page, and yield it when it is ready. At the end assert that the page requested
+    nothing from another host and wrote nothing to the browser's console.
     """
     with open_page(page.address + state, phone=phone) as seen:
         seen.page.wait_for_selector(READY, state="attached")
@@ -61,12 +61,14 @@ def data(seen: Opened, name: str) -> str:
 
 
 def kinds(seen: Opened) -> list[int]:
-    """Return the number of map records (cells) of each kind that the page has drawn."""
+    """Return the number of map cells that the page has drawn, for each kind of record."""
     return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
 
 
 def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
-    """Zoom the page's map in on a cell, until its heading sectors are drawn separately."""
+    """Zoom the page's map in on a cell, until the page draws the cell's heading sectors
+    separately.
+    """
     latitude, longitude = (float(v) for v in grid.centre(cell))
     seen.page.evaluate(
         "async ([x, y, z]) => { const { view } = gripmap.map;"
@@ -88,7 +90,7 @@ def cell_of(part: str, index: int = 1) -> int:
 
 def read(seen: Opened, sector: int) -> dict[str, str]:
     """Return the texts that the page's panel shows for one heading sector of the selected cell, by
-    name of the value.
+    the label of each text.
     """
     found: dict[str, str] = seen.page.evaluate(
         "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
@@ -324,8 +326,8 @@ def test_slider_shows_a_past_cell_and_two_moments_side_by_side(
 
 
 def list_snapshots(archive: Path) -> list[int]:
-    """Return the times [s since 1970] of those stored maps (snapshots) of the archive that the page
-    offers.
+    """Return the times [s since 1970] of the archive's stored maps (snapshots), which the page must
+    offer, in order.
     """
     return sorted(
         snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet")

@@ -1,6 +1,6 @@
-"""Tests of the map's drawing in a real browser: unknown parts stay visible in each square,
-neighbouring cells leave no gap, a route hides no cell, and the map is hatched before a service
-answers.
+"""Tests of the map's drawing in a real browser. Unknown parts must stay visible in each square,
+neighbouring cells must leave no gap, and a route must hide no cell. Before a service answers, the
+map must be hatched.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
 def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
     page: RunningPage, drive: Drive
 ) -> None:
-    """Cells whose values are estimated from neighbours must have a thin dashed frame, also in a
-    tile that has changed since it was first received.
+    """A cell whose values are estimated from its neighbours must have a thin dashed frame. The
+    frame must also appear if the page draws the cell's tile again after a change.
     """
     drive("dry")
     with open_map(page) as seen:

@@ -1,5 +1,6 @@
-"""Tests of the records in which the page receives map cells: their values equal the map's and never
-show more grip, and a larger square of the overview has the worst value of its cells.
+"""Tests of the records in which the page receives map cells. A record must have the map's values,
+rounded so that it never shows more grip. A square of the overview must have the values of its worst
+cell.
 """
 
 from __future__ import annotations

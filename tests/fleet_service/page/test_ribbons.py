@@ -1,5 +1,5 @@
-"""Tests of roads drawn as ribbons (coloured bands along the road) in a real browser: clicks, alerts
-and the overview agree with the drawing.
+"""Tests of roads drawn as ribbons (coloured bands along the road) in a real browser. Clicks, alerts
+and the overview must show the same values as the ribbons.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ _UNDER: Final = """kind => {
 
 
 def road(name: str, part: str, aside: int) -> Line:
-    """Return the line of a street, `aside` cells north of the cells that vehicles report."""
+    """Return a road line along the named part of the test street, `aside` cells north of the cells
+    that vehicles report.
+    """
     x, y = (v.astype(np.int64) for v in grid.deinterleave(street.cells(street.PARTS[part])))
     ends = grid.interleave(
         np.array([x.min() - 20, x.max() + 20], np.int64),
@@ -58,7 +60,9 @@ def road(name: str, part: str, aside: int) -> Line:
 
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
-    """Yield a page with a road map whose roads lie one cell north of the reported cells."""
+    """Yield a page with a road map. Each road of this map lies ASIDE cells north of the cells that
+    vehicles report.
+    """
     archive = tmp_path / "archive"
     roads = RoadMap([road(STREET, "ice", ASIDE)], [("Testby", 11.97, 57.7)])
     with (

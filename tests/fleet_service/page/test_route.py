@@ -1,5 +1,5 @@
-"""Tests of friction along a route: an unknown part stays unknown, and the speed follows from the
-lower end of the interval.
+"""Tests of friction along a route. A part without reports must stay unknown, and the safe speed
+must follow from the lower end of the friction interval.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from tests.fleet_service.page import street
 
 
 def make_ice_table() -> pa.Table:
-    """Return a map table with five cells of ice eastward, followed by cells for which only a lower
-    bound of friction is known.
+    """Return a map table with five cells of ice. The cells that follow to the east have only a
+    lower bound of friction.
     """
     ice = street.cells(street.PARTS["ice"])
     passed = street.cells(street.PARTS["passed"])
@@ -35,8 +35,8 @@ def make_ice_table() -> pa.Table:
 
 
 def ends(first: int, last: int) -> list[tuple[float, float]]:
-    """Return a route as two points (longitude, latitude) [deg]: the centres of the cells number
-    `first` and `last`, counted eastward from the middle of the test street.
+    """Return a route as two points (longitude, latitude) [deg]. They are the centres of the cells
+    number `first` and `last`, counted eastward from the middle of the test street.
     """
     x = street.MIDDLE[0] + np.array([first, last])
     latitude, longitude = grid.centre(grid.interleave(x, np.array([street.MIDDLE[1]] * 2)))

@@ -1,5 +1,5 @@
-"""Tests of the page's server: wrong requests are refused with the reason, a browser that connects
-gets the present state and then each change, and a slow browser is told to reload.
+"""Tests of the page's server. It must refuse wrong requests with the reason, and send a newly
+connected browser the present state and then each change. A slow browser must be told to reload.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
 
 
 def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body of the page's answer to a request."""
+    """Request `path` from the page at `address` with the given headers. Return status, headers and
+    body of the answer.
+    """
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
@@ -61,7 +63,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
 
 @contextmanager
 def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
-    """Yield an iterator over the events that an event stream of the page sends."""
+    """Open an event stream of the page at `address`, and yield an iterator over its events."""
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", path)
     answer = connection.getresponse()
@@ -204,8 +206,8 @@ def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSe
 
 
 def ask_briefly(address: str) -> int:
-    """Open an event stream of the page and close it immediately; return the HTTP status of the
-    answer.
+    """Open an event stream of the page at `address`, close it at once, and return the HTTP status
+    of the page's answer.
     """
     connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
     connection.request("GET", "/events")

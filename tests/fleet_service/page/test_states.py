@@ -40,7 +40,9 @@ _FIRST_PICTURE: Final = """document.addEventListener("DOMContentLoaded", () => n
 
 
 def keep_picture(seen: Opened, name: str) -> Path:
-    """Store a picture of the page in a state, and return its path."""
+    """Store a picture of the page under the name of the page's present state, and return the
+    picture's path.
+    """
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{name}.png"
     seen.page.screenshot(path=path)
@@ -48,8 +50,8 @@ def keep_picture(seen: Opened, name: str) -> Path:
 
 
 def card(seen: Opened, state: str) -> str:
-    """Wait until the page shows the card of a state (such as "no service"), and return its
-    words.
+    """Wait until the page shows the card (message box) of the named state, such as "no service".
+    Return the card's text.
     """
     waits(seen, f"document.getElementById('card').dataset.state === '{state}'")
     assert seen.page.locator("#card").is_visible()
@@ -57,7 +59,7 @@ def card(seen: Opened, state: str) -> str:
 
 
 def show_ice(seen: Opened, zoom: float = 17.2) -> None:
-    """Show the stretch with ice, and wait until it is drawn."""
+    """Show the part of the test street with ice, and wait until the page has drawn it."""
     seen.page.set_viewport_size(LAPTOP)
     near(seen, cell_of("ice"), zoom)
     waits(seen, ICE_DRAWN)
@@ -103,7 +105,7 @@ def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
 
 def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive) -> None:
     """A page opened by a link must paint the linked map before it creates its buttons. If the map's
-    cells take long to arrive, the buttons must not wait for them.
+    cells arrive late, the page must create the buttons without waiting for them.
     """
     drive("ice")
     with open_map(page) as seen:

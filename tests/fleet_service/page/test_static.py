@@ -1,5 +1,5 @@
-"""Tests of the page's static files: every text stands in one table, modules are short, all are
-joined into one script, and nothing is loaded from elsewhere.
+"""Tests of the page's static files. Every text must stand in one table, modules must be short and
+joined into one script, and the page must load nothing from another host.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
 
 
 def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
-    """In the joined modules an import must become the exported value, and a private name used in
-    two modules must become two variables.
+    """When the page's modules are joined, each import must become the exported value. A private
+    name that two modules use must become two variables.
     """
     modules = {
         "main": (

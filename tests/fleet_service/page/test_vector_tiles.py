@@ -1,5 +1,5 @@
-"""Tests of vector tiles: numbers of PMTiles tiles equal those of its own library, a written file is
-read back, and the page can draw the tiles.
+"""Tests of vector tiles. The numbers of PMTiles tiles must equal those of the PMTiles library, a
+written file must be read back unchanged, and the page must draw the tiles.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ TILES = {
 
 
 def write(path: Path, kind: int = 1) -> Path:
-    """Write a PMTiles file with leaf directories by the format's own library, and
-    return its path.
+    """Write a PMTiles file (map tiles in one file) with leaf directories, by the PMTiles library.
+    Return the file's path.
     """
     with path.open("wb") as file:
         writer = pmtiles_writer.Writer(file)
@@ -86,8 +86,8 @@ def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_tile_is_the_bytes_of_the_specification() -> None:
-    """The encoded point, line and polygon must have the bytes of the examples in section 4.3.5 of
-    the specification.
+    """A point, a line and a polygon must be encoded to the bytes of the examples in section 4.3.5
+    of the vector tile specification.
     """
     point = encode_tile({"p": [TileShape(POINT, [[(25, 17)]], {})]})
     assert bytes([9, 50, 34]) in point

@@ -1,5 +1,5 @@
-"""Tests of checkpoints (saved states of a service): a restart from a checkpoint gives the same
-state as a restart from all archived rows, and reads only rows written after the checkpoint.
+"""Tests of checkpoints (saved states of a service). A restart from a checkpoint must give the same
+state as a restart from all archived rows. It must read only the rows written after the checkpoint.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ def message(one: Batch) -> Message:
 
 
 def keep(engine: Engine, root: Path) -> Path:
-    """Write a checkpoint (saved state) as the service does: a background thread requests it, and
-    the worker thread makes it between two segments (files of new rows). Return its folder.
+    """Write a checkpoint (saved state) as the service does, and return its folder. A background
+    thread requests the checkpoint; the worker thread makes it between two segments (files of new
+    rows).
     """
     taken: list[checkpoints.Taken | None] = []
     stop = threading.Event()
@@ -77,7 +78,9 @@ def beliefs(engine: Engine, at: int) -> FloatArray:
 
 @pytest.fixture
 def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list that receives the number of rows read by each replay."""
+    """Return a list. Each restart during the test appends the number of archived rows that it reads
+    to restore the map.
+    """
     rows: list[int] = []
     in_order: Callable[..., Iterable[pa.Table]] = rebuild.in_order
 
@@ -122,8 +125,9 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
 
 
 def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
-    """Return arrays by name: the beliefs and columns from which a map is made, sorted by cell and
-    heading sector, the latest epoch (minute), and the time of the newest row.
+    """Return the state of an engine as arrays by name. They are the beliefs and columns from which
+    a map is made (sorted by cell and heading sector), the latest epoch (minute), and the time of
+    the newest row.
     """
     fusion = engine.state.fusion
     rows = engine.state.fusion.store.state.live
@@ -141,8 +145,9 @@ def read_state(engine: Engine) -> dict[str, NDArray[Any]]:
 def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
     tmp_path: Path, oldest_s: float
 ) -> None:
-    """A batch that is too old to be sent again must not affect the map after a restart, although a
-    compaction (sorting of rows) joined old and new rows in one file.
+    """A batch may be so old that no vehicle sends it again. After a restart, such a batch must not
+    affect the map a second time. In the test, compaction (sorting of rows) has joined old and new
+    rows in one file.
     """
     config = ServiceConfig(oldest_s=oldest_s)
     now = time.time_ns()
@@ -165,8 +170,8 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
-    """The state restored from a checkpoint (saved state), and the state restored from all archived
-    rows without it, must equal that of the running service. In the test, some reports before the
+    """The states restored with and without a checkpoint (saved state) must both equal the state of
+    the running service. Without it, the state comes from all archived rows. Some reports before the
     checkpoint are late and out of order.
     """
     rng = np.random.default_rng(3)
@@ -267,9 +272,9 @@ def _set() -> threading.Event:
 
 
 def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Path) -> None:
-    """A restart must replay all rows written after the checkpoint (the service's saved state),
-    although the clock was an hour ahead when the checkpoint was written and was corrected
-    afterwards.
+    """A restart must replay all rows written after the checkpoint (the service's saved state). This
+    must hold although the clock was an hour ahead when the checkpoint was written, and was
+    corrected later.
     """
     ahead = time.time_ns() + 3600 * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -1,5 +1,5 @@
-"""Tests of fencing: late uploads of a service that lost its lease (ownership of the archive)
-replace no object of its successor.
+"""Tests of fencing, the protection of an archive against a service that lost its lease (ownership).
+Its late uploads must replace no file of the service that took over.
 """
 
 from __future__ import annotations

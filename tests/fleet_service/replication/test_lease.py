@@ -1,5 +1,5 @@
-"""Tests of the lease (exclusive ownership of an archive): a service that ended, froze or was cut
-off is followed by another service, which has every acknowledged row exactly once.
+"""Tests of the lease (exclusive ownership of an archive). If a service ends, freezes or is cut off,
+another service must take over the archive, with every acknowledged row exactly once.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 
 
 def make_driver(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
-    """Return a function that sends unacknowledged batches again each second, as agents do, and
-    returns True when all batches are acknowledged.
+    """Return a function for repeated calls. Once a second it sends those batches of `sent` again
+    that no service has acknowledged. It returns True when all of them are acknowledged.
     """
     last = [0.0]
 
@@ -147,8 +147,8 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 
 
 class Machine:
-    """Folder of an archive with a service that runs in threads; a test can stop the service between
-    any two steps.
+    """Service that runs in threads on an archive folder. A test can stop it between any two
+    steps.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Machine:
         return self.holding.copy
 
     def freeze(self) -> None:
-        """Stop the service's renewals of its lease (ownership of the archive), as if its process
+        """Stop the service from renewing its lease (ownership of the archive), as if its process
         were frozen.
         """
         assert self.holding.lease is not None

@@ -1,5 +1,6 @@
-"""Tests of the lease object, which records in the bucket which service owns the archive: it states
-the lease time, other versions are read, and a damaged object delays but never ends a service.
+"""Tests of the lease object, which records in the bucket which service owns the archive. The object
+must state the lease time, and objects of other versions must be readable. A damaged object may
+delay a service but must never end it.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from schemas.errors import InputError
 
 
 class MemoryBucket:
-    """Simulated bucket (object store) in memory, with an operation that creates an object only if
-    there is none.
+    """Simulated bucket (object store) in memory. It can create an object only if no object has this
+    name.
     """
 
     def __init__(self) -> None:
@@ -44,8 +45,8 @@ def lease_on(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
-    """Let a standby (waiting service) take over the lease (ownership of an archive), and return its
-    `Lease`.
+    """Let the standby (waiting service) `name` take over the lease (ownership of the archive) in
+    the bucket. Return the `Lease` of this standby.
     """
     standby = Standby(
         may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
@@ -118,8 +119,8 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A renewal of the lease after a failed one must use another turn (serial number of renewals),
-    because the write that failed may still take effect later.
+    """Each renewal of the lease has its own turn (serial number). After a failed renewal the next
+    one must use another turn, because the failed write may still take effect later.
     """
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)

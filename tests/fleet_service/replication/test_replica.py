@@ -1,6 +1,6 @@
-"""Tests of the bucket replica (copy of an archive in an object store): it contains every
-acknowledged row, files deleted from the archive are deleted from it, and a service with an empty
-disk restores the archive from it.
+"""Tests of the bucket replica (copy of an archive in an object store). It must contain every
+acknowledged row, and must lose the files that are deleted from the archive. A service with an empty
+disk must be able to restore the archive from it.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ Make = Callable[[Path], BucketReplica]
 
 @pytest.fixture
 def make(bucket: BucketServer) -> Iterator[Make]:
-    """Yield a function that starts a copy of an archive in a bucket (object store). At the end of
-    the test all copies are closed.
+    """Yield a function that starts the copying of an archive folder to a bucket (object store). At
+    the end of the test all copying is stopped.
     """
     made: list[BucketReplica] = []
 
@@ -59,7 +59,7 @@ def there(bucket: BucketServer) -> dict[str, bytes]:
 
 def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) -> SegmentLog[int]:
     """Return a segment log (writer of new rows) that has written files of observations and states
-    to disk. With `copy`, it has also uploaded them to the bucket.
+    to the disk. With the bucket replica `copy`, it has also uploaded these files to the bucket.
     """
     log: SegmentLog[int] = SegmentLog(root, NAME, None if copy is None else copy.upload_segments)
     Pseudonyms(root / "keys").of("sim-001", 0)

@@ -1,5 +1,5 @@
-"""Tests of alerts: they begin when enough independent vehicles report ice, and end only when grip
-is certain or nobody confirms the ice.
+"""Tests of alerts. An alert must begin when enough independent vehicles report ice. It must end
+only when grip is certain or no vehicle confirms the ice any more.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
-    """Let `vehicles` vehicles report ice in a cell one after the other. Return the fusion (beliefs
-    about all cells), its alerts, and a list with one item per vehicle: True if its report raised an
-    alert.
+    """Let the vehicles with the given numbers report ice in a cell, one after the other. Return the
+    fusion (beliefs about all cells), its alerts, and one value per vehicle: True if its report
+    raised an alert.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
@@ -117,9 +117,9 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
 def report_in_turn(
     mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
 ) -> tuple[Fusion, list[bool]]:
-    """Let `vehicles` report the friction `mu` in a cell, and `wait` seconds later each of `others`
-    the friction `then`. Return the fusion (beliefs about all cells), and a list with one item for
-    each of `others`: True if the cell had an alert after its report.
+    """Let each of `vehicles` report the friction `mu` in a cell. After `wait` seconds, let each of
+    `others` report the friction `then` there. Return the fusion (beliefs about all cells), and one
+    value for each of `others`: True if the cell had an alert after its report.
     """
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)

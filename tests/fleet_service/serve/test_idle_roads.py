@@ -1,5 +1,5 @@
-"""Tests of the limit on idle roads: two vehicles alone can raise alerts only in a few places, but
-traffic or a third vehicle removes this limit.
+"""Tests of the limit on alerts on idle roads (roads without other traffic). Two vehicles alone can
+raise alerts only in a few places. Other traffic, or a third vehicle, removes this limit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def test_each_vehicle_supports_alerts_in_few_areas() -> None:
 
 
 def alerts_of(vehicles: int) -> int:
-    """Return the number of alerts when this many vehicles report ice in all cells."""
+    """Let `vehicles` vehicles report ice in each cell of CELLS, and return the number of alerts."""
     fusion = Fusion(120.0)
     alerts = Alerts(fusion, IdleRoads())
     raised = 0

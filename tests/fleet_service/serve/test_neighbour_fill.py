@@ -1,5 +1,6 @@
-"""Tests of values borrowed from neighbours: the influence falls with distance, the values are never
-more certain than those neighbours, and they are marked as borrowed.
+"""Tests of values that unvisited cells borrow from their neighbours. The influence of a neighbour
+must fall with its distance. A borrowed value must be marked as borrowed, and must never be more
+certain than the neighbours' own values.
 """
 
 from __future__ import annotations
@@ -21,12 +22,11 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """Return the beliefs about unvisited cells in a row of thirty cells, estimated ("borrowed")
-    from cells of this row in which three vehicles measured friction.
+    """Return estimated ("borrowed") beliefs about unvisited cells in a row of thirty cells. The
+    estimates come from cells of this row in which three vehicles measured friction.
 
-    Args:
-        visited: measured friction by index of the cell in the row.
-        route: the cells to fill; None for all cells of the tiles.
+    Args: visited: measured friction by index of the cell in the row. route: the cells to estimate;
+    None for all cells of the tiles.
     """
     fusion = Fusion(120.0)
     for place, mu in visited.items():
@@ -42,8 +42,8 @@ def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) ->
 
 
 def widths(cells: CellView) -> dict[int, float]:
-    """Return the width of the friction interval of each cell in a view (map cells with their
-    beliefs), by index of the cell in the row of thirty cells.
+    """Return the width of the friction interval of each cell in `cells`, by index of the cell in
+    the row of thirty cells.
     """
     lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
     return {

@@ -1,5 +1,5 @@
-"""Tests of the public view: only cells with enough vehicles are shown, with their safe
-deceleration.
+"""Tests of the public view of a map: it shows only cells that enough vehicles visited, and the safe
+deceleration on them.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ MORE = tuple(f"sim-01{k}" for k in range(5))
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Yield a function that opens an engine (service without network) which shows only cells with
-    at least `public` vehicles.
+    """Yield a function that opens an engine (service without network). The engine shows readers
+    only cells that at least `public` vehicles visited.
     """
     opened: list[Engine] = []
 
@@ -63,8 +63,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def hear(engine: Engine, *names: str, now: int | None = None) -> None:
-    """Let the engine (service without network) process one observation of each named vehicle, at
-    the time `now` [ns].
+    """Let the engine (service without network) process one observation of each vehicle in `names`,
+    at the time `now` [ns].
     """
     now = time.time_ns() if now is None else now
     sent = [
@@ -76,14 +76,14 @@ def hear(engine: Engine, *names: str, now: int | None = None) -> None:
 
 
 def later() -> int:
-    """Return a time [ns] in the near future by which observations made now are visible to
-    readers.
-    """
+    """Return a time [ns] at which readers will see the observations that are made now."""
     return time.time_ns() + PERIOD_NS
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
-    """Return the cells in the answer of the engine (service without network) to a map query."""
+    """Return the cells with which the engine (service without network) answers a map query with
+    these parameters, at the time `now`.
+    """
     tiles = engine.queries.answer(
         query.parse(parameters), lambda _: True, time.time_ns() if now is None else now
     )
@@ -121,8 +121,8 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
 
 
 def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
-    """If a vehicle passes a public cell (one that readers may see) once more, the times and counts
-    that readers see must not change; they are rounded for this purpose.
+    """Readers must not notice the single passage of a vehicle through a public cell (one that
+    readers may see). The published times and counts are rounded so that they stay the same.
     """
     engine = start(3)
     hear(engine, *(f"sim-{k:03}" for k in range(6)))
@@ -159,8 +159,8 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
     """A vehicle that passes alone at night must not be visible in answers, routes, stored maps
-    (snapshots) and tiles, although many vehicles passed by day: only vehicles of the last hours may
-    make a cell public.
+    (snapshots) and tiles. Only vehicles of the last hours may make a cell public. The many vehicles
+    of the day must not count.
     """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
@@ -207,8 +207,8 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
 
 @pytest.mark.parametrize("basis", ["checkpoint", "log"])
 def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
-    """After a restart, a lone vehicle must not become visible in a public cell (one that readers
-    may see), and must not be the vehicle that makes another cell public.
+    """After a restart of the service, a lone vehicle must not become visible in a public cell (one
+    that readers may see). It must also not be the vehicle that makes another cell public.
     """
     beside: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002],
@@ -238,8 +238,8 @@ def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, ba
 
 
 def taken_from(engine: Engine) -> checkpoints.Taken:
-    """Return a checkpoint (saved state) of the engine, the service without its network. This thread
-    plays the worker, which writes segments (files of new rows) meanwhile.
+    """Return a checkpoint (saved state) of an engine, which is a service without network. The
+    calling thread acts as the worker, which writes segments (files of new rows) meanwhile.
     """
     found: list[checkpoints.Taken | None] = []
     thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))
@@ -307,7 +307,9 @@ def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start
 
 
 def hear_ice(engine: Engine, now: int) -> list[wire.Alert]:
-    """Let four vehicles report ice in one cell, which raises an alert. Return the alerts."""
+    """Let four vehicles report ice in one cell to the engine, so that it raises an alert. Return
+    the engine's alerts.
+    """
     where: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002] * 3,
         "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)] * 3,

@@ -1,5 +1,5 @@
-"""Tests of privacy: a lone vehicle changes nothing that readers can see, except that it may make a
-cell look more slippery.
+"""Tests of privacy. Readers must not notice a lone vehicle in any value that they see, with one
+exception: it may make a cell look more slippery.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ class Map:
             self.fusion.update(o)
 
     def seen(self, second: float, cell: int = CELL) -> list[float]:
-        """Return lower end, upper end and P(slippery) of a cell as readers see them at the time
-        `second`, or an empty list if the cell is not public.
+        """Return three values of a cell as readers see them at the time `second`: lower end and
+        upper end of its friction (as bin numbers), and P(slippery). Return an empty list if the
+        cell is not public.
         """
         now = START + int(second * SECOND)
         slot = self.public.select(self.slots(cell), now)
@@ -53,7 +54,7 @@ class Map:
 @pytest.fixture
 def busy() -> Map:
     """Return a map with one public cell (a cell that readers see), which five vehicles visited
-    after it was published.
+    before it was published.
     """
     made = Map()
     made.visit(0.0, 1, 2, 3, 4, 5)

@@ -1,5 +1,5 @@
-"""Tests that failed answers carry an error, because a client would mistake a missing answer for a
-map without data.
+"""Tests that an answer which fails carries an error. A client would mistake a missing answer for an
+empty map.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ FAILURES = (
 
 
 def texts(session: zenoh.Session, selector: str) -> list[str]:
-    """Return all replies and errors to a query as texts, sorted because Zenoh does not
-    order them.
+    """Return all replies and errors to the query `selector` as texts. They are sorted, because
+    Zenoh does not order them.
     """
     return sorted(
         part.payload.to_string()
@@ -111,8 +111,8 @@ def nothing(
 def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
-    """A query for little data must be answered while a query for much data is still being answered.
-    Many tiles of one cell each must count as heavy too.
+    """The service must answer a query for little data while it still answers a query for much data.
+    A query for many tiles of one cell each must count as one for much data.
     """
     key = keys.map_key(TILE)
     counts = Counter[str]()
@@ -148,8 +148,8 @@ COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}
 
 
 class Half:
-    """Zenoh queryable (handler of queries) for tests of scheduling: it answers a query with two
-    tiles. A query of the most expensive kind gets further replies until the event `go` is set.
+    """Zenoh queryable (handler of queries) for tests of scheduling. It answers each query with two
+    tiles. A query with the highest cost gets further replies until the test sets the event `go`.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -173,16 +173,16 @@ class Half:
         yield TILE, b"last"
 
     def ask(self, kind: int) -> list[str]:
-        """Send a query of a kind and return the replies as texts. Zenoh passes on only the last
-        reply with the same key, so the list usually has one item.
+        """Send a query of the cost class `kind`, and return the replies as texts. Zenoh passes on
+        only the last reply with the same key, so the list usually has one item.
         """
         return texts(self.session, f"{self.key}?min_vehicles={kind}")
 
 
 @pytest.fixture
 def half(session: zenoh.Session) -> Iterator[Half]:
-    """Yield a Zenoh queryable (handler of queries) that answers with two tiles, when a client's
-    queries reach it.
+    """Yield a Zenoh queryable (handler of queries) that answers with two tiles. Queries of the
+    test's session already reach it.
     """
     made = Half(session)
     declared = session.declare_queryable(made.key, made.queryable, complete=True)
@@ -204,8 +204,8 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
 
 
 def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
-    """A client with many small queries must wait behind the heavy queries, but none of its queries
-    may be refused.
+    """A client sends more small queries than its share of the service allows. These queries may
+    wait behind heavy queries, but the service must not refuse any of them.
     """
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]

@@ -1,5 +1,5 @@
-"""Tests of the tile cache: a cached tile is served for at most a second, and never after an
-acknowledged report or an alert has changed it.
+"""Tests of the tile cache. The service may send a cached tile for at most a second. It must never
+send one that an acknowledged report or an alert has changed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ NOW = START + 60 * SECOND
 
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
-    """Add one observation of a cell to the map, and mark the cell as changed, as the service
-    does.
+    """Let a vehicle report one observation of a cell to the map, and mark the cell as changed, as
+    the service does.
     """
     state.mark_changed(
         state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots

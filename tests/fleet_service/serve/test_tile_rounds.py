@@ -1,6 +1,6 @@
-"""Tests of the rounds in which tiles are published: they begin at regular times, each changed tile
-is published in some round, and they never take more than a fixed share of a pass of the service's
-main loop.
+"""Tests of the rounds in which the service publishes tiles. Rounds begin at regular times, and each
+changed tile is published in some round. The publication takes at most a fixed share of each pass of
+the service's main loop.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ COST_S = SHARE_S / 2.0  # time to make a tile
 
 
 class Made:
-    """Simulated environment for tests of the publication rounds: tiles that change, a clock that
-    the test advances, and a list of the published tiles with their times.
+    """Simulated environment for tests of the publication rounds. It has a set of changed tiles, a
+    clock that the test advances, and a list of the published tiles with their times.
     """
 
     def __init__(self) -> None:

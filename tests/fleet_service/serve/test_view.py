@@ -1,5 +1,5 @@
-"""Test of a cell's basis (kind of evidence, such as measured or only a bound): a cell that is
-probably slippery is never shown as one with only a lower bound of friction.
+"""Test of a cell's basis (kind of evidence). The basis of a cell that is probably slippery must
+never be "only a lower bound of friction".
 """
 
 from __future__ import annotations

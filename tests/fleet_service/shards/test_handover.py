@@ -1,5 +1,5 @@
-"""Tests of the live hand-over of a region between services: the new service has the same map,
-alerts, trust and batches.
+"""Tests of the hand-over of a running service's region to another service. The new service must
+have the same map, alerts, trust in vehicles and known batches.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ EVERYWHERE = "*/*/*"
 
 
 class Machine:
-    """Service with the option --standby, run in threads of this process."""
+    """Service with the option `--standby` (it waits for another to end), run in threads of the
+    test's process.
+    """
 
     def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
         archive = {"path": str(root), **bucket.settings}

@@ -1,5 +1,5 @@
-"""Tests of the presence of regions: every client learns from liveliness tokens (signs of connected
-services) which regions are served. Three services run, and one of them stops.
+"""Tests of the presence of regions. Every client learns which regions are served from liveliness
+tokens (signs of connected services). Three services run, and one of them stops.
 """
 
 from __future__ import annotations
@@ -58,15 +58,15 @@ CARS = 3
 
 @pytest.fixture(autouse=True)
 def nobody(session: zenoh.Session) -> None:
-    """Wait until no service has a liveliness token (sign of a connected service), because the
-    router may learn late that the services of the previous test have ended.
+    """Wait until the router knows no service by its liveliness token (sign of a connected service).
+    The router may learn late that the services of the previous test have ended.
     """
     until(lambda: not presence.active_tokens(session))
 
 
 def visits(vehicle: str) -> list[Batch]:
-    """Return a batch for each place of the street, each by another car, because one car cannot be
-    at several places at once.
+    """Return one batch for each place of the street, with vehicle names that begin with `vehicle`.
+    Each batch is from another car, because one car cannot be at several places at once.
     """
     now = time.time_ns() - 2 * SECOND
     out = list[Batch]()
@@ -253,7 +253,7 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The service answers map queries, but clients do not see its liveliness token (sign of a
-    connected service). The client's first query gets no reply. The client must notice that a
+    connected service). The client's first query gets no reply. The client must then find that the
     service can answer, and query again.
     """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())

@@ -1,5 +1,5 @@
-"""Tests of the figures of the detection evaluation: on made-up drives each figure follows its
-definition, and one small town passes through the whole pipeline.
+"""Tests of the figures that evaluate the detection of ice. On made-up drives each figure must
+follow its definition. One small simulated town must pass through the whole evaluation.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ SAMPLES = 1200  # 2 s dry, 4 s of ice with a slide of 1 s, then 6 s dry
 
 
 def drive_saying(lower: float, upper: float) -> DetectionDrive:
-    """Return a simulated drive of one car over ice, with the output of a made-up estimator that
-    always reports the same friction interval.
+    """Return a simulated drive of one car over ice, with made-up estimates: the friction interval
+    is always `lower` to `upper`.
     """
     ones = np.ones((SAMPLES, 1), np.float32)
     mu = 0.9 * ones

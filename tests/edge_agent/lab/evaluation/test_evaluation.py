@@ -1,5 +1,5 @@
-"""Tests of the evaluation campaign: all figures and targets exist, scores are correct on small
-cases, and the report is made only from figures.
+"""Tests of the evaluation campaign. All figures and targets must exist, scores must be correct on
+small cases, and the report must be made from the measured figures alone.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ ASKED = {
 
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
-    """Return made-up estimates for a drive `like`: its true motion, and a constant friction
-    interval.
+    """Return made-up estimates for the drives `like`: their true motion, and everywhere the
+    friction `mu` with the interval from `lower` to `upper`.
     """
     output = np.zeros((*like.t.shape, ONE_FRICTION))
     truth = like.truth

@@ -1,5 +1,6 @@
-"""Tests of simulated sensor faults: the estimates stay finite, health flags report the fault, and
-the default estimator's friction interval keeps its coverage.
+"""Tests of simulated sensor faults. The estimates must stay finite, and health flags must report
+the fault. The friction interval of the default estimator must still contain the true friction as
+often as stated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests that plots have captions, and that an estimator has the same colour in all of them."""
+"""Tests that every plot has a caption, and that an estimator has the same colour in all plots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from schemas.runtime.palette import line_of
 
 @pytest.fixture(scope="module")
 def drives() -> dict[str, PlottedDrive]:
-    """Return the estimates of two estimators on a double lane change, by name."""
+    """Return a drive, a double lane change, with the estimates of each of two estimators, by
+    estimator name.
+    """
     batch = realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
     return {
         name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch))

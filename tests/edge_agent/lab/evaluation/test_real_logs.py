@@ -1,5 +1,5 @@
-"""Tests of the evaluation of recorded drives in a folder: the estimates are compared with the true
-values that were measured, and ice reported on a road with grip counts as false.
+"""Tests of the evaluation of recorded drives in a folder. The estimates are compared with the true
+values where these were measured. Ice that is reported on a road with grip must count as false.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def judge(
     used: float = 0.0,
 ) -> LogFigures:
     """Return the evaluation figures of a made-up log: ten seconds at 20 m/s, with a reported
-    friction interval from 0.4 to 0.8 (wider at the first sample). With `friction` NaN the true
-    friction is not measured.
+    friction interval from 0.4 to 0.8 (wider at the first sample). `friction` is the true friction
+    in the log, NaN if it was not measured.
     """
     t = np.arange(0.0, 10.0, 0.01)
     signals = np.full((len(t), len(CHANNELS)), np.nan)

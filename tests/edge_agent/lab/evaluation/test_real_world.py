@@ -1,5 +1,5 @@
-"""Tests of the figures for simulated drives with realistic sensor errors on hills: trivial
-estimators get the expected scores, and the drives' seeds are not used for tuning.
+"""Tests of the figures for simulated drives with realistic sensor errors on hills. Trivial
+estimators must get the expected scores, and the tuning must not use the seeds of these drives.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from schemas.thresholds import GRAVITY, SLIPPERY_MU, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Return the drives of six cars with realistic sensor errors, forty seconds in a town, and, for
-    each sample and car, the largest share of the available grip that any wheel used, (T, 6).
+    """Return simulated drives of six cars with realistic sensor errors, forty seconds in a town.
+    Return also, (T, 6), the largest share of the available grip that any wheel used, for each
+    sample and car.
     """
     return real_world.town(FIGURES, 6, 40.0)
 
@@ -149,9 +150,9 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """The oracle is an estimator that knows everything except the quantities which the vehicle file
-    and the data sheet leave open. Most of its speed error must come from the wheel radius in the
-    vehicle file, and its friction error must be a few hundredths.
+    """The oracle is an estimator that is given everything except the quantities which the vehicle
+    file and the data sheet leave open. Most of its speed error must come from the wheel radius in
+    the vehicle file. Its friction error must be a few hundredths.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

@@ -1,5 +1,5 @@
-"""Tests of the figures about the reliability of friction intervals and the consistency of filters:
-a known error in made-up estimates must be visible in them.
+"""Tests of the figures about the reliability of friction intervals and the consistency of filters.
+A known error in made-up estimates must be visible in these figures.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the comparison that shows the benefit of fuzzy inference and of the ant colony. It uses
-only simulated drives that are not used for tuning.
+"""Tests of the comparison that shows the benefit of fuzzy inference and of tuning by an ant colony.
+The comparison must use only simulated drives that the tuning does not use.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""Tests of simulated fleets: results do not depend on the number of vehicles or on the division
-into blocks of samples, cars stay on the road, and they use much friction where the scenario intends
+"""Tests of simulated fleets. Results must not depend on the number of vehicles or on the division
+into blocks of samples. Cars must stay on the road, and use much friction where the scenario intends
 it.
 """
 
@@ -164,8 +164,8 @@ def test_a_block_needs_at_least_one_sample() -> None:
 
 
 def test_warned_driver_slows_down_only_for_the_stretch() -> None:
-    """A warned driver must slow down for the slippery stretch, and only there. The same driver
-    drives from the same start with and without a warning.
+    """A warned driver must slow down for the slippery stretch, and only there. The test compares
+    drives of the same driver from the same start, with and without a warning.
     """
     speeds = []
     for warned in (False, True):

@@ -1,5 +1,5 @@
-"""Tests of manoeuvres: the simulated car completes each of them, uses as much friction as intended,
-and drives the same way each time.
+"""Tests of manoeuvres. The simulated car must complete each of them, use as much friction as
+intended, and drive the same way each time.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ def test_dugoff_curve_of_the_plant_is_that_of_the_filters(theta: float) -> None:
 
 
 def slip_per_force(vehicle: TrueVehicle, mu: float) -> float:
-    """Return the slip of a wheel during gentle acceleration, divided by its used share of the
-    friction `mu`.
+    """Return the slip of a wheel during gentle acceleration, divided by the friction coefficient
+    that this wheel uses.
     """
     log, file = simulate_manoeuvre(
         "throttle",

@@ -31,7 +31,7 @@ ROUNDING = 1e-9
 def some_instant(
     rng: np.random.Generator, mu: float = 0.6
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the arrays of a simulated vehicle in a violent manoeuvre drawn at random: state,
+    """Return the arrays of a simulated vehicle at a random instant of a violent manoeuvre: state,
     parameters, inputs, and forces of the wheels.
     """
     p = PRESETS["sedan"].row()
@@ -69,8 +69,8 @@ def rolling(
 def run(
     x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
 ) -> FloatArray:
-    """Simulate a vehicle for `seconds` with constant inputs, and return the output of its wheels
-    (columns of `Wheel`, 4).
+    """Simulate a vehicle for `seconds` from the state `x`, with parameters `p` and constant inputs
+    `u`. Return the last output of its wheels (columns of `Wheel`, 4).
     """
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
@@ -150,8 +150,8 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
 def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
-    """At walking pace the yaw rate must equal the rate given by the geometry of the wheel
-    directions, for every ratio of rear to front steering.
+    """At walking pace the yaw rate must be the one that follows from the directions of the wheels,
+    for every ratio of rear to front steering.
     """
     circles = []
     for rear in (0.0, share):

@@ -1,5 +1,5 @@
-"""Tests of roads and friction in the simulation: lanes join without gaps and never end, and the
-friction is right at every place and time.
+"""Tests of roads and friction in the simulation. Lanes must join without gaps and never end, and
+the friction must be right at every place and time.
 """
 
 from __future__ import annotations

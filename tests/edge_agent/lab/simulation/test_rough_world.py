@@ -56,8 +56,8 @@ def sine(slope: float) -> float:
 def still(
     slope: float, bank: float = 0.0, mu: float = 0.85
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the arrays of a simulated sedan that stands on a road with this slope and bank: state,
-    parameters, inputs, and forces of the wheels.
+    """Return the arrays of a simulated sedan that stands on a road with the given slope and bank:
+    state, parameters, inputs, and forces of the wheels.
     """
     p = PRESETS["sedan"].row()
     x = np.zeros(STATES)

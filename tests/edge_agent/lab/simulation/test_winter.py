@@ -1,6 +1,6 @@
-"""Tests of winter equipment and roads in the simulation: controllers (ABS and others) act on
-slippery road only, tyres build up side force over a distance, and a winter town has the intended
-surfaces.
+"""Tests of winter equipment and roads in the simulation. Controllers (ABS and others) must act on
+slippery road only. Tyres must build up side force over a distance, and a winter town must have the
+intended surfaces.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the ant colony as a search: it follows its equations, stays within its bounds, and finds
-better results than random search.
+"""Tests of the search by an ant colony. It must follow its equations, stay within its bounds, and
+find better results than random search.
 """
 
 from collections.abc import Callable
@@ -28,17 +28,17 @@ CHOICES = [np.linspace(0.0, 1.0, POSITIONS)] * VERTICES
 
 
 def bowl(seed: int) -> Objective:
-    """Return an objective whose vertices (tuned parameters) do not interact: it is the sum of one
-    parabola per vertex, each with its maximum at a random position (value of the parameter). The
-    maximum is 0.
+    """Return an objective for the search in which the vertices (tuned parameters) do not interact.
+    It is a sum of parabolas, one per vertex, each with its maximum at a random value of this
+    vertex. The maximum is 0.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
     return lambda vector: -float(np.sum((vector - top) ** 2))
 
 
 def decoy(seed: int) -> Objective:
-    """Return a deceptive objective: for every vertex (tuned parameter) the slope leads away from
-    the best position (value of the parameter). The maximum is VERTICES.
+    """Return a deceptive objective for the search. For every vertex (tuned parameter) the slope
+    leads away from the best value. The maximum is VERTICES.
     """
     top = np.random.default_rng(seed).integers(POSITIONS, size=VERTICES) / (POSITIONS - 1)
 
@@ -63,8 +63,8 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
-    """The colony must win at least 21 of 24 trials. If both searches were equally good, this would
-    have a probability of 1 in 7 000.
+    """The ant colony must win at least 21 of 24 trials against random search. If both searches were
+    equally good, this would have a probability of 1 in 7 000.
     """
     wins = 0
     for trial in range(TRIALS):

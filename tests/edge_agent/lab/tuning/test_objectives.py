@@ -1,5 +1,5 @@
-"""Tests of the tuning objective: it is a proper and finite score, its drives differ from the
-held-out drives, and the command works from end to end.
+"""Tests of the tuning objective. It must be a proper and finite score, its drives must differ from
+the held-out drives, and the command must work from end to end.
 """
 
 import argparse
@@ -105,9 +105,9 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
-    """The likelihood of the innovations (measurement minus prediction) must be lower with a
-    measurement noise of 4.5 R than with the right R, although fewer innovations exceed their
-    expected bound with 4.5 R.
+    """The likelihood of the innovations (measurement minus prediction) must be lower with the
+    measurement noise 4.5 R than with the right noise R. This must hold although fewer innovations
+    exceed their expected bound with 4.5 R.
     """
     usual, inflated = (
         scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5)

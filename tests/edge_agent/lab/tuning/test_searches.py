@@ -1,5 +1,5 @@
-"""Tests of the tuning searches over continuous parameters, and of their comparison, in which each
-search has the same number of trials.
+"""Tests of the tuning searches over continuous parameters, and of the comparison of these searches.
+In the comparison each search has the same number of trials.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from edge_agent.lab.tuning.sensitivity import ConstantChange
 
 @pytest.fixture(scope="module")
 def drives() -> list[sensitivity.JudgedDrives]:
-    """Simulate short drives for two seeds: in two towns, one of them in winter, and manoeuvres.
-    Return the drives.
+    """Simulate short drives for two seeds: manoeuvres, a town, and a town in winter. Return the
+    drives.
     """
     return sensitivity.simulate_drives([8001, 8002], cars=2, town_s=8.0, drive_s=2.0)
 

@@ -1,5 +1,5 @@
-"""Tests of the study of paper 004's tuning: drives for the search and for judging are separate, the
-noise follows the stated schedule, and the command runs from end to end.
+"""Tests of the study of paper 004's tuning. Drives for the search and for judging must be separate,
+the noise must follow the stated schedule, and the command must run from end to end.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STILL = study_report.GIVEN["fixed"]
 
 @pytest.fixture(scope="module")
 def drives() -> StudySet:
-    """Return the first two drives of the study's search set, six seconds each."""
+    """Return the first two drives of the study's search set, six seconds of each."""
     return record(TRAIN[:2])
 
 

@@ -1,5 +1,5 @@
-"""Tests of reading directed links from an OpenStreetMap extract and from files of lines; other
-input is refused with an error that names it.
+"""Tests of the reading of directed road links from an OpenStreetMap extract and from files of
+lines. Any other input must be refused with an error that names the file.
 """
 
 from __future__ import annotations

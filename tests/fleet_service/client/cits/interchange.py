@@ -100,7 +100,7 @@ def _serve(url: str, requests: Connection) -> None:
 
 
 def _plain(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the application properties of a received message with Python types instead of AMQP
-    types.
+    """Return the application properties of a received AMQP message, with plain Python types in
+    place of AMQP types.
     """
     return {name: int(value) if isinstance(value, int) else value for name, value in given.items()}

@@ -1,5 +1,5 @@
-"""Tests of DENM (hazard messages): other encoders write the same bytes, an event keeps its number
-over restarts, and DENM of other parties count as reports of one vehicle.
+"""Tests of DENM (hazard messages). Other encoders must write the same bytes, an event must keep its
+number over restarts, and all DENM of other parties must count as reports of one vehicle.
 """
 
 from __future__ import annotations
@@ -229,8 +229,8 @@ def stretch(
 
 
 class Run:
-    """Output of the gateway under test, with a simulated clock and interchange. `sent` are the
-    messages that it has sent, and `settles` is True if the interchange accepts messages.
+    """Gateway output under test, with a simulated clock. The list `sent` collects the messages that
+    the gateway sends. `settles` is True if the simulated interchange accepts them.
     """
 
     def __init__(self, path: Path, settles: bool = True) -> None:
@@ -361,8 +361,8 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
 
 
 def _yaws(denm: Denm) -> list[float]:
-    """Return the yaw angles [deg] of the reports that the gateway makes from a DENM (hazard
-    message), each once.
+    """Return the distinct yaw angles [deg], sorted, of the reports that the gateway makes from a
+    DENM (hazard message).
     """
     batches = [json.loads(body) for _, body in encode_reports(denm, "cits-se", 5, 1, START)]
     return sorted({round(math.degrees(yaw)) % 360 for batch in batches for yaw in batch["yaw"]})
