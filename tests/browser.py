@@ -30,9 +30,7 @@ def find_chromium() -> str | None:
 
 
 class Opened:
-    """Page that is open in the browser, with the errors that it reported and the network requests
-    that it made.
-    """
+    """Page that is open in the browser: its errors, and the network requests that it made."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -52,8 +50,8 @@ class Opened:
         return int(self.page.evaluate("document.body.dataset.drawn || 0"))
 
     def count_colours(self, panel: int = 0) -> dict[str, int]:
-        """Return the number of pixels per opaque colour (#rrggbb) of the canvas with
-        index `panel`.
+        """Return the number of pixels of each opaque colour (#rrggbb) in the page's canvas number
+        `panel`.
         """
         found: dict[str, int] = self.page.evaluate(_COLOURS, panel)
         return found

@@ -74,7 +74,7 @@ class BucketServer:
             self._process.send_signal(signal.SIGCONT)
 
     def read_objects(self) -> dict[str, bytes]:
-        """Return the content of all objects of the bucket by name."""
+        """Return the content of every object in the bucket, by object name."""
         base = self._folder / BUCKET / PREFIX
         found = [
             path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")
@@ -105,8 +105,8 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
 
 
 def list_copied_files(root: Path) -> dict[str, bytes]:
-    """Return the content of those files of an archive that its copy in the bucket must contain, by
-    path.
+    """Return, by path, the content of those files of an archive that its bucket copy must
+    contain.
     """
     from fleet_service.replication.replica_files import FOLDERS
 

@@ -6,8 +6,8 @@ from fleet_service.app.queries import Queries
 
 
 def changed_tiles(queries: Queries, now: int) -> list[tuple[int, bytes]]:
-    """Return the tile number and the payload of every non-empty tile that changed since the last
-    call.
+    """Return tile number and payload of every non-empty tile that changed since the last call;
+    `now` is the present time [ns].
     """
     changed = queries.take_changed(now)
     return [(tile, stream) for tile in changed if (stream := queries.tile(tile, now))]

@@ -13,7 +13,7 @@ settings.load_profile("fixed")
 
 @pytest.fixture(autouse=True)
 def _use_numba_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let each test begin with Numba's kernels (compiled functions). An agent that an earlier test
-    ran in this process may have switched to the kernels of the shared library.
+    """Let each test begin with Numba's kernels (compiled functions). An earlier test in this
+    process may have run an agent, which switches to the kernels of the shared library.
     """
     monkeypatch.setattr(jit._Native, "library", None)

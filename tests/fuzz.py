@@ -77,7 +77,7 @@ class Parser(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Counts of one fuzzing run of a parser: executions, stored inputs (corpus), executed lines,
+    """Result of fuzzing one parser: numbers of executions, stored inputs (corpus), executed lines,
     crashes and hangs.
     """
 
@@ -173,7 +173,7 @@ class Fuzzer:
             self._run_input(one, always=True)
 
     def run(self, seconds: float = float("inf"), executions: float = float("inf")) -> Result:
-        """Fuzz for a time [s] or a number of executions, and return the counts."""
+        """Fuzz until `seconds` have passed or `executions` inputs have run. Return the counts."""
         end = time.monotonic() + seconds
         while self._executions < executions and time.monotonic() < end:
             self._run_input(self._mutate_input(self._random.choice(self._corpus)))
@@ -250,7 +250,7 @@ def seeds_of(name: str) -> list[bytes]:
 
 def make_keeper(folder: Path) -> Callable[[str, bytes], None]:
     """Return a function that writes an input of the fuzzer as a file below `folder`. Equal inputs
-    get the same file, so each distinct input is stored once.
+    get the same file name, so each distinct input is stored once.
     """
 
     def write_input(kind: str, data: bytes) -> None:

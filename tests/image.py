@@ -52,8 +52,8 @@ def parse_steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """State of a container image after the steps that were run: its folders below `root`, working
-    folder and environment.
+    """Container image after the steps that were run: its folders (below `root`), working folder and
+    environment.
     """
 
     def __init__(self, root: Path) -> None:
@@ -64,8 +64,8 @@ class Image:
         self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
 
     def localize_paths(self, text: str) -> str:
-        """Return the text of an instruction in which the image's folders are replaced by folders
-        below `root`, and the owner in `chown` by this user.
+        """Return the text of an instruction for this machine. Folders of the image become folders
+        below `root`, and the owner in `chown` becomes this user.
         """
         for place in PLACES:
             text = re.sub(rf"(?<![\w.]){re.escape(place)}\b", str(self.root) + place, text)

@@ -86,14 +86,14 @@ DUNDER: Final = re.compile(r"__\w+__")
 
 
 class Docstring(NamedTuple):
-    """Docstring of the code, with its file and line."""
+    """Docstring in the code, with its file and line."""
 
     place: str
     text: str
 
 
 class Named(NamedTuple):
-    """Name of a function of the code, with its file and line."""
+    """Name of a function in the code, with its file and line."""
 
     place: str
     name: str
@@ -190,8 +190,8 @@ def measure_package(package: str) -> dict[str, float]:
 
 
 def round_up(value: float) -> float:
-    """Return a value rounded up to a tenth, so that a ceiling (upper limit of a count) never lies
-    below its measurement.
+    """Return `value` rounded up to a tenth, so that a ceiling (upper limit of a count) computed
+    from it never lies below the measurement.
     """
     return -(-int(value * 1000) // 100) / 10
 
@@ -247,8 +247,8 @@ def markdown_words() -> int:
 
 
 def measure_pages() -> dict[str, dict[str, float]]:
-    """Return the numbers of long sentences and stop words, by page with at least one of them; under
-    the key "*" the number of words of all pages.
+    """Return the numbers of long sentences and stop words, by page. Pages without any are left out.
+    The key "*" has the number of words of all pages.
     """
     found: dict[str, dict[str, float]] = {"*": {"words": float(markdown_words())}}
     for page in list_pages():
@@ -272,8 +272,8 @@ def read_ceilings() -> dict[str, dict[str, dict[str, float]]]:
 
 
 def lower_ceilings() -> None:
-    """Lower each ceiling (upper limit that a test checks) to the present figure if that is smaller,
-    and add missing ceilings.
+    """Lower each stored ceiling (upper limit that a test checks) that is above the present figure
+    to this figure. Add missing ceilings.
     """
     today = {
         "packages": {package: measure_package(package) for package in PACKAGES},

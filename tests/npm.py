@@ -21,7 +21,9 @@ FOLDER: Final = ROOT / ".page" / "tools"
 
 
 class Package(NamedTuple):
-    """Version of an npm package, and the SHA-256 of each needed file by its path in the package."""
+    """Version of an npm package, and the SHA-256 of each file that is needed from it, by path in
+    the package.
+    """
 
     version: str
     files: dict[str, str]
@@ -47,8 +49,8 @@ PACKAGES: Final = {
 
 
 def file_of(name: str, path: str) -> Path | None:
-    """Return the path of a package's file, or None if the file is missing or differs from the
-    pinned one.
+    """Return the path of the file `path` of a package. Return None if the file is missing or its
+    hash is not the pinned one.
     """
     found = FOLDER / name / Path(path).name
     if (

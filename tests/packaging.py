@@ -58,8 +58,8 @@ WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 
 
 def find_interpreters() -> list[str]:
-    """Return the commands of the Python versions in VERSIONS that work here. Print the versions
-    left out, and why.
+    """Return the commands of the Python versions in VERSIONS that work on this machine. Print the
+    other versions, and why they are left out.
     """
     found = []
     for version in VERSIONS:

@@ -43,13 +43,13 @@ def build_packages(out: Path) -> Path:
 
 
 def find_newest(folder: Path, pattern: str) -> Path:
-    """Return the newest file in a folder that matches a pattern."""
+    """Return the newest file in a folder whose name matches a pattern."""
     return max(folder.glob(pattern), key=lambda path: path.stat().st_mtime)
 
 
 def platform_tag(code: bytes) -> str:
-    """Return the platform tag (PEP 600) of a wheel with the given machine code: it names the oldest
-    C library that has all functions called.
+    """Return the platform tag (PEP 600) of a wheel that contains the machine code `code`. The tag
+    names the oldest C library that has all functions which this code calls.
     """
     versions = [int(minor) for minor in re.findall(rb"GLIBC_2\.(\d+)", code)]
     return f"manylinux_2_{max(versions)}_x86_64"

@@ -52,7 +52,7 @@ Shown: TypeAlias = dict[str, list[Metric]]
 
 
 def command_actions(program: str) -> Iterator[tuple[Any, list[argparse.Action]]]:
-    """Yield each command of a program, together with the command's options and arguments."""
+    """Yield each command of a program, with the parser actions of its options and arguments."""
     for command in COMMAND_LINES[program].COMMANDS:
         parser = argparse.ArgumentParser(add_help=False)
         importlib.import_module(command.module).add_arguments(parser)
@@ -141,7 +141,7 @@ def tables_page() -> str:
 
 
 def all_metrics(root: Path) -> Shown:
-    """Return all metrics that an agent and a service export. The service is created with a new
+    """Return all metrics that an agent and a service export. For this a service is created on a new
     archive in the folder `root`.
     """
     config = ServiceConfig()

@@ -1,11 +1,11 @@
-"""Find regular expressions whose time grows faster than the length of the text.
+"""Search for regular expressions whose matching time grows faster than the length of the text.
 
     python -m tests.regexes      print every suspicious pattern of the product
 
-A backtracking matcher takes quadratic time if two unbounded repeats follow each other and can match
-the same character, with nothing mandatory and different between them, because the text can be
-divided between them in many ways. It takes exponential time if such a repeat is inside another. The
-check looks at literal patterns of the module `re`.
+A backtracking matcher takes quadratic time if two unbounded repeats that can match the same
+character follow each other. The text can then be divided between them in many ways, unless
+something mandatory and different stands between them. The matcher takes exponential time if such a
+repeat is inside another. The check looks at literal patterns of the module `re`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ Characters = frozenset[int]
 
 
 class Part(NamedTuple):
-    """Part of a sequence in a regular expression: the characters that it can match, True if it may
-    be empty, and True if it repeats without bound.
+    """Part of a sequence in a regular expression: the characters that it can match, and two flags,
+    True if the part may be empty and True if it repeats without bound.
     """
 
     characters: Characters
@@ -61,8 +61,9 @@ def is_superlinear(pattern: str) -> bool:
 
 
 def _is_ambiguous(sequence: list[Any]) -> bool:
-    """Return True if a sequence of a regular expression can match a text in many ways: an unbounded
-    repeat contains another one, or is followed by one of the same characters.
+    """Return True if a sequence of parts of a regular expression can match a text in many ways,
+    because an unbounded repeat contains another one or is followed by one that matches the same
+    characters.
     """
     parts = [_describe_part(item) for item in sequence]
     for k, part in enumerate(parts):
@@ -82,8 +83,8 @@ def _is_ambiguous(sequence: list[Any]) -> bool:
 
 
 def _never_fails(parts: list[Part], start: int) -> bool:
-    """Return True if everything from the part `start` on is optional, so that the matcher never
-    fails there and never backtracks into an earlier repeat.
+    """Return True if all parts after number `start` are optional. The matcher then never fails
+    after this part, and never backtracks into it.
     """
     return all(part.is_optional for part in parts[start + 1 :])
 
@@ -109,8 +110,8 @@ def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 tuples of the parser
 
 
 def _find_sequences(parsed: Any) -> Iterator[list[Any]]:  # noqa: ANN401
-    """Yield every sequence (parts that match one after the other) of a parsed regular expression;
-    the content of unrepeated groups is merged into it.
+    """Yield every sequence (parts that match one after the other) of a parsed regular expression.
+    Groups that are not repeated are merged into their sequence.
     """
     yield _open_groups(parsed)
     for name, value in parsed:
@@ -146,7 +147,9 @@ def _describe_part(item: Any) -> Part:  # noqa: ANN401
 
 
 def _match_characters(items: Any) -> Characters:  # noqa: ANN401
-    """Return the ASCII characters that any of the given items of a pattern can match."""
+    """Return the ASCII characters (code numbers) that any of the given items of a pattern can
+    match.
+    """
     out: Characters = frozenset()
     for name, value in items:
         if name is sre.LITERAL:

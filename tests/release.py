@@ -41,7 +41,7 @@ def changelog_section(text: str, version: str) -> str:
 
 
 def with_version(text: str, pattern: str, version: str) -> str:
-    """Return a file's text with its version number replaced.
+    """Return a file's text in which the version number is replaced by `version`.
 
     Args:
         text: content of the file.
@@ -72,8 +72,8 @@ def set_version(root: Path, version: str, day: str) -> None:
 
 
 def list_licences() -> str:
-    """Return a text with name, version and licence of each installed package, one
-    package per line.
+    """Return a text with name, version and licence of each installed package, one package per
+    line.
     """
     lines = []
     for package in distributions():

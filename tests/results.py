@@ -216,8 +216,8 @@ TABLES: Final = (
 
 
 class Line(NamedTuple):
-    """Row of the results block (generated part) of the root README: text, and the figure that it
-    shows.
+    """Row of the results block (generated part) of the root README: its text, and the campaign,
+    name and number format of the figure that it shows.
     """
 
     text: str
@@ -249,14 +249,16 @@ def list_pages() -> list[Path]:
 
 
 def read_kept(name: str) -> dict[str, Row]:
-    """Return the stored figures of a campaign by name. The result is empty if no figures are
-    stored.
+    """Return the stored figures of a campaign, by name of the figure. The result is empty if none
+    are stored.
     """
     return {row["name"]: row for row in _read_rows(name)[1:]}
 
 
 def _read_runs(name: str) -> dict[str, Row]:
-    """Return date, machine and seeds of a campaign's stored runs, by commit."""
+    """Return date, machine and seeds of the runs that measured a campaign's stored figures, by
+    commit.
+    """
     return dict(header["runs"]) if (header := next(iter(_read_rows(name)), None)) else {}
 
 
@@ -318,8 +320,8 @@ def keep_figures(name: str, source: Path) -> str:
 
 
 def _is_wanted(name: str, row: Row, before: dict[str, Row]) -> bool:
-    """Return True if a measured figure must be stored: it has a target, is already stored, or
-    belongs to a table of the results page.
+    """Return True if a figure that a campaign measured must be stored: it has a target, is already
+    stored, or belongs to a table of the results page.
     """
     shown = any(table.names.match(row["name"]) for table in TABLES if table.campaign == name)
     return row["bar"] is not None or row["name"] in before or shown
@@ -449,8 +451,8 @@ def escape_unit(unit: str) -> str:
 
 
 def with_block(page: str) -> str:
-    """Return a page's text in which the results block (its generated part) is replaced by the
-    current block.
+    """Return the text of a page with its results block (generated part) replaced by the current
+    one.
     """
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)

@@ -36,7 +36,9 @@ RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1
 
 
 def free_endpoint(protocol: str) -> str:
-    """Return an endpoint at a port that stays free, so that a router can restart on it."""
+    """Return an endpoint with a free port. The port stays free while a router restarts, so that the
+    router can use it again.
+    """
     return f"{protocol}/127.0.0.1:{free_ports(1)[0]}"
 
 
@@ -56,13 +58,15 @@ def make_enrolment(**changed: object) -> Enrolment:
 
 
 def open_registry(folder: Path) -> Registry:
-    """Create a certificate authority in a folder, valid from now on."""
+    """Open a certificate registry with a new certificate authority in a folder, valid from now
+    on.
+    """
     return Registry(folder, Terms(), datetime.now(UTC))
 
 
 def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
-    """Return the Zenoh settings of a session with a router at `endpoint`, with certificates from
-    `folder`; `changed` replaces entries of the TLS section.
+    """Return the Zenoh settings of a session with the router at `endpoint`. The session uses the
+    certificates in `folder`; `changed` replaces entries of the TLS section.
     """
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
@@ -79,13 +83,13 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
 
 @dataclass
 class Network:
-    """Two routers, each in a separate process, with the second connected to the first.
+    """Two routers, each in a separate process; the second one connects to the first.
 
     `protocol` is the transport of sessions; the routers connect to each other over TLS. If `capped`
-    is False, the routers do not limit message rates, so that a test's earlier attack does not hide
-    a later one. If `guarded` is False, they check no certificates, as a control. The routers run
-    outside the test's process because Zenoh may abort a process that closes one of two connected
-    routers.
+    is False, the routers do not limit message rates, so that the traffic of an earlier attack in a
+    test does not affect a later one. If `guarded` is False, they check no certificates, for control
+    measurements. The routers run in processes of their own because Zenoh may abort a process that
+    closes one of two connected routers.
     """
 
     folder: Path
@@ -148,7 +152,7 @@ class Network:
             process.terminate()
 
     def await_link(self) -> None:
-        """Wait until messages pass between the two routers in both directions."""
+        """Wait until a message of each of the two routers reaches the other."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with (
                 self.open_session(SERVICE, first) as here,

@@ -43,12 +43,12 @@ def spark_session(count: int) -> Iterator[Any]:
 def killed_at_first(
     work: Callable[[_Task], _Outcome], name_of: Callable[[_Task], str], tries: Path
 ) -> Callable[[_Task], _Outcome]:
-    """Return a function that does the same work as `work`, but kills its process at the first
-    attempt of each task.
+    """Return a function that does the same as `work`, but kills its process at the first attempt of
+    each task.
 
     Args:
         work: function of a task.
-        name_of: returns a task's name.
+        name_of: function that returns a task's name.
         tries: folder that records the names of attempted tasks.
     """
     tries.mkdir()

@@ -129,8 +129,8 @@ def open_hosts(
     named: bool = False,
     **settings: Any,  # noqa: ANN401
 ) -> Iterator[list[Host]]:
-    """Yield hosts whose services are not yet started, and close them after the `with` block. If
-    `named`, each service has its host's name.
+    """Yield hosts (simulated machines) whose services are not yet started, and close them after the
+    `with` block. If `named`, each service has its host's name.
     """
     with ExitStack() as stack:
         own = [{"name": name} if named else {} for name in names]
@@ -144,8 +144,8 @@ def open_hosts(
 
 
 def restore_archive(folder: Path, bucket: BucketServer) -> Path:
-    """Return the archive that a service with an empty disk would restore from the bucket. The
-    bucket is not changed.
+    """Restore the archive from the bucket into `folder`, as a service with an empty disk does, and
+    return its path. The bucket is not changed.
     """
     root = folder / "archive"
     root.mkdir(parents=True)

@@ -43,7 +43,7 @@ def parse(path: Path) -> ast.Module:
 
 @cache
 def list_nodes(path: Path) -> tuple[ast.AST, ...]:
-    """Return all nodes of a Python file's syntax tree, in the order of `ast.walk`."""
+    """Return all nodes of the syntax tree of a Python file, in the order of `ast.walk`."""
     return tuple(ast.walk(parse(path)))
 
 
@@ -64,8 +64,8 @@ def room_of(name: str) -> tuple[str, str]:
 
 
 def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
-    """Return the pairs (first, second) of sub-packages of a package in which the first imports the
-    second, each with one file and line.
+    """Return the pairs (first, second) of sub-packages in which the first imports the second,
+    within one package. Each pair has one example: file and line of the import.
     """
     found: dict[tuple[str, str], str] = {}
     for path in list_sources(root, package):
@@ -78,13 +78,15 @@ def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
 
 
 def loose_modules(root: Path, package: str) -> list[str]:
-    """Return the modules that lie directly in a package's folder, outside its sub-packages."""
+    """Return the names of the modules that lie directly in a package's folder, outside its
+    sub-packages.
+    """
     return sorted(path.stem for path in (root / package).glob("*.py") if path.name != "__init__.py")
 
 
 def too_wide(root: Path) -> list[str]:
-    """Return the functions of the product (all code except tests) that have too many positional
-    parameters.
+    """Return the functions of the product (all code except tests) that have more than
+    MOST_PARAMETERS positional parameters.
     """
     found = []
     for path in list_sources(root, *PACKAGES):
@@ -98,7 +100,9 @@ def too_wide(root: Path) -> list[str]:
 
 
 def ambiguous_classes(root: Path) -> dict[str, list[str]]:
-    """Return each class name that several classes have, with their files and lines."""
+    """Return the names that several classes have; for each name the files and lines of these
+    classes.
+    """
     places: dict[str, list[str]] = {}
     for path in list_sources(root, *PACKAGES):
         for node in list_nodes(path):
@@ -136,7 +140,7 @@ PRODUCT: Final = ("schemas", "edge_agent", "fleet_service")
 
 
 def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
-    """Yield place (file, line and name) and syntax node of every function."""
+    """Yield place (file, line and name) and syntax node of every function in the given packages."""
     for path in list_sources(root, *packages):
         for node in list_nodes(path):
             if isinstance(node, FunctionNode):
@@ -144,8 +148,8 @@ def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
 
 
 def room_arrows(root: Path, folder: str) -> Places:
-    """Return the pairs (first, second) of sub-packages or modules of a folder in which the first
-    imports the second.
+    """Return one text per pair (first, second) of sub-packages or modules of a folder in which the
+    first imports the second.
     """
     base = folder.replace("/", ".")
     found: dict[tuple[str, str], str] = {}
@@ -163,16 +167,14 @@ def room_arrows(root: Path, folder: str) -> Places:
 
 
 def import_circles(root: Path) -> Places:
-    """Return the circles of modules that import each other, also inside functions."""
+    """Return one text per circle of modules that import each other, also inside functions."""
     return circles_of(
         {path.relative_to(root): parse(path) for path in list_sources(root, *PACKAGES)}
     )
 
 
 def methods_of_largest_class(root: Path) -> Places:
-    """Return the methods and properties of the class that has most of them, one entry
-    per method.
-    """
+    """Return the methods and properties of the class that has the most, one entry per method."""
     largest: Places = []
     for path in list_sources(root, *PACKAGES):
         for node in list_nodes(path):
@@ -187,8 +189,8 @@ def methods_of_largest_class(root: Path) -> Places:
 
 
 def most_parameters(root: Path) -> Places:
-    """Return the parameters of the function with the most parameters, including keyword parameters,
-    without `self` and `cls`.
+    """Return the parameters, one entry each, of the function that has the most. Keyword parameters
+    count; `self` and `cls` do not.
     """
     most: Places = []
     for place, node in functions(root, *PACKAGES):
@@ -211,7 +213,7 @@ def functions_with_many_parameters(root: Path) -> Places:
 
 
 def packed_assignments(root: Path) -> Places:
-    """Return the statements that assign a literal tuple to several names: `a, b = x, y`."""
+    """Return the places of assignments of a literal tuple to several names: `a, b = x, y`."""
     found = []
     for path in list_sources(root, *PACKAGES):
         for node in list_nodes(path):
@@ -222,8 +224,8 @@ def packed_assignments(root: Path) -> Places:
 
 
 def fmt_skips(root: Path) -> Places:
-    """Return the places of all lines of source code that a comment excludes from formatting, also
-    in tests.
+    """Return the places of all source lines, also in tests, that a comment excludes from
+    formatting.
     """
     marker = "# fmt: " + "skip"
     return [
@@ -235,9 +237,7 @@ def fmt_skips(root: Path) -> Places:
 
 
 def long_lines(root: Path) -> Places:
-    """Return the places of all lines of source code that have more than 100 characters, also in
-    tests.
-    """
+    """Return the places of all source lines, also in tests, with more than 100 characters."""
     return [
         f"{path.relative_to(root)}:{line}"
         for path in list_sources(root, *PACKAGES, "tests")
@@ -250,8 +250,8 @@ _NESTING: Final = (ast.If, ast.For, ast.While, ast.With, ast.Try, ast.AsyncFor, 
 
 
 def _measure_depth(node: ast.AST) -> int:
-    """Return the depth of nested blocks in a function. An `elif` adds no depth, and inner functions
-    are measured separately.
+    """Return the largest depth of nested blocks in a function. An `elif` adds no depth. Inner
+    functions do not count here, because they are measured separately.
     """
     deepest = 0
     for child in ast.iter_child_nodes(node):
@@ -284,11 +284,11 @@ def many_locals(root: Path) -> Places:
 
 
 def named_constants(root: Path) -> Places:
-    """Return the named numbers in the folders of code that process data between sensor and map
-    (`CONSTANT_ROOMS`).
+    """Return the places of named numbers in the code that processes data between sensor and map
+    (the folders CONSTANT_ROOMS).
 
-    Counted are module constants (capital letters) and fields of classes called …Constants whose
-    value is a number or an expression of numbers.
+    Counted are module constants (capital letters), and fields of classes called …Constants. Their
+    value must be a number or an expression of numbers.
     """
     found = []
     for path in list_sources(root, *CONSTANT_ROOMS):
@@ -315,8 +315,8 @@ def named_constants(root: Path) -> Places:
 
 
 def _is_number(node: ast.AST) -> bool:
-    """Return True if a node is a number or an arithmetic expression of numbers, but not a bool or a
-    text.
+    """Return True if the syntax node is a number or an arithmetic expression of numbers, but no
+    bool or text.
     """
     parts = list(ast.walk(node))
     constants = [part.value for part in parts if isinstance(part, ast.Constant)]
@@ -333,8 +333,8 @@ LIBRARY_CALLS: Final = ("visit_", "on_", "log_message")
 
 
 def only_tests_use(root: Path) -> Places:
-    """Return the places of product functions and classes whose name occurs only in tests, so that
-    the product does not need them.
+    """Return the places of product functions and classes whose name occurs only in tests. The
+    product does not need them.
 
     A name counts as used if any other line of product, deployment, Makefile, pages or examples
     contains it. Functions with a decorator other than `property` are left out, because the
@@ -399,7 +399,7 @@ class Figure(NamedTuple):
         bar: target value.
         ceiling: value that must not be exceeded; at most the last measured value.
         places: function that returns one entry per counted code place.
-        per_1000: True if the value is per 1,000 lines of the packages.
+        per_1000: True if the figure is the count per 1,000 lines of the packages.
     """
 
     name: str

@@ -1,8 +1,8 @@
-"""Tests that no form of output gives a colour value to unmeasured cells.
+"""Tests that no form of output gives a colour value to unmeasured cells, so that unknown road is
+never shown as dry.
 
-They test the promise that unknown road is never shown as dry. If only lower bounds of a cell's μ
-are known, or a report used little grip, the median of μ is mostly the prior. The prior's median has
-the colour of wet asphalt, so it must not be shown as a colour.
+If only lower bounds of a cell's μ are known, or a report used little grip, the median of μ is
+mostly the prior's. This median has the colour of wet asphalt, so it must not be shown as a colour.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ def two_cells() -> pa.Table:
 def find_painted(
     rows: list[dict[str, Any]], known: Callable[[dict[str, Any]], bool], *names: str
 ) -> list[dict[str, Any]]:
-    """Return those rows of an exported map that are not measured (`known` is False) but have a
-    number in one of the columns `names`. Fail if there are no measured or no unmeasured rows.
+    """Return the rows of an exported map that look measured but are not. For such a row, `known`
+    returns False, but one of the columns `names` has a number. Fail if the map has no measured or
+    no unmeasured rows.
     """
     bounds = [row for row in rows if not known(row)]
     assert bounds

@@ -1,5 +1,5 @@
-"""Tests of SIGTERM and Ctrl-C: agent and service flush, deliver as many reports as possible, and
-end, with and without a working router.
+"""Tests of SIGTERM and Ctrl-C. With and without a working router, agent and service must write
+their stored data, deliver as many reports as possible, and end.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of both command lines, `edge-agent` and `fleet-service`: help, completion, Ctrl-C and exit
-codes work as documented, and no command replaces a file that it must not touch.
+"""Tests of both command lines, `edge-agent` and `fleet-service`. Help, completion, Ctrl-C and exit
+codes must work as documented, and no command may replace a file that it must not touch.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
 
 
 def on_terminal(command: list[str], answer: str) -> str:
-    """Return the output of a command that runs on a terminal and reads this answer."""
+    """Run the command on a terminal with `answer` as the typed input, and return its output."""
     here, there = pty.openpty()
     with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
         os.close(there)
@@ -342,8 +342,8 @@ def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixtur
     ],
 )
 def test_demo_and_plain_commands_load_without_optional_packages(modules: str) -> None:
-    """The demo and the plain commands must load without SciPy, matplotlib and Ibis, which the
-    extras `demo` and `page` do not install.
+    """The commands of the demo and those without extras must load without SciPy, matplotlib and
+    Ibis. The extras `demo` and `page` do not install these.
     """
     hidden = "import sys; sys.modules.update(dict.fromkeys(('scipy', 'matplotlib', 'ibis')))"
     command = [sys.executable, "-c", f"{hidden}; import {modules}"]
@@ -352,7 +352,7 @@ def test_demo_and_plain_commands_load_without_optional_packages(modules: str) ->
 
 def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
     """The extra `demo` must install the packages for the demo's metrics and page. If a process of
-    the demo cannot start, the demo's error must contain the reason that the process printed.
+    the demo cannot start, the demo must print an error with the reason that the process printed.
     """
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.split(r"[<>=]", one)[0] for one in extras["optional-dependencies"]["demo"]}

@@ -1,5 +1,5 @@
-"""Tests that the documentation agrees with the code: every option is documented, every command on a
-page is valid, links lead to their targets, and pages keep their size limits.
+"""Tests that the documentation agrees with the code. Every option must be documented, every command
+on a page must be valid, links must lead to their targets, and pages must keep their size limits.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def test_a_mistake_is_made_with_every_command() -> None:
 
 
 def list_commands(text: str) -> list[str]:
-    """Return the commands in the code blocks of a page, without comments and without lines that
+    """Return the commands in the code blocks of a page. Comments are left out, and also lines that
     contain brackets (synopses).
     """
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
@@ -108,7 +108,7 @@ def test_every_command_of_the_tutorials_is_understood_and_writes_to_try() -> Non
 
 
 def test_git_ignores_what_the_tutorials_make_and_every_key() -> None:
-    """`git add .` after the tutorials must not add any file, above all no private key."""
+    """After the tutorials, `git add .` must add no file, above all no private key."""
     made = [
         "try/certs/ca/key.pem",
         "certs/ca/key.pem",
@@ -160,7 +160,7 @@ def test_links_of_pages_lead_to_files_and_headings() -> None:
 
 def test_pages_have_no_reference_links_which_the_link_test_cannot_follow() -> None:
     """Pages must not define reference links at their end, because the test of links cannot follow
-    them. Figures belong into generated blocks (parts of a page that a program writes) instead.
+    such links. Figures belong into generated blocks (parts of a page that a program writes).
     """
     reference = re.compile(r"^\[[^\]]+\]: \S|\]\[[\w.]+\]", re.MULTILINE)
     for page in list_pages():

@@ -1,5 +1,5 @@
-"""Tests of the whole system in one process (recorded drives, agent, router and service): slippery
-drives must become a slippery map for a client that uses only Zenoh.
+"""Tests of the whole system in one process: recorded drives, agent, router and service. Drives on
+slippery roads must become a slippery map, also for a client that uses only Zenoh.
 """
 
 from __future__ import annotations
@@ -55,13 +55,15 @@ class System:
         until(lambda: any(line.startswith("ready") for line in self.said[before:]))
 
     def stop(self) -> None:
-        """Stop the service, which flushes and acknowledges first."""
+        """Stop the service. Before it ends, it stores and acknowledges the received reports."""
         self._stop.set()
         self._thread.join(30)
         assert not self._thread.is_alive()
 
     def publish_drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
-        """Simulate and record a drive, and publish it under the name `vehicle`."""
+        """Simulate and record a drive on a road with friction `mu`, and publish it under the
+        vehicle name `vehicle`.
+        """
         log, file, out = (
             self.folder / f"{vehicle}-{n}"
             for n in ("log.parquet", "vehicle.json", "estimates.parquet")
@@ -93,7 +95,7 @@ class System:
         assert edge_agent([*words, "--trust", "--config", str(self.agent)]) == 0
 
     def query_cells(self, parameters: str = "format=json") -> list[dict[str, object]]:
-        """Return the map's cells as a client without GripMap code receives them."""
+        """Return the map's cells as a client that has no GripMap code receives them."""
         session = open_session(ZenohSettings(connect=[self.endpoint]))
         assert session is not None
         with session:

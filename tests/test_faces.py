@@ -1,5 +1,5 @@
-"""Tests of the public interfaces: every name exists, is documented and can be imported; plug-ins of
-other distributions are found.
+"""Tests of the public interfaces. Every name must exist, be documented and be importable; plug-ins
+of other distributions must be found.
 """
 
 from __future__ import annotations

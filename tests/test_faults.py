@@ -1,5 +1,5 @@
-"""Tests of the framework of the fault campaigns: it reports missing figures, and its comparison
-with the archive finds lost and doubled rows.
+"""Tests of the framework of the fault campaigns. It must report missing figures, and its comparison
+with the archive must find lost and doubled rows.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests that the fuzzer finds a deliberately planted crash by coverage, and that the committed
-seeds crash no parser.
+"""Tests of the fuzzer: it must find a planted crash by coverage, and the committed seeds must crash
+no parser.
 """
 
 from __future__ import annotations

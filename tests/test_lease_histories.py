@@ -1,5 +1,5 @@
-"""Tests that simulated histories of the lease (ownership of an archive) in virtual time keep every
-promise, and that deliberately broken protocols are detected.
+"""Tests of the lease (ownership of an archive). Simulated histories of it in virtual time must keep
+every promise of the protocol, and deliberately broken protocols must be detected.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of `free_ports`: the returned ports are unused, and lie below the range of outgoing
+"""Tests of `free_ports`. The returned ports must be unused, and lie below the range of outgoing
 connections.
 """
 

@@ -1,5 +1,6 @@
-"""Exhaustive check of the protocol model (takeover of an archive between services): every reachable
-state keeps the promises, and without any one of the rules some state breaks a promise.
+"""Exhaustive check of the protocol by which services take over an archive. Every reachable state of
+its model must keep the promises. Without any one of the protocol's rules, some state must break a
+promise.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Test that no regular expression of the product takes more than linear time."""
+"""Test that no regular expression of the product takes more than linear time in the length of the
+text.
+"""
 
 from __future__ import annotations
 

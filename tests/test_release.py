@@ -1,5 +1,5 @@
-"""Tests that a release needs a changelog section, and sets the version exactly once in
-each file.
+"""Tests of a release: it must be refused without a changelog section, and must set the version
+exactly once in each file.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Tests of the structure of the packages, read from the source: imports follow the allowed
-directions, the core does no I/O, sizes stay below their limits, and everything public has a
-docstring.
+"""Tests of the structure of the packages, read from the source. Imports must follow the allowed
+directions, the core must do no I/O, sizes must stay below their limits, and everything public must
+have a docstring.
 """
 
 from __future__ import annotations
@@ -212,8 +212,8 @@ def place_of(path: Path, line: int) -> str:
 
 
 def find_crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
-    """Return line and name of the imports, in a module of `package`, of project packages that it
-    must not import.
+    """Return line and name of each forbidden import in a module of `package`: an import of a
+    project package that `package` must not use.
     """
     forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
     return [(line, name) for line, name in list_imports(tree) if name.split(".")[0] in forbidden]
@@ -242,7 +242,7 @@ def find_impurities(tree: ast.AST) -> list[tuple[int, str]]:
 
 def find_undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield line and name of public modules, classes and functions without a docstring. Names
-    inside a function count as private.
+    inside a function are not public.
     """
     if ast.get_docstring(tree) is None:
         yield 1, "module"
@@ -337,8 +337,8 @@ SHARED_NUMBER = re.compile(
 
 
 def shared_numbers(text: str) -> Iterator[tuple[int, str]]:
-    """Yield line number and text where code repeats a number of `schemas.thresholds`; comments are
-    ignored.
+    """Yield line number and text of each line of code that repeats a number of
+    `schemas.thresholds`. Comments are ignored.
     """
     for line, words in enumerate(text.splitlines(), 1):
         if found := SHARED_NUMBER.search(words.partition("#")[0]):

@@ -174,9 +174,7 @@ IMPATIENT = (
 def test_replay_with_a_hanging_session_keeps_its_estimates(
     drive: Path, tmp_path: Path, well: bool
 ) -> None:
-    """A replay must end, and its estimates must be written, although a frozen router never
-    answers.
-    """
+    """A replay must end and write its estimates although a frozen router never answers."""
     router = Part(
         "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
     )
@@ -516,8 +514,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """A log has no torques and no rear steering angles, and every second speed reading of the front
-    left wheel is missing. The estimates from it must be finite, and some must have a health flag.
+    """Estimates must be finite, and some must have a health flag, for a log without torques and
+    rear steering angles in which every second speed reading of the front left wheel is missing.
     """
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]

@@ -57,7 +57,9 @@ def batch_of_version_1(kind: Kind) -> Batch:
 
 
 def make_acknowledgement() -> tuple[str, list[StreamAck]]:
-    """Return an acknowledgement of two streams (batches of one vehicle, kind and region)."""
+    """Return an acknowledgement of two streams. A stream is all batches of one vehicle, kind and
+    region.
+    """
     return "volvo-240", [
         StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
         StreamAck(

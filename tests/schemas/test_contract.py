@@ -1,5 +1,5 @@
-"""Tests of the contract (common definitions in `schemas`): keys, friction grid, configuration,
-vehicle file and queries are read as defined, and an error names the wrong field.
+"""Tests of the contract (common definitions in `schemas`). Keys, friction grid, configuration,
+vehicle file and queries must be read as defined, and an error must name the wrong field.
 """
 
 from __future__ import annotations

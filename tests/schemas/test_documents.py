@@ -181,8 +181,8 @@ def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Pa
 
 
 def read_descriptor(module: str) -> str:
-    """Return the message definitions in a module that protoc generated, without parts that depend
-    on protoc's version.
+    """Return the message definitions in a module that protoc generated. Parts that depend on
+    protoc's version are left out.
     """
     found = re.search(r"AddSerializedFile\((.*)\)", module)
     assert found

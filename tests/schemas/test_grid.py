@@ -1,5 +1,5 @@
-"""Tests of map cells, tiles and heading sectors: the grid satisfies its theorems, and its borders
-are handled correctly.
+"""Tests of map cells, tiles and heading sectors. The grid must satisfy its theorems, and places on
+its borders must get the right cell.
 """
 
 from __future__ import annotations

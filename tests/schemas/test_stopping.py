@@ -1,5 +1,5 @@
-"""Test that a vehicle which drives at the computed stopping speed can stop within the known
-distance.
+"""Test of the computed stopping speed: a vehicle that drives at this speed must be able to stop
+within the known distance.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests that a third party can take part with the contract (package `schemas`) alone: without
+"""Tests that a third party can take part with the contract (package `schemas`) alone. It has no
 compiler, science library, agent or service.
 """
 
@@ -20,8 +20,8 @@ pytestmark = pytest.mark.timeout(400)
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
-    """Yield the results of a third party's process, with a router and a service in separate
-    processes.
+    """Yield the results that a third party's process printed. The router and the service of the
+    test run in separate processes.
     """
     folder = tmp_path_factory.mktemp("third-party")
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")

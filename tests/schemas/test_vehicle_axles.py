@@ -1,5 +1,5 @@
-"""Tests of the understeer that follows from the axles of a vehicle file: it is unknown without axle
-stiffness, and a calibrated value replaces it.
+"""Tests of the understeer of a vehicle, computed from the axles in its file. It must be unknown
+without axle stiffness, and a calibrated value must replace it.
 """
 
 from __future__ import annotations

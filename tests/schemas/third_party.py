@@ -58,8 +58,8 @@ PROTOBUF_SENDER = "anna"
 
 
 def protobuf_batch(now: int) -> bytes:
-    """Return a batch with observations of one cell and their likelihoods, as protobuf bytes encoded
-    by `schemas.wire`.
+    """Return a batch with observations of one cell and their likelihoods, encoded by `schemas.wire`
+    as protobuf bytes.
     """
     leave = now - SECOND * np.arange(VISITS)[::-1]
     log_likelihood = -0.5 * np.square((mugrid.CENTRES - ICE) / STD)
@@ -112,8 +112,8 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 
 class Heard:
-    """Messages that the third party's subscribers received and decoded, by topic. For an unreadable
-    message the error is stored.
+    """Messages that the third party's subscribers received and decoded, by topic. If a message is
+    unreadable, the error is stored instead.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -157,7 +157,7 @@ def query_replies(session: zenoh.Session, selector: str) -> list[tuple[str, byte
 
 
 def find_blocked() -> list[str]:
-    """Return the forbidden packages that cannot be imported."""
+    """Return the names of the forbidden packages that this process cannot import."""
     out = []
     for name in FORBIDDEN:
         try:

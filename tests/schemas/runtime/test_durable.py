@@ -1,5 +1,5 @@
-"""Tests of durable writing: a file is complete or unchanged, has its permissions from the first
-byte on, and survives power loss.
+"""Tests of durable writing. A file must be complete or unchanged at any time, also after a power
+loss, and must have its permissions from the first byte on.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Tests of figures: a figure meets its target (bar) or misses it, and the file records which."""
+"""Tests of figures (measured values with a target, the bar). A figure meets or misses its bar, and
+the stored file must record which.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tests that hints on installing an extra name the source of this distribution. Its name alone
-would not work, because it is not in a package index.
+"""Tests of hints on installing an extra. A hint must name the source of this distribution, because
+the distribution is in no package index.
 """
 
 from __future__ import annotations

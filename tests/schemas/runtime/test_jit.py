@@ -28,8 +28,8 @@ FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0));
 
 
 def run_outer(folder: Path, factor: str, before: str = "") -> str:
-    """Write two compiled functions, of which `outer` calls `inner`, and `inner` multiplies by
-    `factor`; return the result of outer(1.0) in a new process.
+    """Write two compiled functions: `inner` multiplies by `factor`, and `outer` calls `inner`.
+    Return the result of outer(1.0) in a new process.
     """
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
@@ -68,9 +68,9 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
 @pytest.mark.campaign
 @pytest.mark.parametrize("place", ["/proc/nowhere", ""])
 def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, place: str) -> None:
-    """Without a writable cache folder (service account without a home folder, read-only container),
-    kernels (compiled functions) must be compiled at each start, without a traceback and without
-    files elsewhere.
+    """A service account without a home folder, or a read-only container, has no writable cache
+    folder. Kernels (compiled functions) must then be compiled at each start, without a traceback
+    and without files elsewhere.
     """
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / "__init__.py").touch()

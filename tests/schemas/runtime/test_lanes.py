@@ -1,5 +1,5 @@
-"""Tests of lanes (numbers side by side in a vector register): arithmetic on vectors equals that on
-numbers, and exponential and logarithm equal those of NumPy.
+"""Tests of lanes (numbers side by side in a vector register). Arithmetic on lanes must equal that
+on single numbers. Exponential and logarithm must equal those of NumPy.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class LaneRecord:
 
 @inlined
 def mix_operations(a: float, b: float) -> float:
-    """Compute a value with every operator, for numbers or for lanes (vectors of numbers)."""
+    """Compute a value from `a` and `b` with every operator; both are numbers, or both are lanes
+    (vectors of numbers).
+    """
     total = 0.0
     for k in range(3):
         total += k * a

@@ -1,5 +1,5 @@
-"""Tests of the watch of a session's links (connections to routers): it reports real routers that
-are started and stopped.
+"""Tests of the watch of a session's links (connections to routers). It must report when a real
+router starts and stops.
 """
 
 from __future__ import annotations

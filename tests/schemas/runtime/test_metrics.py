@@ -1,5 +1,5 @@
-"""Tests of metrics and health over real HTTP on loopback: a metrics parser reads all values, health
-follows the reported problems, and log lines are JSON if requested.
+"""Tests of metrics and health over real HTTP on loopback. A metrics parser must read all values,
+health must follow the reported problems, and log lines must be JSON if requested.
 """
 
 from __future__ import annotations
@@ -135,7 +135,9 @@ def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.Monkey
 
 
 def has_ended(connection: socket.socket) -> bool:
-    """Send a byte. Return True if the server has ended the request, with or without an answer."""
+    """Send a byte over the connection. Return True if the server has ended the request, with or
+    without an answer.
+    """
     try:
         connection.send(b"G")
         connection.recv(1)

@@ -1,5 +1,5 @@
-"""Tests of shared libraries of kernels (compiled functions): they give the results of Numba, and
-calls that a library cannot serve are left to Numba or refused.
+"""Tests of shared libraries of kernels (compiled functions). A library must give the results of
+Numba. Calls that it cannot serve must be left to Numba or refused.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ kernels.call_kernels()
 
 
 def run_python(folder: Path, code: str, *words: str) -> list[str]:
-    """Run Python code in a process that can import the test's module `kernels`, and return its
-    output's lines.
+    """Run Python code with the arguments `words` in a process that can import the test's module
+    `kernels`. Return the lines that it prints.
     """
     root = Path(__file__).parents[3]
     environment = os.environ | {
@@ -101,7 +101,7 @@ def run_python(folder: Path, code: str, *words: str) -> list[str]:
 def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
     """The library must give the results of Numba without importing Numba, and must report an
     exception in a kernel (compiled function). Numba must run the calls that the library lacks:
-    those with a result that is no integer, or with an array of another layout.
+    those whose result is no integer, or that have an array of another layout.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
     library = str(tmp_path / "library.so")

@@ -1,4 +1,4 @@
-"""Tests of progress messages on a terminal: they appear while slow libraries are still being
+"""Tests of progress messages. They must appear on a terminal while slow libraries are still being
 loaded, and not at all in quiet mode.
 """
 

@@ -1,5 +1,5 @@
-"""Tests of records: the annotations of a class become the fields of an array, for Python and for
-compiled functions.
+"""Tests of records (structured arrays). The annotations of a class must become the fields of an
+array, for Python and for compiled functions.
 """
 
 from __future__ import annotations

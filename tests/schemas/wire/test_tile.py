@@ -1,5 +1,5 @@
-"""Tests of the tile decoder with untrusted input: a written tile is read back unchanged, and any
-other bytes give a decoding error and nothing else.
+"""Tests of the tile decoder with untrusted input. A written tile must be read back unchanged. Any
+other bytes must give a decoding error and nothing else.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the wire format: a decoded message equals the encoded one for every version ever sent,
-and other bytes are refused with a reason.
+"""Tests of the wire format, in every version ever sent. A decoded message must equal the encoded
+one, and other bytes must be refused with a reason.
 """
 
 from __future__ import annotations
