@@ -29,8 +29,8 @@ class Block:
 
 
 def to_utc_ns(t: FloatArray, start_ns: int) -> IntArray:
-    """Convert times t [s] since the start of a source to [ns UTC], rounded to 1 ns. `start_ns` is
-    the time of the start [ns UTC]. The shape stays the same.
+    """Convert times t [s] since the start of a signal source to [ns UTC], rounded to 1 ns.
+    `start_ns` is the time of the start [ns UTC]. The result has the shape of `t`.
     """
     whole = t.astype(np.int64)
     time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)

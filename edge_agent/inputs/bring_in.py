@@ -28,10 +28,10 @@ PROVENANCE = b"gripmap.import"
 
 
 def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
-    """Read a recording of any supported kind.
+    """Read a recording of any supported file format.
 
     Return the signals that the profile (assignment of signals to channels) needs, or all signals if
-    `profile` is None.
+    `profile` is None. `database` is the CAN database that decodes logs of CAN frames.
 
     Raises:
         InputError: the file is missing, of an unknown kind, broken or too large for the memory, or
@@ -121,8 +121,8 @@ def _decode_frames(
 
 
 def profile_of(log: Path) -> Profile:
-    """Return the profile with which a log was imported. For a log that was not imported, return a
-    profile (assignment of signals to channels) that uses the columns unchanged.
+    """Return the profile (assignment of signals to channels) with which a log was imported. If the
+    log was not imported, return a profile that uses its columns unchanged.
 
     Raises:
         InputError: the file cannot be read.
@@ -138,10 +138,11 @@ def profile_of(log: Path) -> Profile:
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:
-    """Write the merged log as Parquet.
+    """Write a merged signal log to a Parquet file.
 
-    The time column is `timestamp` if the date is known, else `t`. The file's metadata records the
-    sources, the profile and the processing steps.
+    The time column is `timestamp` if the date of the recording is known, else `t`. The file's
+    metadata records the source files, the profile (assignment of signals to channels) and the
+    processing steps.
     """
     columns: dict[str, Any] = {}
     if merged.start_ns is not None:

@@ -38,7 +38,7 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
     Args:
         name: name of the signal, one of CONTEXT.
         values: readings in the unit of the signal log; NaN for a missing reading.
-        active: recorded values at which a flag is on; None: all except 0.
+        active: recorded values at which a flag is on; None means all except 0.
 
     Returns:
         Flags as 0 or 1, wiper limited to the range 0 to 1, temperatures unchanged. Impossible
@@ -53,10 +53,11 @@ def context_values(name: str, values: FloatArray, active: Sequence[float] | None
 
 
 def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) -> FloatArray:
-    """Return the last reading at or before each time t (T,) [s]; NaN if there is no such reading or
-    it is too old.
+    """Return the last reading of a context signal at or before each time t (T,) [s]. It is NaN if
+    there is no such reading or if the reading is older than HELD_S.
 
-    A reading of a `lasting` channel never becomes too old.
+    A reading of a `lasting` channel (sent only when it changes) never becomes too old. `name` is
+    the signal, and `series` its readings.
     """
     known = np.isfinite(series.values)
     times = series.t[known]
@@ -81,7 +82,9 @@ def lasting_signals(profile: Profile) -> set[str]:
 
 
 def context_signals(profile: Profile) -> set[str]:
-    """Return the full names of the signals from which the context channels are computed."""
+    """Return the full names of the recorded signals from which a profile (assignment of signals to
+    channels) computes the context channels (controller flags, temperature, wiper).
+    """
     return {
         name
         for channel in CONTEXT

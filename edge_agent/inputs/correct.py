@@ -1,11 +1,12 @@
 """Correction of signals by a vehicle's calibration: sensor offsets, wheel radii, steering angle and
 delays between devices.
 
-A quantity that was not learned is assumed to be free of error. A learned error is a posterior mean,
-and its prior assumes no error. Therefore the correction is smaller than the measured error. The
-rear steering angle is not corrected. The lateral acceleration a_y is not corrected either. Its
-measured offset on a straight is partly a sensor error and partly due to the crossfall of the road,
-which causes a real tyre force. Drives cannot separate the two.
+The calibration contains errors that were learned from drives. A quantity without a learned error is
+not corrected. A learned error is a posterior mean with a prior around zero. Therefore the
+correction is smaller than the measured error. The rear steering angle is not corrected. The lateral
+acceleration a_y is not corrected either. Its measured offset on a straight road is partly a sensor
+error and partly due to the crossfall of the road, which causes a real tyre force. Drives cannot
+separate the two.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ TURNING = (S.OMEGA, S.OMEGA + 4)
 
 
 class Corrector:
-    """Correction of one vehicle's signals by its calibration; the samples may be passed in blocks
-    of any length.
+    """Corrector of one vehicle's signals for the sensor errors in its calibration. The samples may
+    be passed in blocks of any length.
 
-    Devices have different delays. All readings of a corrected row (sample) describe one moment,
+    Devices have different delays. All readings of a corrected row (sample) describe one moment:
     that of the slowest device's reading, which is up to 0.1 s before the row's time stamp. For each
     faster device the reading nearest to this moment is used, without interpolation.
     """
@@ -87,10 +88,11 @@ def correct_log(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatAr
 
 
 def scale_axles(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Return signals (T, 18) converted to wheels that all have the radius `wheel_radius`.
+    """Return signals (T, 18) converted to wheels that all have the radius `wheel_radius` of the
+    vehicle file.
 
     Wheel speed and torque are scaled so that the speed at the rim and the force on the road stay
-    the same. If the vehicle file has no radius per axle, the result is the same array.
+    the same. If the vehicle file has no radius per axle, the result is the array `signals` itself.
     """
     for axle in range(2):
         share = vehicle.axle_radius(axle) / vehicle.wheel_radius
@@ -134,8 +136,9 @@ def _correct_signals(signals: FloatArray, known: Calibration) -> FloatArray:
 
 
 def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
-    """Return the delay [s] that must be added to the signals of each device so that they match the
-    slowest device. A key is the device's range of channels. The slowest device itself is left out.
+    """Return, for each device, the delay [s] that must be added to its signals so that they match
+    the slowest device. A device is given by its range of channels (first, last + 1). The slowest
+    device itself is left out.
     """
     if known is None or (known.wheel_lag is None and known.steer_lag is None):
         return {}

@@ -1,4 +1,4 @@
-"""Names of the columns of a signal log, and filling of steering angles without a column."""
+"""Names of the columns of a signal log, and steering angles for wheels without a column."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ REAR_STEERING: Final = per_wheel("delta")[2:]
 
 
 def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
-    """Fill the steering angles of wheels without a column, in place; `missing` (4,) is True for
-    these wheels.
+    """Write steering angles into `signals` for the wheels that have no column in the log. `missing`
+    (4,) is True for these wheels.
 
-    A front wheel gets the angle of the other front wheel, a rear wheel gets zero. Columns without
-    readings are not filled.
+    A front wheel gets the angle of the other front wheel, a rear wheel gets zero. A wheel whose
+    column exists but has no readings is not changed.
     """
     if missing[0]:
         signals[:, S.DELTA] = signals[:, S.DELTA + 1]

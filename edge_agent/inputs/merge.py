@@ -53,10 +53,11 @@ SMOOTH: Final = 50
 
 @dataclass
 class Merged:
-    """A merged signal log.
+    """A signal log that was merged from recordings.
 
-    `t` (T,) [s] starts at 0, and `columns` are the channels by name. `start_ns` is the [ns UTC] of
-    t = 0 if a source had a date, else None. `notes` describe the processing steps.
+    `t` (T,) [s] starts at 0, and `columns` are the channels by name. `start_ns` is the time [ns
+    UTC] of t = 0 if a source had a date, else None. `notes` describe the processing steps, and
+    `origins` the source of each channel.
     """
 
     t: FloatArray
@@ -139,9 +140,9 @@ def merge_recordings(
 
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
-    """Return a pair (index, rule) for each channel of the signal log. The index is that of the
-    recording that contains the channel's signals. The rule, from the profile, converts these
-    signals to the channel.
+    """Return, for each channel of the signal log that was recorded, a pair (index, rule). The index
+    is that of the recording that contains the channel's signals. The rule, from the profile
+    (assignment of signals to channels), converts these signals to the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.
@@ -168,8 +169,10 @@ def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tup
 def _align_clocks(
     recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
 ) -> tuple[list[float], int | None]:
-    """Return the seconds to add to the times of each recording, and the [ns UTC] of time 0 (None
-    without a date). `reference` is the index of the recording whose clock is used for the log.
+    """Return the seconds that must be added to the times of each recording, and the time [ns UTC]
+    of t = 0 of the log (None without a date). `reference` is the index of the recording whose clock
+    is used for the log. `shifts` are further corrections [s] by source, and `notes` receive
+    messages.
     """
     spans = [_time_span(recording) for recording in recordings]
     base = recordings[reference].start_ns
@@ -230,7 +233,15 @@ def _spans_overlap(span: tuple[float, float], shift: float, other: tuple[float, 
 def make_channel(
     name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
 ) -> tuple[Series, float]:
-    """Return a channel in SI units at its own times, and the jitter of its time stamps [s].
+    """Return the readings of a channel in SI units at their own times, and the jitter of their time
+    stamps [s].
+
+    Args:
+        name: name of the channel.
+        channel: its rule in the profile: which signals it uses and their conversion.
+        recording: recording that contains the signals.
+        radius: wheel radius [m], if known.
+        ratio: steering ratio, if known.
 
     Raises:
         InputError: the unit requires the wheel radius or the steering ratio, and it is not known.
@@ -288,8 +299,8 @@ def make_channel(
 
 
 def _hold_last(series: Series, t: FloatArray) -> FloatArray:
-    """Return, for each time in `t` (n,), the last reading of a series (recorded signal) at or
-    before it; for times before the first reading, the first reading.
+    """Return, for each time in `t` (n,) [s], the last reading of a series (recorded signal) at or
+    before this time. For a time before the first reading, return the first reading.
     """
     return series.values[
         np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)
@@ -325,7 +336,9 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _still_courses(series: dict[str, Series]) -> None:
-    """Set the course over ground of a position receiver to NaN at walking speed."""
+    """Set the course over ground of a position receiver to NaN (unknown) at walking speed, in
+    place. `series` has the signals of the receiver by name.
+    """
     if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
         yaw = series["yaw"]
         speed = series[GROUND].values

@@ -80,8 +80,8 @@ def split_words(name: str) -> str:
 
 
 def place_of(plain: str) -> str | None:
-    """Return the wheel ("fl", "fr", "rl" or "rr") that the words of a signal's name denote; None if
-    they denote no wheel.
+    """Return the wheel ("fl", "fr", "rl" or "rr") that the words of a signal's name (`plain`)
+    denote; None if they denote no wheel.
     """
     tokens = plain.split()
     for wheel, spellings in PLACES.items():

@@ -1,5 +1,5 @@
-"""A profile, stored as validated JSON: it maps the signals of a recording, by name, to channels of
-the signal log.
+"""Profile of a recording, stored as validated JSON. It maps the signals of the recording, by name,
+to channels of the signal log.
 
     value of a channel = scale · (sum of its signals, in SI) · sign + offset,
     at the time (time stamp − delay_s)
@@ -36,7 +36,7 @@ class Part(BaseModel):
 
 
 class Sign(Part):
-    """Recorded signal that gives the sign of another signal's value: the value is negative where
+    """Rule for the sign of a channel's value: the value is negative where the recorded signal
     `signal` equals `negative`.
     """
 
@@ -92,16 +92,16 @@ class Channel(Part):
 
     @property
     def signals(self) -> list[str]:
-        """Return the full names of the signals whose values are added to give the value of this
-        channel of the signal log.
+        """Return the full names of the recorded signals whose sum gives the value of this channel
+        of the signal log.
         """
         names = [self.signal] if isinstance(self.signal, str) else self.signal
         return [self.full_name(name) for name in names]
 
     @property
     def gates(self) -> dict[str, list[float]]:
-        """Return the full names of the signals that state the validity of a reading, each with the
-        values that mean "valid".
+        """Return the signals that state the validity of this channel's readings, by full name. Each
+        has the list of its values that mean "valid".
         """
         return {self.full_name(name): values for name, values in self.valid.items()}
 
@@ -181,7 +181,7 @@ def load_profile(name: str) -> tuple[Profile, Path]:
     profile; return it with the folder of its CAN database.
 
     Raises:
-        InputError: it cannot be read, or a field is missing, unknown or out of range.
+        InputError: the profile cannot be read, or a field is missing, unknown or out of range.
     """
     path = FOLDER / f"{name}.json" if name in shipped_profiles() else Path(name)
     try:

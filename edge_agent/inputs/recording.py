@@ -28,12 +28,12 @@ class Series:
 
 @dataclass
 class Recording:
-    """Signals of one source by name, all with the same clock.
+    """Signals of one source of a recording, such as a file, by name; all have the same clock.
 
     Attributes:
         name: name of the file, for messages.
-        signals: the series by name.
-        start_ns: [ns UTC] of t = 0, None if the source has no date.
+        signals: the recorded signals by name.
+        start_ns: time [ns UTC] of t = 0; None if the source has no date.
         rows: True if all signals have the same times, like the columns of a table.
         notes: remarks of the reader.
     """
@@ -47,11 +47,11 @@ class Recording:
 
 @contextmanager
 def foreign_errors(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception that a library raises on a broken file into a one-line error that names
-    the file.
+    """Return a context manager that converts any exception of a library in the `with` block into a
+    one-line error that names the file.
 
     Raises:
-        InputError: the file cannot be read as `kind`.
+        InputError: the file cannot be read as `kind`, the name of its format.
     """
     try:
         yield
@@ -70,7 +70,8 @@ def foreign_errors(path: Path, kind: str) -> Iterator[None]:
 
 # Modules have no common type.
 def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401
-    """Import an optional library and return it.
+    """Import the optional library `name` and return it. `extra` is the optional part of the package
+    that installs the library.
 
     Raises:
         InputError: the library is not installed.

@@ -43,8 +43,8 @@ BLOCK_ROWS: Final = 16_384
 
 @dataclass(frozen=True)
 class SignalLog:
-    """A signal log in memory: t (T,) [s] as recorded, signals (T, channels), and the [ns UTC] of t
-    = 0 if the log states it, else None.
+    """A signal log in memory. `t` (T,) [s] are the times as recorded and `signals` (T, channels)
+    the readings. `start_ns` is the time [ns UTC] of t = 0 if the log states it, else None.
     """
 
     t: FloatArray
@@ -57,7 +57,7 @@ class SignalLog:
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
         """Yield the samples of the signal log in order, in blocks of at most `rows` samples.
-        `start_ns` is the [ns UTC] of t = 0.
+        `start_ns` is the time [ns UTC] of t = 0.
         """
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
@@ -115,8 +115,8 @@ def _read_table(path: Path) -> pa.Table:
 
 
 def _read_context(table: pa.Table) -> FloatArray | None:
-    """Return the context signals (flags and surroundings), (T, len(CONTEXT)); None if the log has
-    no context column.
+    """Return the context signals of a log (controller flags, air temperature, wiper), (T,
+    len(CONTEXT)). Return None if the log has no context column.
     """
     if not set(CONTEXT) & set(table.column_names):
         return None
@@ -128,7 +128,7 @@ def _read_context(table: pa.Table) -> FloatArray | None:
 
 
 def _float_column(table: pa.Table, name: str) -> FloatArray:
-    """Return a column as float64 (n,), with NaN for null.
+    """Return the column `name` of a table as float64 (n,), with NaN for null.
 
     The result is a writable copy. Arrow's own array is read-only, and numba would compile a second
     version of each function for it.

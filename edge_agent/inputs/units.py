@@ -94,24 +94,26 @@ assert set(QUANTITY) == {*CHANNELS, *CONTEXT}
 
 
 def standard_spelling(text: str) -> str:
-    """Return the standard spelling of a unit; an unknown unit is returned in lower case."""
+    """Return the standard spelling of a unit, given as `text`. An unknown unit is returned in lower
+    case without blanks.
+    """
     plain = re.sub(r"\s", "", text.lower())
     return SPELLINGS.get(plain, plain)
 
 
 def unit_of_channel(channel: str, text: str) -> str | None:
-    """Return the unit of a channel as the recording states it in `text`; None if the stated unit
-    does not fit the channel.
+    """Return the unit that a recording states for a channel in `text`, in standard spelling. Return
+    None if the stated unit does not fit the channel.
     """
     unit = standard_spelling(text)
     return unit if unit in QUANTITY[channel] else None
 
 
 def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
-    """Return the factor that converts values of a channel from the recorded unit to the unit of the
-    signal log.
+    """Return the factor that converts the values of a channel from the recorded `unit` to the unit
+    of the signal log.
 
-    Return None if a speed at the rim requires a wheel radius that is not known.
+    Return None if the values are speeds at the rim and the wheel radius [m] is not known.
     """
     factor = QUANTITY[channel][unit]
     if channel.startswith("omega") and unit in SPEED:

@@ -1,13 +1,13 @@
-"""Begin and end of visits (passages of one map cell): computes the cell and heading sector of a
-vehicle from position fixes and yaw, sample by sample.
+"""Cell tracker: finds the map cell and the heading sector of each vehicle at each sample, from its
+position fixes and yaw. It thereby finds the start and the end of each visit (passage of one cell).
 
 A visit begins with a position fix in a new cell or heading sector. Fixes are noisy, and a road may
 run along a border. Therefore a visit ends only when a fix lies clearly outside: CELL_MARGIN beyond
 the cell, or SECTOR_KEEP beyond the sector. After FIX_HELD_S without a fix the vehicle is in no cell
-(cell -1). Without yaw the course over ground is used.
+(cell -1). If the yaw is unknown, the course over ground is used instead.
 
-The module is pure: the state between blocks of samples is a `CellTrack` per vehicle. Any division
-of the samples into blocks gives the same result.
+The module is pure (no I/O). The state between two blocks of samples is one `CellTrack` per vehicle.
+Any division of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ NOWHERE: Final = -1  # cell of a vehicle without position
 
 
 class CellTrack:
-    """State of the cell tracking of one vehicle, as a record that is kept between blocks of
-    samples; NaN where nothing has been received yet.
+    """State of the cell tracking of one vehicle (last fix, visited cell), as an array record that
+    is kept between two blocks of samples. A value is NaN where nothing has been received yet.
     """
 
     fix_time: float  # [s] time of the last fix
@@ -56,8 +56,8 @@ class CellTrack:
 
 
 class ReceiverSample:
-    """One sample of the position receiver, as a record: position [deg], yaw [rad], its cell and the
-    cell's borders.
+    """One sample of the position receiver, as an array record: position [deg], yaw [rad], the map
+    cell that contains the position, and the borders of this cell [deg].
     """
 
     latitude: float
@@ -71,7 +71,7 @@ class ReceiverSample:
 
 
 class Located(NamedTuple):
-    """Cells visited by N vehicles at T samples, shape (T, N).
+    """Cells visited by N vehicles at T samples; each array has the shape (T, N).
 
     closes: True where the previous visit (passage of a cell) has ended: at the first sample in a
     new cell or sector, or in no cell. inside, outside: True where a position fix of this sample
@@ -91,8 +91,9 @@ class Located(NamedTuple):
 
 
 def new_tracks(vehicles: int) -> RecordArray:
-    """Return the initial tracks (N,) (states of the cell tracking) of vehicles that have not
-    received a position."""
+    """Return the initial states of the cell tracking, (N,), for N vehicles that have not received a
+    position.
+    """
     tracks = records(CellTrack, vehicles)
     for name in tracks.dtype.names or ():
         tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan
@@ -102,12 +103,12 @@ def new_tracks(vehicles: int) -> RecordArray:
 def locate_vehicles(
     tracks: RecordArray, t: FloatArray, signals: FloatArray, *, lost: bool = False
 ) -> tuple[RecordArray, Located]:
-    """Compute the cells of N vehicles in a block of samples.
+    """Compute the map cells in which N vehicles are, for a block of samples.
 
     Args:
         tracks: (N,) states of the cell tracking after the previous block.
-        t: (T, N) [s].
-        signals: (T, N, channels).
+        t: (T, N) times of the samples [s].
+        signals: (T, N, channels) measurements.
         lost: True to forget the last position fixes, which ends every visit (passage of a cell).
 
     Returns:
@@ -149,8 +150,8 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
 
 @compiled
 def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
-    """Update the course over ground [rad from east] in `track`, the vehicle's state of the cell
-    tracking, if the vehicle has moved far enough since the last update.
+    """Update the vehicle's course over ground [rad from east] in its tracking state `track`. The
+    course changes only if the vehicle has moved far enough since the last update.
     """
     north = (latitude - track.course_latitude) * METRES_PER_DEGREE
     east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
@@ -179,8 +180,8 @@ def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
 
 @compiled
 def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
-    """Store the position and the yaw of a sample in `track`, the vehicle's state of the cell
-    tracking, if they are valid.
+    """Store the position and the yaw of one sample, each only if it is valid, in the vehicle's
+    tracking state `track`.
     """
     if np.isfinite(fix.yaw):
         track.yaw_time = now
@@ -194,8 +195,9 @@ def _store_readings(track: CellTrack, fix: ReceiverSample, now: float) -> None:
 
 @compiled
 def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
-    """Begin a visit (passage) of the map cell that contains the fix, in the sector of `heading`
-    [rad]."""
+    """Begin a visit (passage) of the map cell that contains the position `fix`, in the heading
+    sector that contains the direction `heading` [rad].
+    """
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
     track.west = fix.west
@@ -208,8 +210,8 @@ def _begin_visit(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
 def _advance_tracks(
     t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located
 ) -> None:
-    """Advance the tracks (states of the cell tracking) sample by sample, and write the cells to
-    `located`; this is the compiled part of `locate_vehicles`.
+    """Advance the tracking states of all vehicles sample by sample, and write the visited cells to
+    `located`. This is the compiled part of `locate_vehicles`.
     """
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):

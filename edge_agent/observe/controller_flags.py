@@ -1,5 +1,5 @@
-"""Filter for implausible controller flags, such as a lamp that is always on or a wrongly decoded
-bit. Such a flag counts as unknown.
+"""Filter for implausible flags of controllers (ABS, ESC, traction control), such as a lamp that is
+always on or a wrongly decoded bit. Such a flag counts as unknown.
 
 A flag is implausible
 
@@ -9,9 +9,9 @@ A flag is implausible
 - while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S
   of them.
 
-The second condition ends when the flag was off for OFF_S, and the third when the share decreases.
-The module is pure. A `FlagRecord` per vehicle and flag is kept between blocks, so that any division
-of the samples into blocks gives the same result.
+The second condition ends when the flag was off for OFF_S. The third ends when the share of active
+time falls again. The module is pure (no I/O). A `FlagRecord` per vehicle and flag is kept between
+blocks, so that any division of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (
 
 
 class Doubt(IntEnum):
-    """Reason why a flag is implausible; reasons are added."""
+    """Reason why a controller flag is implausible. The numbers of several reasons are added."""
 
     NEVER_OFF = 1
     STANDING = 2
@@ -89,9 +89,9 @@ def trusted_context(
 
     Args:
         before: (N, len(FLAGS)) states of the flags after the previous block.
-        t: (T, N) [s].
+        t: (T, N) times of the samples [s].
         signals: (T, N, channels); the wheel speeds show whether the vehicle stands.
-        context: (T, N, len(CONTEXT)).
+        context: (T, N, len(CONTEXT)) context signals, which contain the flags.
 
     Returns:
         the states for the next block, and the context signals with NaN for implausible flags.
@@ -110,8 +110,8 @@ def trusted_context(
 
 
 def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
-    """Return (index of the vehicle, name of the flag, reason) for each flag that is implausible
-    now.
+    """Return a list of the controller flags that are implausible now, as (index of the vehicle,
+    name of the flag, reason).
     """
     return [
         (
@@ -156,7 +156,7 @@ def _count_sample(record: FlagRecord, dt: float, on: bool, stands: bool) -> None
     implausible (`record.doubt`).
 
     Args:
-        record: state of the flag.
+        record: state of the flag, which is changed.
         dt: time since the flag's previous known sample [s].
         on: True if the flag is on in this sample.
         stands: True if the vehicle stands in this sample.

@@ -52,9 +52,9 @@ EXCLUDED_NATS: Final = -3.0
 
 class RecordBlock(NamedTuple):
     """Records of one kind, ready for publication: observations (one per visited map cell) or states
-    (position, motion and friction at a fixed rate). Attributes are the columns of the message (n,
-    …), the index of the vehicle (n,), and a mask (n,) of urgent records, which are sent
-    immediately.
+    (position, motion and friction at a fixed rate). `columns` are the columns of the message (n,
+    …). `vehicle` is the index of each record's vehicle (n,). `urgent` is True for records that must
+    be sent immediately (n,).
     """
 
     kind: Kind
@@ -64,7 +64,9 @@ class RecordBlock(NamedTuple):
 
 
 class Visit:
-    """One visit (passage of a map cell), open or ended, as a record."""
+    """One visit (passage of a map cell by a vehicle) that has begun or has ended, as an array
+    record.
+    """
 
     sample: int  # index in the block of the sample at which the visit ended
     vehicle: int
@@ -104,8 +106,8 @@ class Visit:
 
 
 class Sample:
-    """Estimates for one vehicle at one sample, with the measured accelerations, as a record for
-    compiled code.
+    """Estimates for one vehicle at one sample, with the measured accelerations, as an array record
+    for compiled code.
     """
 
     health: int
@@ -129,19 +131,20 @@ class OpenVisits:
 
     @staticmethod
     def before_any(vehicles: int) -> OpenVisits:
-        """Return the initial records of vehicles that have not begun a visit (passage of a map
-        cell)."""
+        """Return the initial records (N,) for N vehicles that have not begun a visit (passage of a
+        map cell).
+        """
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
 
 
 class BlockReadings(NamedTuple):
-    """Signals of a block of samples, as far as they are known.
+    """Measurements of a block of samples for the observations; each array may be missing.
 
     Without `signals` (T, N, channels), observations do not contain the direction in which grip was
-    used. Without `context` (T, N, len(CONTEXT)), they contain no controller flags, air temperature
-    and wiper.
+    used. Without `context` (T, N, len(CONTEXT)), they contain no controller flags, no air
+    temperature and no wiper state.
     """
 
     signals: FloatArray | None = None
@@ -159,9 +162,11 @@ def build_records(
     config: AgentConfig,
     readings: BlockReadings = NO_READINGS,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Build the records of a block of samples with times (T, N) [ns UTC]. Return the open visits
-    (passages of a map cell), the observations of ended visits, and the vehicles' states (position,
-    motion and friction at a fixed rate).
+    """Build the records of a block of samples with times (T, N) [ns UTC]. `before` has the visits
+    (passages of a map cell) that were open before the block.
+
+    Return the visits open after the block, the observations of ended visits, and the vehicles'
+    states (position, motion and friction at a fixed rate).
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -225,8 +230,8 @@ def _advance_visits(
     visits: Records[Visit],
     ended: Records[Visit],
 ) -> int:
-    """Add each sample to its visit (passage of a map cell), and write a visit to `ended` when the
-    next one begins; return the number of ended visits.
+    """Add each sample to its vehicle's visit (passage of a map cell). Write a visit to `ended` at
+    the sample that ends it. Return the number of ended visits.
     """
     count = 0
     for k in range(time.shape[0]):
@@ -258,7 +263,7 @@ def _advance_visits(
 
 @compiled
 def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
-    """Start a new visit (passage of a map cell) in the record, still without samples."""
+    """Start a new visit (passage of a map cell) in the record `visit`. It has no samples yet."""
     visit.enter_time = time
     visit.cell = cell
     visit.sector = sector
@@ -289,8 +294,8 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
     cell.
 
     `told` is the log-likelihood of friction from the part that ends. The grip used in that part
-    cannot exceed the largest friction that `told` does not exclude, so that the record of the grip
-    used is limited to this value.
+    cannot exceed the largest friction that `told` leaves possible. Therefore the stored grip is
+    limited to this friction.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):
@@ -330,8 +335,9 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
 
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
-    """Add one sample of the context signals (controllers, surroundings; (len(CONTEXT),)) to a visit
-    (passage of a map cell); NaN are skipped."""
+    """Add one sample of the context signals (controller flags, air temperature, wiper),
+    (len(CONTEXT),), to a visit (passage of a map cell). Signals that are NaN are skipped.
+    """
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
@@ -364,12 +370,12 @@ def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Column
 
 
 def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
-    """Return the grip used in longitudinal and in lateral direction of the vehicle, (n,). The
-    squared total is divided in proportion to the summed squared accelerations of the two
-    directions. The result is NaN without acceleration readings.
+    """Return the grip used in longitudinal and in lateral direction of the vehicle, (n,) each, for
+    n ended visits (passages of a map cell). Both are NaN without acceleration readings.
 
-    A visit (passage of a map cell) may contain both braking and driving, or left and right turns.
-    The sign is that of the stronger one.
+    The square of the total grip used is divided between the two directions in proportion to their
+    summed squared accelerations. A visit may contain both braking and driving, or left and right
+    turns. The sign is that of the stronger one.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -436,8 +442,8 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     """Return the observation columns about controllers and surroundings for n visits (passages of a
     map cell), (n,) each.
 
-    A flag is 1 if it was on at any sample. It is 0 if it was never on and was known at KNOWN_SHARE
-    of the samples. Otherwise it is unknown.
+    A controller flag is 1 if it was on at any sample. It is 0 if it was never on and was known at
+    KNOWN_SHARE of the samples. Otherwise it is unknown.
     """
     known = ended["known"]
     told = ended["told"]
@@ -456,8 +462,8 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
     (n, 32); (n, 0) for an estimator without evidence (likelihood of friction).
 
     The likelihood is flat for a visit that the estimator did not process from its start. If
-    friction changed within the cell, the friction before or after the change may apply, so that the
-    larger of both likelihoods counts.
+    friction changed within the cell, the friction before or after the change may apply. Therefore
+    the larger of both likelihoods counts.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)
@@ -471,9 +477,9 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states (position, motion and friction) to publish: the first sample with a known
-    position in each time slot (reporting interval). The function updates `after.slot`, the number
-    of the last slot.
+    """Return the states (position, motion and friction) to publish: for each vehicle and time slot
+    (reporting interval), the first sample with a known position. The function stores the number of
+    each vehicle's last slot in `after.slot`.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

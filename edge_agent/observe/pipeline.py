@@ -1,5 +1,5 @@
-"""One step of the estimation loop. From a block of samples it computes the cells in which the
-vehicles are, the estimates, and the records for publication.
+"""One step of the estimation loop. From a block of samples it computes the map cells in which the
+vehicles are, the estimates of motion and friction, and the records for publication.
 
 The step is the same for one car and for a fleet, live and in a replay.
 """
@@ -45,8 +45,9 @@ class Seen(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """Friction of the vehicles at the end of a block of samples, (N,) each: quantiles of mu, grip
-    used, time [ns UTC]; NaN where unknown.
+    """Friction of the vehicles at the end of a block of samples, (N,) each: median, lower and upper
+    quantile of the friction mu, grip used (force over load), time [ns UTC]. A value is NaN where
+    unknown.
     """
 
     mu: FloatArray
@@ -57,8 +58,9 @@ class Grip(NamedTuple):
 
 
 class Pipeline:
-    """Estimators of N vehicles (bank), with the open visits (passages of a map cell) of the
-    vehicles. Call `step` for each block of samples in order, then `finish` once.
+    """Estimation and record building for N vehicles: their estimators (the bank) and their open
+    visits (passages of a map cell). Call `step` for each block of samples in order, then `finish`
+    once.
     """
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
@@ -74,9 +76,9 @@ class Pipeline:
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
-        """Process a block of at least one sample. Return the estimates, the observations of ended
-        visits (passages of a map cell), and the vehicles' states (position, motion and friction at
-        a fixed rate).
+        """Process a block of at least one sample. Return the estimates of all samples, the
+        observations of ended visits (passages of a map cell), and the vehicles' states (position,
+        motion and friction at a fixed rate).
 
         For privacy, records near the beginning and end of a trip are left out.
         """
@@ -126,8 +128,8 @@ class Pipeline:
         return self._bank.beliefs()
 
     def doubted_flags(self) -> list[tuple[int, str, str]]:
-        """Return (index of the vehicle, name of the flag, reason) for each controller flag that is
-        implausible and therefore ignored now.
+        """Return a list of the controller flags that are implausible and therefore ignored now, as
+        (index of the vehicle, name of the flag, reason).
         """
         return doubted_flags(self._flags)
 

@@ -60,8 +60,8 @@ class TripEnds:
         self._drop_old_track()
 
     def release_records(self, records: RecordBlock) -> RecordBlock:
-        """Return the records that may be published now, from `records` and from those
-        that waited.
+        """Return the records that may be published now. They come from `records` and from the
+        records that waited since earlier calls; the others wait on.
         """
         if self._is_off or self._began is None:
             return records
@@ -76,8 +76,8 @@ class TripEnds:
         return _select_rows(both, begun & passed)
 
     def _drop_old_track(self) -> None:
-        """Delete the stored times and distances of the vehicles that are no longer needed, because
-        they are older than the oldest waiting record.
+        """Delete the stored times and distances of the vehicles that are older than the oldest
+        waiting record, because they are no longer needed.
         """
         waiting = [
             r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
@@ -87,8 +87,9 @@ class TripEnds:
             del self._times[0], self._odometers[0]
 
     def _distance_at(self, time: IntArray, vehicle: IntArray) -> FloatArray:
-        """Return the distance (n,) [m] that each vehicle had driven at a time (n,) [ns UTC],
-        interpolated between the ends of blocks of samples.
+        """Return the distances (n,) [m] that n vehicles had driven since the start of the trip.
+        Element i is the distance of the vehicle with index `vehicle[i]` at `time[i]` [ns UTC]. It
+        is interpolated between the ends of the blocks of samples.
         """
         times = np.vstack(self._times)
         odometers = np.vstack(self._odometers)

@@ -1,5 +1,6 @@
-"""Processing of acknowledgements from fleet services. An acknowledgement settles batches: they are
-removed from the outbox (store on disk). It also shows how far the vehicle's clock is behind.
+"""Processing of acknowledgements from fleet services. An acknowledgement settles batches (messages
+with records): they are removed from the outbox (store on disk). It also shows how far the vehicle's
+clock is behind the service's clock.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Counts:
-    """Numbers of records by kind and by result (published, acknowledged, rejected, dropped), and
-    numbers of late batches (too late for the map to use in order of time) and of resent batches.
+    """Counts of the publisher. `offered`, `published`, `acknowledged`, `rejected` and `dropped` are
+    numbers of records of each kind. `late` counts batches that arrived too late for the map to use
+    in order of time, and `resent_batches` counts batches that were sent again.
     """
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
@@ -43,12 +45,12 @@ class Counts:
 
 
 class AckSettlement:
-    """Queue of received acknowledgements. The sending thread takes them from it and applies them to
-    the outbox (store of unsent and unanswered batches).
+    """Queue of received acknowledgements. The sender thread takes them from the queue and removes
+    the acknowledged batches from the outbox (store of unsent and unanswered batches).
 
     Attributes:
-        clock_behind_s: how far the vehicle's clock is behind the clock of the last service that
-            answered [s].
+        clock_behind_s: time [s] by which the vehicle's clock is behind that of the service that
+            answered last.
     """
 
     def __init__(
@@ -61,14 +63,14 @@ class AckSettlement:
         self.clock_behind_s = 0.0
 
     def receive_ack(self, vehicle: str, payload: bytes) -> None:
-        """Queue a received acknowledgement for the vehicle. This method is called on a thread of
-        Zenoh.
+        """Queue the `payload` of an acknowledgement that `vehicle` received. Zenoh calls this
+        method on one of its own threads.
         """
         self._acks.put((vehicle, payload))
 
     def settle_received(self) -> None:
-        """Apply all queued acknowledgements. An unreadable acknowledgement, or one for another
-        vehicle, is ignored and counted.
+        """Apply all queued acknowledgements to the outbox (store of batches on disk). An
+        acknowledgement that is unreadable or names another vehicle is ignored and counted.
         """
         while not self._acks.empty():
             vehicle, payload = self._acks.get()
@@ -104,8 +106,8 @@ class AckSettlement:
                 )
 
     def _compare_clocks(self, reported: int) -> None:
-        """Compare the vehicle's clock with the time [ns UTC] that a service reported; 0 means
-        unknown.
+        """Store the difference between the vehicle's clock and the time [ns UTC] that a service
+        reported, and log a large difference. A reported time of 0 means unknown.
 
         The comparison assumes that an acknowledgement is about a second old on arrival.
         """

@@ -27,8 +27,9 @@ UNNUMBERED: Final = 0  # placeholder until the outbox stores and numbers the bat
 
 @dataclass(frozen=True)
 class Draft:
-    """Batch of records that has no sequence number yet; `encode(seq, first_held)` returns its
-    payload with this number.
+    """Batch of records that has no sequence number yet. `encode(seq, first_held)` returns its
+    payload with the sequence number `seq`, and with `first_held`, the oldest number still in the
+    outbox.
     """
 
     vehicle: str
@@ -53,8 +54,8 @@ class _Group:
 
 
 class Batcher:
-    """Collector that makes batches from the records of the named vehicles. A batch has at most
-    `rows` records and waits at most `flush_s` seconds.
+    """Collector that groups the records of the vehicles `names` into batches (messages). A batch
+    has at most `rows` records, and its oldest record waits at most `flush_s` seconds.
     """
 
     def __init__(
@@ -69,14 +70,15 @@ class Batcher:
 
     @property
     def records(self) -> int:
-        """Return the number of records that wait for a batch."""
+        """Return the number of records that are not yet part of a batch."""
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:
-        """Add records. Records of one vehicle and region keep their order.
+        """Add records to the groups of their vehicle, kind and region at time `now` [s]. The
+        records of each group keep their order.
 
         Raises:
-            IndexError: a record belongs to an unknown vehicle.
+            IndexError: a record has a vehicle index without a name.
         """
         if not len(records.vehicle):
             return
@@ -97,8 +99,9 @@ class Batcher:
             group.urgent |= bool(records.urgent[chosen].any())
 
     def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
-        """Remove from the collector the batches that are due (or all batches, with `everything`),
-        and return them."""
+        """Remove the records whose batch is due at time `now` [s] from the collector, and return
+        the batches. With `everything`, all batches are due.
+        """
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
             whole = everything or group.urgent or now - group.since >= self._flush_s
@@ -133,8 +136,11 @@ class Batcher:
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Divide the first `ready` records into batches: yield the range [first, last) of each batch. A
-    batch has at most `rows` records and a limited time span, because a replayed drive may be long.
+    """Divide the first `ready` records, which have the times `time` [ns], into batches. Yield the
+    index range [first, last) of each batch.
+
+    A batch has at most `rows` records. Its time span is limited too, because a replayed drive may
+    be long.
     """
     first = 0
     for at in range(1, ready + 1):
@@ -148,6 +154,7 @@ def _slice_columns(columns: Columns, first: int, last: int) -> Columns:
 
 
 def _encode_batch(batch: Batch, seq: int, first_held: int) -> bytes:
-    """Encode a batch with the sequence number that the outbox (store on disk) assigned, and return
-    the payload."""
+    """Return the payload of a batch with its sequence number `seq`. The outbox (store on disk)
+    assigned this number. `first_held` is the stream's lowest number that is still in the outbox.
+    """
     return encode(replace(batch, seq=seq, first_held=first_held))

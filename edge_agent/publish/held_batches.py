@@ -1,5 +1,6 @@
-"""In-memory index of the batches in an outbox (store on disk), without their payloads: by key, by
-stream and in order of age. The module is pure (no I/O).
+"""In-memory index of the batches in an outbox (store on disk), without their payloads. A batch is
+found by its key (row number in the file), by its stream (vehicle, start, kind, region), or in order
+of age. The module is pure (no I/O).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ LEAST_OLDEST: Final = 1000  # number of keys before the list is searched for rem
 
 
 class Stream(NamedTuple):
-    """Stream of batches with its own sequence numbers, which count from 1. A stream has all batches
-    of one vehicle, one start of the agent (`boot`), one kind of record and one region (z10
+    """Identity of a stream of batches, whose sequence numbers count from 1. A stream has all
+    batches of one vehicle, one start of the agent (`boot`), one kind of record and one region (z10
     quadint).
     """
 
@@ -32,8 +33,9 @@ class Stream(NamedTuple):
 
 @dataclass(slots=True)
 class HeldBatch:
-    """Data of a batch in the outbox (store on disk), without its payload. While the batch is in
-    flight (sent and not answered), `due` is the time [s] of its next resend.
+    """Data of a batch in the outbox (store on disk), without its payload. `due` is the time [s] at
+    which the batch is sent again if no answer came. It is None while the batch is not in flight
+    (sent and not answered).
     """
 
     stream: Stream
@@ -47,7 +49,7 @@ class HeldBatch:
 @dataclass
 class _Sequence:
     """Sequence numbers of one stream (vehicle, start, kind, region): the next free number, and the
-    numbers of the stream's batches in the outbox (store on disk).
+    key of each of its batches in the outbox (store on disk) by sequence number.
     """
 
     stream: Stream
@@ -59,7 +61,8 @@ class _Sequence:
         """Return the lowest sequence number of a batch of this stream that is still in the outbox
         (store on disk). If there is none, return the next free number.
 
-        The search continues where the last one ended, so that each number is skipped only once.
+        Each call continues the search where the last call ended, so that each number is skipped
+        only once.
         """
         while self.first < self.next and self.first not in self.held:
             self.first += 1
@@ -94,7 +97,9 @@ class HeldBatches:
         return iter(self._entries)
 
     def add_batch(self, key: int, batch: HeldBatch) -> None:
-        """Add a batch (message with records) of the outbox's file to the index."""
+        """Add a batch (message with records) to the index. `key` is its row number in the outbox's
+        file.
+        """
         self._entries[key] = batch
         oldest = self._oldest[batch.stream.kind]
         oldest.append(key)
@@ -109,7 +114,7 @@ class HeldBatches:
         self.bytes += batch.size
 
     def remove_batch(self, key: int) -> HeldBatch:
-        """Remove the batch with this key from the index and return it."""
+        """Remove the batch with the row number `key` from the index, and return the batch."""
         batch = self._entries.pop(key)
         sequence = self._streams[batch.stream]
         del sequence.held[batch.seq]
@@ -119,8 +124,8 @@ class HeldBatches:
         return batch
 
     def remove_all(self) -> None:
-        """Remove all batches (messages not yet answered) from the index. The sequence numbers of
-        this start's streams (vehicle, kind, region) continue.
+        """Remove all batches (messages not yet answered) from the index. The streams (vehicle,
+        kind, region) of the present start of the agent keep their next sequence numbers.
         """
         own = {
             stream: sequence
@@ -135,9 +140,9 @@ class HeldBatches:
         self.bytes = 0
 
     def has_stream(self, stream: Stream) -> bool:
-        """Return True if the index knows the stream (vehicle, start, kind, region): it has had
-        batches since this start, or it has batches of an earlier start in the outbox (store on
-        disk).
+        """Return True if the index knows the stream (vehicle, start, kind, region). That is the
+        case if the stream had batches since this start of the agent, or if batches of an earlier
+        start are still in the outbox (store on disk).
         """
         return stream in self._streams
 
@@ -160,8 +165,8 @@ class HeldBatches:
         return {key for first, last in ranges for key in _keys_within(held, first, last)}
 
     def pop_oldest(self, kind: Kind) -> int | None:
-        """Return the key of the oldest batch of a kind, or None if there is none. The key is
-        removed from the list that is sorted by age, so that the next call returns the next oldest
+        """Return the key of the oldest batch of a kind, or None if there is none. The method also
+        removes the key from the list sorted by age, so that the next call returns the next oldest
         batch.
         """
         oldest = self._oldest[kind]
@@ -205,9 +210,9 @@ class HeldBatches:
 
 
 def _keys_within(held: dict[int, int], first: int, last: int) -> list[int]:
-    """Return the keys of the batches with a sequence number in [first, last]; `held` maps sequence
-    numbers to keys. The work does not grow with the range, because a hostile service may send a
-    very large one.
+    """Return the keys of the batches with a sequence number in [first, last]. `held` maps sequence
+    numbers to keys. The work is limited by the size of `held`, because a hostile service may send a
+    very large range.
     """
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]

@@ -35,8 +35,9 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Batch on disk that no service has settled (acknowledged or refused by the service). A new
-    batch (`fresh`) is sent immediately. Any other batch is sent when `due_batches` returns it.
+    """Batch on disk that no service has settled (acknowledged or refused by the service). If
+    `fresh`, the batch is new and is sent immediately. Any other batch is sent when `due_batches`
+    returns it.
     """
 
     key: int
@@ -49,9 +50,13 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records by what happened to them in the outbox (store of batches on disk) of this
-    process. They were stored, settled (acknowledged or refused by the service), evicted for lack of
-    space, lost by damage of the file, or given up because the service answers only later ones.
+    """Numbers of records that the outbox (store of batches on disk) of this process has handled:
+
+    - `stored`, and `settled` (acknowledged or refused by the service);
+    - `evicted` for lack of space, by kind;
+    - `damaged`: lost by damage of the file;
+    - `unanswered`: given up, because the service answered only later batches.
+
     `damages` is the number of times that the file was found damaged.
     """
 
@@ -69,9 +74,9 @@ class Outbox:
     or refused by the service).
 
     Attributes:
-        held: the batches, without payloads; its counts may be read on any thread.
+        held: index of the batches, without payloads; its counts may be read on any thread.
         schedule: which batches are in flight (sent and not answered), and when they are sent again.
-        counts: numbers of records by what happened to them.
+        counts: numbers of records that were stored, settled or lost.
 
     Raises:
         InputError: the file belongs to another agent or is not an outbox.
@@ -106,8 +111,8 @@ class Outbox:
         self._evict_oldest()
 
     def recover_file(self) -> None:
-        """Replace a damaged file: continue in a new file that has the readable content of the old
-        one. After an error the call may be repeated.
+        """Replace a damaged file by a new file that has the readable content of the old one, and
+        load it. If an error occurs, the caller may call the method again.
 
         Raises:
             sqlite3.Error, OSError: the disk does not accept the write.
@@ -131,10 +136,10 @@ class Outbox:
         return batch.records
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
-        """Assign sequence numbers to new batches (drafts), and commit them to disk in one
-        transaction; if the commit fails, nothing changes.
+        """Assign sequence numbers to new batches (`drafts`), commit them to disk in one
+        transaction, and return them. If the commit fails, nothing changes.
 
-        Return the stored batches.
+        Batches that were evicted at once for lack of space are not returned.
 
         Raises:
             sqlite3.Error: the disk does not accept the write.
@@ -156,9 +161,11 @@ class Outbox:
     def _insert_draft(
         self, draft: Draft, ahead: dict[Stream, int]
     ) -> tuple[int, Stream, int, Draft, bytes]:
-        """Insert a batch into the file; return its key, stream (vehicle, start, kind, region),
-        sequence number, draft and payload. `ahead` holds the next numbers of the streams within the
-        transaction.
+        """Insert a batch without number (`draft`) into the file. Return its key (row number), its
+        stream (vehicle, start, kind, region), its sequence number, the draft and the payload.
+
+        `ahead` maps each stream to its next sequence number within the present transaction; it is
+        updated.
         """
         stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
         following, first_held = self.held.next_numbers(stream)
@@ -199,8 +206,8 @@ class Outbox:
             self._deletable.clear()
 
     def settle_ranges(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
-        """Remove the batches in inclusive ranges of seq; return the number of their records.
-        Unknown numbers are ignored.
+        """Remove the batches of a stream whose sequence numbers lie in the inclusive `ranges`.
+        Return the number of their records. Numbers that are not in the outbox are ignored.
 
         The batches are deleted from the disk only with the next `store` or `delete_settled`, so
         that an acknowledgement requires no sync of the disk. If a crash happens before that, the
@@ -215,8 +222,8 @@ class Outbox:
     def due_batches(
         self, now: float, limit: int, vehicles: Collection[str] | None = None
     ) -> list[StoredBatch]:
-        """Return at most `limit` batches to send now, oldest first, of the given vehicles or of all
-        vehicles.
+        """Return at most `limit` batches to send at time `now` [s], oldest first. They belong to
+        `vehicles`, or to any vehicle if that is None.
 
         The module `pacing` limits how many batches of a vehicle and region are sent at once.
 
@@ -229,8 +236,8 @@ class Outbox:
         return [batch for key in keys if (batch := self.read_batch(key)) is not None]
 
     def read_batch(self, key: int) -> StoredBatch | None:
-        """Return a batch with its payload. If its row is missing or damaged, count the loss and
-        return None.
+        """Return the batch with the row number `key`, with its payload. If the row is missing or
+        damaged, count the loss and return None.
 
         Raises:
             sqlite3.Error: the disk cannot be read.

@@ -88,7 +88,9 @@ class Pacer:
         return self._unanswered_since
 
     def queue_batch(self, key: int) -> None:
-        """Queue a stored batch for sending, by its key; lower keys are older and are sent first."""
+        """Queue a stored batch for sending. `key` is its row number in the outbox (store on disk),
+        so that lower keys are older; they are sent first.
+        """
         heapq.heappush(self._waiting, key)
 
     def record_sent(self, now: float) -> None:
@@ -139,8 +141,9 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again. Batches in flight (sent and not answered) are
-        lost. In the silent state (no service answers), a probe is sent immediately.
+        """Record that a router is available again at time `now` [s]. Batches in flight (sent and
+        not answered) count as lost. In the silent state (no service answers), a probe is sent
+        immediately.
         """
         self.flying = 0
         self._unanswered_since = None
@@ -148,8 +151,8 @@ class Pacer:
         self._probe_s = FIRST_PROBE_S
 
     def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
-        """Return the keys of at most `most` batches to send now, oldest first. Keys that are not in
-        `held`, the batches in the outbox (store on disk), are dropped.
+        """Return the keys of at most `most` batches to send at time `now` [s], oldest first. `held`
+        are the keys of the batches in the outbox (store on disk); other keys are dropped.
         """
         if self._answered:
             self._answered = False
@@ -165,10 +168,11 @@ class Pacer:
         return out
 
     def _take_probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """Return the key of one batch to send as a probe, alternately the oldest and the newest
-        batch, so that a batch that the service cannot read does not block all others.
+        """Return the key of one batch to send as a probe at time `now` [s], or an empty list if no
+        probe is due.
 
-        The list is empty if no probe is due.
+        The probe is alternately the oldest and the newest batch, so that a batch that the service
+        cannot read does not block all others.
         """
         if now < self._probe_at:
             return []

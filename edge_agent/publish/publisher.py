@@ -45,11 +45,11 @@ log = logging.getLogger(__name__)
 
 
 class Publisher:
-    """Publisher of the records of the named vehicles; column `vehicle` of the records is an index
-    into `names`.
+    """Publisher of the records of the vehicles `names`. The column `vehicle` of the records is an
+    index into these names.
 
-    `on_open(name, session)` is called when the session of a vehicle is open. With it, other
-    components of the agent publish and subscribe on the same session.
+    `on_open(name, session)` is called when the Zenoh session of a vehicle is open. Other components
+    of the agent then publish and subscribe on the same session.
     """
 
     def __init__(
@@ -89,8 +89,8 @@ class Publisher:
 
     @property
     def is_broken(self) -> bool:
-        """Return True if the sender thread has died. Records are then still accepted, and dropped
-        when the queue is full.
+        """Return True if the sender thread has died. The queue then still accepts records until it
+        is full, and further records are dropped.
         """
         return (
             self._sender.ident is not None
@@ -99,14 +99,14 @@ class Publisher:
         )
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled (acknowledged or refused by the
-        service) yet; see `PublisherStatus`.
+        """Return the number of records of one kind, or of all kinds, that no service has settled
+        (acknowledged or refused) yet. It includes records that are not in the outbox yet.
         """
         return self.status.count_unsettled(kind)
 
     def offer(self, *blocks: RecordBlock) -> None:
-        """Queue records without blocking. Records that do not fit into the queue are dropped and
-        counted.
+        """Queue records for publication without blocking. A block of records that does not fit into
+        the queue is dropped, and its records are counted.
         """
         for records in blocks:
             if not len(records.vehicle):

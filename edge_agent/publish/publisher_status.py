@@ -44,18 +44,20 @@ class PublisherStatus:
 
     @property
     def cut_off(self) -> bool:
-        """Return True if an open Zenoh session is not connected to a router."""
+        """Return True if at least one open Zenoh session is not connected to a router."""
         return self._sessions.is_cut_off
 
     @property
     def clock_behind_s(self) -> float:
-        """Return how far the vehicle's clock is behind the clock of the fleet service [s]."""
+        """Return the time [s] by which the vehicle's clock is behind the clock of the fleet
+        service.
+        """
         return self._settlement.clock_behind_s
 
     @property
     def unanswered_s(self) -> float:
-        """Return the time [s] for which sent batches have been unanswered, in the region with the
-        longest wait.
+        """Return how long sent batches have been unanswered [s], for the vehicle and region with
+        the longest wait; 0 if none waits.
         """
         return self._outbox.schedule.unanswered_s(self._clock())
 
@@ -94,9 +96,9 @@ class PublisherStatus:
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
-        """Return the number of records that no service has settled (acknowledged or refused by the
-        service). These records are in the outbox (store on disk), where some may come from an
-        earlier start of the agent, or they are not stored yet.
+        """Return the number of records of one kind, or of all kinds, that no service has settled
+        (acknowledged or refused). They are in the outbox (store on disk), where some may come from
+        an earlier start of the agent, or they are not stored yet.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

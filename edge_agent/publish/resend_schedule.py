@@ -1,6 +1,6 @@
-"""Times at which the batches of an outbox (store on disk) are sent again. There is one `Pacer`
-(limit of unanswered batches) per vehicle and region, and a time limit for each batch that was sent
-and not answered. The module is pure (no I/O); time is monotonic [s].
+"""Schedule that decides when the batches of an outbox (store on disk) are sent again. There is one
+`Pacer` (limit of unanswered batches) per vehicle and region, and a time limit for each batch that
+was sent and not answered. The module is pure (no I/O); time is monotonic [s].
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ JITTER: Final = 0.25
 
 
 class ResendSchedule:
-    """Schedule of the batches in `held`: which are in flight (sent and not answered), and when
-    batches are sent again.
+    """Schedule of the batches in `held`, the index of the outbox (store on disk). It knows which
+    batches are in flight (sent and not answered), and when they are sent again.
     """
 
     def __init__(self, held: HeldBatches, first_resend_s: float, seed: int) -> None:
@@ -48,14 +48,14 @@ class ResendSchedule:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def queue_batch(self, key: int) -> None:
-        """Queue a batch, which is sent as soon as its pacer (limit of unanswered batches)
-        allows.
+        """Queue the batch with the row number `key`. It is sent as soon as its pacer (limit of
+        unanswered batches) allows.
         """
         self._pacer_of(self._held[key]).queue_batch(key)
 
     def mark_in_flight(self, key: int, now: float) -> None:
-        """Mark the batch with this key as in flight (sent and not answered), and set the time of
-        its next resend.
+        """Mark the batch with the row number `key` as in flight (sent and not answered) at time
+        `now` [s], and set the time of its next resend.
         """
         batch = self._held[key]
         delay = min(
@@ -68,8 +68,9 @@ class ResendSchedule:
         self._pacer_of(batch).record_sent(now)
 
     def send_or_queue(self, key: int, now: float) -> bool:
-        """Mark a new batch as in flight (sent and not answered) and return True. If the service of
-        the batch's region is silent, queue the batch and return False.
+        """Mark the new batch with the row number `key` as in flight (sent and not answered), and
+        return True. If the service of the batch's region is silent, queue the batch and return
+        False.
         """
         if self._pacer_of(self._held[key]).silent:
             self.queue_batch(key)
@@ -78,16 +79,16 @@ class ResendSchedule:
         return True
 
     def record_answer(self, stream: Stream) -> None:
-        """Record that an acknowledgement arrived for any batch of the vehicle and region that
-        `stream` names.
+        """Record that the service of a region acknowledged any batch of a vehicle. Vehicle and
+        region are those of `stream`.
         """
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
             pacer.record_answer()
 
     def record_removal(self, batch: HeldBatch) -> None:
-        """Update the schedule after the removal of a batch (message with records) from the
-        outbox.
+        """Record that a batch (message with records) was removed from the outbox. If it was in
+        flight (sent and not answered), it counts as answered.
         """
         if batch.due is not None:
             self._pacer_of(batch).record_settled()
@@ -109,9 +110,9 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def expire_batches(self, now: float) -> Iterator[int]:
-        """Queue the batches that were not answered in time, so that they are sent again. A batch
-        that the service has passed over (see `HeldBatches.is_passed_over`) is not queued. Its key
-        is yielded instead, and the caller must remove the batch before it continues.
+        """Queue the batches that were not answered before `now` [s], so that they are sent again.
+        If the service seems to ignore a batch (see `HeldBatches.is_passed_over`), yield its key
+        instead. The caller must then remove this batch before it continues.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)
@@ -126,8 +127,9 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def take_due(self, now: float, limit: int, vehicles: Collection[str] | None) -> list[int]:
-        """Return the keys of at most `limit` batches to send now, oldest first, of the given
-        vehicles or of all vehicles, and mark them as in flight (sent and not answered).
+        """Mark at most `limit` batches as in flight (sent and not answered), and return their keys,
+        oldest first, so that the caller sends them at `now` [s]. They belong to `vehicles`, or to
+        any vehicle if that is None.
         """
         keys: list[int] = []
         for (vehicle, _), pacer in self._pacers.items():
@@ -142,8 +144,8 @@ class ResendSchedule:
         return sorted(keys)
 
     def unanswered_s(self, now: float) -> float:
-        """Return the time [s] for which sent batches have been unanswered, in the region with the
-        longest wait; 0 if no batch waits.
+        """Return how long sent batches have been unanswered at time `now` [s], for the vehicle and
+        region with the longest wait; 0 if no batch waits.
         """
         since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
         return max((now - one for one in since if one is not None), default=0.0)

@@ -26,8 +26,9 @@ Value = int | str | bytes | None
 
 
 def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
-    """Yield (row id, columns) of every intact cell (stored row) of the file. The cells of the
-    write-ahead log come first, newest page first.
+    """Yield (row id, column values) of every intact cell (stored row) of a damaged SQLite file.
+    `database` is the content of the file and `log` that of its write-ahead log. The cells of the
+    log come first, newest page first.
     """
     pages = {at // PAGE + 1: database[at : at + PAGE] for at in range(0, len(database), PAGE)}
     newer = [

@@ -1,5 +1,5 @@
-"""Zenoh sessions of all vehicles of a publisher, opened on a separate thread, and their connections
-to a router.
+"""Zenoh sessions of all vehicles of a publisher, with their connections to a router. A separate
+thread opens the sessions.
 """
 
 from __future__ import annotations
@@ -41,11 +41,15 @@ class SessionLinks:
         self._opener = threading.Thread(target=self._open_all, name="connector", daemon=True)
 
     def start(self) -> None:
-        """Start to open the sessions. Each one waits for a router as long as necessary."""
+        """Start the thread that opens the sessions. For each session it waits for a router as long
+        as necessary.
+        """
         self._opener.start()
 
     def close(self) -> None:
-        """Close all Zenoh sessions. Set the event `stop` before this call."""
+        """Close all Zenoh sessions. The caller must set the event `stop` first, because the method
+        waits for the thread that opens the sessions.
+        """
         self._opener.join()
         for link in self._links.values():
             link.close()

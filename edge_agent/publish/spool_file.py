@@ -54,8 +54,8 @@ Row = tuple[object, ...]
 
 
 class SpoolFile:
-    """Table of batches in the file of an outbox (store of batches that no service has answered).
-    The key of a batch is its row number.
+    """SQLite file of an outbox (store of batches that no service has answered), as a table of
+    batches. The key of a batch is its row number.
 
     Attributes:
         was_damaged: True if the file was found damaged when it was opened.
@@ -71,8 +71,8 @@ class SpoolFile:
         self.was_damaged = aside is not None
 
     def recover_content(self) -> None:
-        """Replace a damaged file by a new one with its readable content. After an error the call
-        may be repeated.
+        """Replace a damaged file by a new one with the readable content of the old one. If an error
+        occurs, the caller may call the method again.
 
         Raises:
             sqlite3.Error, OSError: the disk does not accept the write.
@@ -81,21 +81,24 @@ class SpoolFile:
         self._database, _ = recover_file(self._path)
 
     def begin_transaction(self) -> sqlite3.Connection:
-        """Provide a database transaction as a context: it is committed at its end, and changes
-        nothing after an error.
+        """Return a context manager for a database transaction. It commits the changes at the end of
+        the `with` block, and undoes them after an error.
         """
         return self._database
 
     def list_batches(self) -> Iterator[tuple[int, tuple[str, int, str, int, int, int], int]]:
-        """Yield key, identifier (the columns NAME) and size [bytes] of each batch, oldest first."""
+        """Yield each batch as (key, identifier, size of the payload [bytes]), oldest first. The
+        identifier has the columns NAME (vehicle, start, kind, region, sequence number, number of
+        records).
+        """
         rows = self._database.execute(f"SELECT id, {NAME}, LENGTH(payload) FROM batch ORDER BY id")
         for key, *name, size in rows:
             vehicle, boot, kind, region, seq, records = name
             yield key, (vehicle, boot, kind, region, seq, records), size
 
     def insert_row(self, name: Row, payload: bytes) -> int:
-        """Insert a batch into the outbox's file with its identifier (the columns NAME) and payload;
-        return the key (row number) that it gets.
+        """Insert a batch with its identifier `name` (the columns NAME) and its payload into the
+        outbox's file. Return the key (row number) of the new row.
         """
         cursor = self._database.execute(
             f"INSERT INTO batch ({NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
@@ -106,11 +109,13 @@ class SpoolFile:
         return cursor.lastrowid
 
     def delete_rows(self, keys: Sequence[int]) -> None:
-        """Delete the batches with these keys from the outbox's file."""
+        """Delete the batches with the row numbers `keys` from the outbox's file."""
         self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in keys])
 
     def read_payload(self, key: int) -> bytes | None:
-        """Return the payload of a batch; None if its row is missing or damaged."""
+        """Return the payload of the batch with the row number `key`; None if the row is missing or
+        damaged.
+        """
         query = f"SELECT {NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
         if row is None:
@@ -127,12 +132,16 @@ class SpoolFile:
 
 
 def batch_checksum(name: Row, payload: bytes) -> int:
-    """Return the checksum (CRC-32) of a batch's identifier `name` and payload."""
+    """Return the checksum (CRC-32) over the identifier `name` of a batch (its columns NAME) and its
+    payload.
+    """
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if an error indicates a damaged file. For a full or slow disk, return False."""
+    """Return True if a database error indicates a damaged file, and False otherwise, for example if
+    the disk is full or slow.
+    """
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
 
 

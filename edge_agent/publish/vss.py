@@ -1,9 +1,9 @@
 """Friction at the vehicle as signals of the Vehicle Signal Specification (COVESA VSS 4 and later).
 
 `Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion
-of 1: 50 %, 5 % and 95 % quantiles, limited to 100 as the standard requires. Unknown values are left
-out, never replaced by a default. MostProbable is also left out if less than EXCITED_SHARE of the
-grip was used within UTILISED_WINDOW_S, because the estimate then depends mostly on the prior.
+of 1: 50 %, 5 % and 95 % quantiles, limited to 100 as the standard requires. Unknown signals are
+left out, never replaced by a default. MostProbable is also left out if less than EXCITED_SHARE of
+the grip was used within UTILISED_WINDOW_S, because the estimate then depends mostly on the prior.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ _TOPIC: Final = keys.TOPICS["vss"]
 def road_friction(
     mu: float, mu_lower: float, mu_upper: float, mu_utilised: float
 ) -> dict[str, float]:
-    """Return the known friction signals by VSS path [%]; an empty dictionary if none is known.
+    """Return the known friction signals [%] as a dictionary indexed by VSS path; it is empty if no
+    signal is known.
 
     Args:
-        mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
-        mu_utilised: largest grip used by any wheel in the last second.
+        mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles of the friction; NaN where unknown.
+        mu_utilised: largest grip (force over load) used by any wheel in the last second.
     """
     signals = {
         "MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan,
@@ -50,21 +51,25 @@ def road_friction(
 
 
 class SignalProvider(Protocol):
-    """Interface of a receiver for the signals of a vehicle."""
+    """Interface of a component that passes the friction signals of a vehicle on, for example to a
+    signal server.
+    """
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Accept signals [%] and their time [ns UTC] for sending. The call must not wait."""
+        """Accept the `signals` [%], indexed by VSS path, and their time [ns UTC] for sending. The
+        call must not wait.
+        """
 
     def close(self) -> None:
         """Send the signals that still wait for sending, and stop the provider."""
 
 
 class RoadFrictionOutput:
-    """Output of the friction of named vehicles: one JSON line per vehicle on the terminal, and the
-    same on the vehicle's Zenoh key.
+    """Output of the friction of the vehicles `names`: one JSON line per vehicle on the terminal,
+    and the same line on the vehicle's Zenoh key.
 
     Args:
-        names: row k of the reported values is vehicle k.
+        names: names of the vehicles; row k of the reported values belongs to vehicle k.
         say: function that prints a line.
         rate_hz: reports per second.
         provider: additional receiver of the same signals, if given.
@@ -85,16 +90,16 @@ class RoadFrictionOutput:
         self._due = 0
 
     def attach(self, name: str, session: zenoh.Session) -> None:
-        """Publish the friction signals of the vehicle `name` over its opened Zenoh session from now
-        on.
+        """Open a publisher of the friction signals on the Zenoh session of the vehicle `name`.
+        Later reports are also sent there.
         """
         self.publishers[name] = session.declare_publisher(
             keys.vss_key(name), encoding=ENCODING, **quality_of(_TOPIC)
         )
 
     def report_grip(self, grip: Grip | None) -> None:
-        """Report the current friction. The call never waits: a message for which there is no space
-        is dropped.
+        """Print and publish the current friction of all vehicles if a report is due. The call never
+        waits: a message for which there is no space is dropped.
         """
         if grip is None or int(grip.time.max()) < self._due:
             return
@@ -116,6 +121,6 @@ class RoadFrictionOutput:
                 publisher.put(line.encode())
 
     def close(self) -> None:
-        """Close the provider of the signals, if there is one."""
+        """Close the additional receiver of the signals (`provider`), if there is one."""
         if self._provider is not None:
             self._provider.close()

@@ -33,8 +33,8 @@ _QUALITY: Final = {
 
 
 class Link:
-    """Link of one vehicle on an open `session`; `on_ack(vehicle, payload)` is called on a thread of
-    Zenoh.
+    """Connection of one vehicle to the network over an open Zenoh `session`. For each
+    acknowledgement, Zenoh calls `on_ack(vehicle, payload)` on one of its threads.
     """
 
     def __init__(
@@ -65,8 +65,8 @@ class Link:
         on_ack: Callable[[str, bytes], None],
         stop: threading.Event,
     ) -> Link | None:
-        """Wait for a router, open the session and return the link; return None if `stop` was set
-        before.
+        """Wait for a router, open the vehicle's session and return the link. Return None if the
+        event `stop` is set before a router answers.
         """
         session = open_session(settings, stop, vehicle)
         return None if session is None else Link(session, vehicle, on_ack)
@@ -80,8 +80,8 @@ class Link:
         """Send a batch; return False if the session does not accept it. Only the acknowledgement
         proves that the batch arrived.
 
-        The call waits until GAP_S after the last message of its kind, because a router drops
-        messages that follow too closely.
+        The call first waits until GAP_S [s] after the vehicle's last message of the same kind,
+        because a router drops messages that follow too closely.
         """
         stream = batch.stream
         early = self._free_at[stream.kind] - self._clock()

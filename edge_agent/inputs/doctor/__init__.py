@@ -1,3 +1,3 @@
-"""The signal doctor, an automatic check of a drive's signals: it finds faults by physical relations
-between signals, and corrects them.
+"""The signal doctor, an automatic check of a drive's signals. It finds faults from physical
+relations between signals, and corrects them.
 """

@@ -48,8 +48,10 @@ def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Examine a log, correct the faults whose size the drive shows, and examine the corrected log.
-    Return the corrected log with the result of the examination."""
+    """Examine a log with the signal doctor (automatic check of the signals), correct the faults
+    whose size the drive shows, and examine the corrected log. Return the corrected log with the
+    result of this second examination.
+    """
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     delays = {
         finding.channel: finding.delay_s
@@ -97,8 +99,8 @@ def align_import(
     profile (assignment of signals to channels) that contains the delays.
 
     The signal doctor (automatic check of the signals) measures the delays. `merge_with` is a
-    function that merges the same recordings with a given profile. If no device is delayed, both
-    arguments are returned unchanged.
+    function that merges the same recordings with a given profile. If no device is delayed, `merged`
+    and `profile` are returned unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
@@ -120,7 +122,8 @@ def align_import(
 
 def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float]) -> FloatArray:
     """Return signals (T, 18) with times t (T,) [s], in which the readings of delayed devices are
-    moved earlier by `delays` [s], with linear interpolation between samples.
+    moved earlier, with linear interpolation between samples. `delays` has the delay [s] of each
+    device by its name.
     """
     signals = signals.copy()
     for device, seconds in delays.items():
@@ -133,8 +136,9 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
 
 
 def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
-    """Return the readings (T,) of one channel moved earlier by `seconds`. Missing readings stay
-    missing; an `angle` is not interpolated.
+    """Return the readings (T,) of one channel moved earlier by `seconds`, interpolated between the
+    times t (T,) [s]. Missing readings stay missing. If `angle` is True, the nearest reading is used
+    instead of an interpolated one.
     """
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)

@@ -30,10 +30,9 @@ CLIPPED: Final = 3.0
 
 
 def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
-    """Return 1 if the front channels meet bumps first, -1 if the rear channels do, 0 if the drive
-    does not show which.
-
-    t are times (T,) [s], signals (T, 18).
+    """Return 1 if the channels named "front" meet bumps first, -1 if the channels named "rear" do,
+    and 0 if the drive does not show the order. `t` are times (T,) [s] and `signals` readings (T,
+    18).
     """
     omega = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(omega).all(axis=1)

@@ -20,9 +20,9 @@ LARGEST_LAG_S: Final = 0.085
 
 
 def wheels_speak_late(axle: Fit, seconds: float) -> bool:
-    """Return True if the yaw rate computed from the speeds of the wheels confirms that their
-    signals lag by `seconds`. `axle` is the fit of this yaw rate to the gyroscope's: its lag must
-    have the same sign and be larger than half of `seconds`.
+    """Return True if the wheels' yaw rate (computed from the wheel speeds) confirms that the wheel
+    signals lag by `seconds`. `axle` is the fit of this yaw rate to the gyroscope's yaw rate. The
+    lag found by the fit must have the same sign and be larger than half of `seconds`.
     """
     return (
         axle.is_known
@@ -34,8 +34,9 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
-    """Measure the delays of wheel speeds and steering relative to the inertial unit. Add a finding
-    (reported fault) to the diagnosis for each delay that is too large.
+    """Measure the delays of wheel speeds and steering relative to the inertial unit, and store them
+    in the diagnosis. Add a finding (reported fault) to the diagnosis for each delay that is too
+    large.
     """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)
@@ -47,12 +48,12 @@ def measure_clocks(
 
 
 def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the delay [s] of each device (wheel speeds, steering, inertial unit), from the lags
-    measured in the turns of a drive.
+    """Return the delay [s] of each device (wheel speeds, steering, inertial unit). It follows from
+    the lags in `diagnosis`, which were measured in the turns of a drive.
 
     If wheels and steering are both ahead of the yaw rate by about the same time, the delay is
-    attributed to the inertial unit. If the unit's accelerometer is not late compared with the
-    wheels, the delay is attributed to the gyroscope alone.
+    attributed to the inertial unit. In that case, if the unit's accelerometer is not late compared
+    with the wheels, the delay is attributed to the gyroscope alone.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

@@ -13,13 +13,13 @@ from edge_agent.inputs.doctor.scales import SETTLED
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault: its channel, its kind, its description, and its correction.
+    """One fault of a signal log: its channel, its kind, its description, and its correction.
 
     Attributes:
         channel: channel or device that has the fault.
         kind: short name of the fault.
         words: description for a person.
-        scale: factor that corrects the channel.
+        scale: factor by which the recorded value must be multiplied.
         offset: correction that is added after the factor.
         delay_s: delay of the channel's time stamps [s].
         confidence: log odds of this explanation against the next best one, if there is another one.
@@ -36,8 +36,9 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """Result of the check of a log: faults, channels without fault, channels about which the drive
-    says nothing, and the fitted physical relations between signals.
+    """Result of the check of a log: its faults (`findings`), the channels without fault (`sound`),
+    the channels about which the drive shows nothing (`unknown`), and the fitted physical relations
+    between signals (`fits`).
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -54,5 +55,5 @@ class Diagnosis:
 
     @property
     def is_passed(self) -> bool:
-        """Return True if every channel was found to be free of faults."""
+        """Return True if the check found every channel to be free of faults."""
         return not self.findings and not self.unknown

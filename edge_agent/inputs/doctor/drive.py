@@ -1,5 +1,5 @@
-"""A drive prepared for its examination: evenly sampled, smoothed, and with the motion computed from
-the wheels alone.
+"""Preparation of a recorded drive for the search for faults: signals are evenly sampled and
+smoothed, and the motion is computed from the wheels alone.
 
 Legend
     v    speed of the car from its wheels [m/s]: wheel radius of the vehicle file times the median
@@ -42,8 +42,9 @@ CREEP: Final = 0.15
 
 @dataclass(frozen=True)
 class EvenDrive:
-    """Smoothed signals at even time steps (n,); NaN where there is no reading. `wheels` (n, 4) are
-    speeds at the rim [m/s].
+    """Signals of a drive, smoothed, at even time steps (n,); NaN where there is no reading. Letters
+    are explained in the module's legend: v, r and course. `wheels` (n, 4) are the wheel speeds at
+    the rim [m/s], `delta` is the steering angle [rad].
     """
 
     t: FloatArray
@@ -88,8 +89,9 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the readings x of a signal interpolated linearly at the times `at` (n,); NaN between
-    readings that are more than JOINED_S apart.
+    """Return the readings x of a signal, recorded at the times `t` [s], interpolated linearly at
+    the times `at` (n,) [s]. The result is NaN between two readings that are more than JOINED_S
+    apart.
     """
     good = np.isfinite(x)
     if good.sum() < 2:
@@ -104,8 +106,9 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
 def over_ground(
     t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return speed [m/s] and course [rad] at the times `at` (n,), computed from the positions FIX_S
-    / 2 before and FIX_S / 2 after each time.
+    """Return speed over ground [m/s] and course [rad] at the times `at` (n,) [s]. Both are computed
+    from the positions FIX_S / 2 before and FIX_S / 2 after each time. `latitude` and `longitude`
+    [deg] are the fixes at the times `t` [s].
     """
     north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
     east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
@@ -125,11 +128,11 @@ def over_ground(
 def prepare_drive(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> EvenDrive:
-    """Return a drive with the given signals (T, 18), evenly sampled and smoothed.
+    """Return the signals of a recorded drive, evenly sampled and smoothed.
 
     Args:
         t: times (T,) [s].
-        signals: readings; readings of a wheel far from the median of the four are left out.
+        signals: readings (T, 18); a wheel speed far from the median of the four wheels is left out.
         vehicle: its wheel radius, track widths and wheelbase are used.
         ground: speed measured by the position receiver (T,) [m/s], if it was recorded; it is more
             accurate than the speed computed from positions.
@@ -202,7 +205,8 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
     The front and rear wheel of a side roll nearly alike, in turns too. A constant difference
     between them is attributed to different tyres. A wheel that differs all the time is not
-    compared, because the whole drive would then count as slip; it is reported as a separate fault.
+    compared, because the complete drive would then count as slip. Such a wheel is reported as a
+    separate fault.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
@@ -224,9 +228,10 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
-    """Return a mask (n,) that is True where all wheels spin or lock together, because the ratio of
-    their speed `v` to the speed over ground `v_ground` is unusual. The unit of `v` does not matter.
-    `fast` is a high speed of the car in this drive, in the same unit.
+    """Return a mask (n,) that is True where all wheels spin or lock together. There the ratio of
+    the wheels' speed `v` (n,) to the speed over ground `v_ground` (n,) differs from its usual value
+    in this drive, so that the unit of `v` does not matter. `fast` is a high speed of the car in
+    this drive, in the unit of `v`.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:
@@ -242,9 +247,9 @@ def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
 
 
 def _nearest_yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
-    """Return, for each time in `at` (n,), the nearest reading of the yaw angle, which is recorded
-    less often than other signals. Readings are not averaged, because averages of angles near ±π
-    would be wrong.
+    """Return, for each time in `at` (n,) [s], the nearest reading of the yaw angle. `yaw` are the
+    readings [rad] at the times `t` [s]. They are recorded less often than other signals. They are
+    not averaged, because averages of angles near ±π would be wrong.
     """
     good = np.flatnonzero(np.isfinite(yaw))
     if len(good) < 2:

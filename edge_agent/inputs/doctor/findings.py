@@ -1,9 +1,10 @@
 """Findings of the signal doctor (automatic check of the signals). A finding is one reported fault
 with the reason for it. The module also lists the channels without fault.
 
-A channel is free of faults if a physical relation with enough excitation (change of the signals)
-confirms it, and no fault explains the drive nearly as well. A channel is unknown if it is neither
-confirmed nor faulty. A log passes only if all its channels are free of faults.
+A channel is free of faults under two conditions. A physical relation with enough excitation (change
+of the signals) confirms it, and no fault would explain the drive nearly as well. A channel is
+unknown if it is neither confirmed nor faulty. A log passes only if all its channels are free of
+faults.
 """
 
 from __future__ import annotations
@@ -75,12 +76,12 @@ CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta",
 def diagnose(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None
 ) -> Diagnosis:
-    """Examine a signal log for faults, and return the diagnosis.
+    """Examine a signal log for faults of its sensors, and return the diagnosis.
 
     Args:
         t: times (T,) [s].
         signals: readings (T, 18).
-        vehicle: nominal vehicle of the drive.
+        vehicle: nominal data of the vehicle that was driven.
         ground: speed measured by the position receiver (T,) [m/s], if it was recorded.
     """
     diagnosis = Diagnosis()
@@ -163,9 +164,9 @@ def diagnose(
 
 
 def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
-    """Return the times (n,) in seconds, and True if the sampling rate is unusable.
+    """Return the times of the samples (n,) in seconds, and True if the sampling rate is unusable.
 
-    Times in another unit are converted. A wrong unit and an unusable rate are added to the
+    Times `t` (n,) in another unit are converted. A wrong unit and an unusable rate are added to the
     diagnosis as faults.
     """
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
@@ -214,7 +215,9 @@ def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
 
 
 def _axes_exchanged(drive: EvenDrive) -> bool:
-    """Return True if the longitudinal and lateral axes of the accelerometer are exchanged."""
+    """Return True if the longitudinal and lateral axes of the accelerometer are exchanged in the
+    recorded drive. Then a_x follows the turns and a_y follows the wheels' acceleration.
+    """
 
     def axis_likeness(x: FloatArray, y: FloatArray) -> float:
         good = np.isfinite(x) & np.isfinite(y) & (drive.moving > 0)
@@ -272,10 +275,10 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
 def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
-    """Return True if a fault of `quantity` explains the signals in all parts of the drive. In each
-    part, the gain of an identity (ratio of two quantities that are equal by physics) must have the
-    value that the fault predicts. In a slide the gain is not constant, so that a slide is not taken
-    for a fault.
+    """Return True if the fault of `quantity` in `verdict`, the result of the search for faults,
+    explains the signals in most parts of the drive. In such a part, the gain of an identity (ratio
+    of two quantities that are equal by physics) must have the value that the fault predicts. In a
+    slide the gain is not constant, so that a slide is not reported as a fault.
     """
     fault = verdict.faults[quantity]
     if (
@@ -316,9 +319,9 @@ def _holds_throughout(
 
 
 def _turns_as_steered(verdict: Verdict, found: dict[str, Fit]) -> bool:
-    """Return True if the car turns as its steering or its course over ground predicts. Otherwise
-    the car slides, and its lateral acceleration is not v·r (speed times yaw rate), so that the two
-    must not be compared.
+    """Return True if the car turns as its steering or its course over ground predicts, in most
+    parts of the drive. Otherwise the car may slide. In a slide the lateral acceleration differs
+    from v·r (speed times yaw rate), so that the caller must not compare the two.
     """
     for name in ("steering", "turning"):
         gain = 1.0
@@ -340,7 +343,7 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
     """Return findings about wheels that turn faster or slower than the others while the car drives
     straight and calmly, and about exchanged axles.
 
-    In a bend, wheels slip with the force of the tyres, so only moments with hardly any force count.
+    A tyre force changes the speed of a wheel by slip, so only moments with hardly any force count.
     An error of a wheel must also appear while the car coasts. If it does not, it is not reported,
     and the wheel speeds are added to `doubts`, the channels that are neither confirmed nor faulty.
     """
@@ -384,9 +387,11 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
 
 
 def _compare_axles(drive: EvenDrive) -> list[Finding]:
-    """Return a finding (fault) if the front and rear wheel speeds are exchanged. In a turn the
-    front wheels travel further than the rear wheels: v_f² = v_r² + (L r)², with the speeds v_f and
-    v_r of the axles, the wheelbase L and the yaw rate r.
+    """Return a finding (fault) if the front and rear wheel speeds are exchanged; else an empty
+    list.
+
+    In a turn the front wheels travel further than the rear wheels: v_f² = v_r² + (L r)², with the
+    speeds v_f and v_r of the axles, the wheelbase L and the yaw rate r.
     """
     front = drive.wheels[:, :2].mean(axis=1)
     rear = drive.wheels[:, 2:].mean(axis=1)
@@ -416,8 +421,8 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
 
 
 def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
-    """Return findings (faults) about constant sensor errors that exceed the largest usual error by
-    SURE standard deviations.
+    """Return findings (faults) about constant errors (offsets) of sensors. An offset is a fault if
+    it exceeds the largest usual offset by SURE standard deviations.
     """
     moving = drive.moving > 0
     lateral = found["lateral"]

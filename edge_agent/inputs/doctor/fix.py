@@ -35,8 +35,8 @@ EXCHANGED: Final = {
 
 
 def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return, by device (wheels, steering, inertial unit), the delays [s] that are too small to be
-    reported as faults, but too large for the estimator.
+    """Return the delay [s] of each device (wheels, steering, inertial unit) whose delay is too
+    small to be reported as a fault, but too large for the estimator.
     """
     if any(finding.kind == "clock" for finding in diagnosis.findings):
         return {}
@@ -45,8 +45,9 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 
 def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
     """Return all corrections that must be written into a profile (assignment of signals to
-    channels): the faults that the signal doctor has found, and the delays that are too small to
-    count as faults (`small_lags`), as findings of the kind "clock".
+    channels). These are the faults that the signal doctor has found, and the delays that are too
+    small to count as faults (`small_lags`). The delays are returned as findings of the kind
+    "clock".
     """
     lags = small_lags(diagnosis)
     return [

@@ -52,7 +52,7 @@ class Fit:
     equal by physics.
 
     `error` is the standard deviation of ln |gain|. `lag_s` is the delay of `left` relative to
-    `right` [s]. `excited_s` is the time with enough excitation [s].
+    `right` [s]. `excited_s` is the time [s] in which the signals change enough.
     """
 
     gain: float
@@ -70,8 +70,8 @@ class Fit:
 
     @property
     def is_known(self) -> bool:
-        """Return True if the drive suffices to determine the gain of left over right: enough time
-        with excitation, a small error and a clear correlation.
+        """Return True if the drive suffices to determine the gain of left over right. This requires
+        enough time in which the signals change, a small error and a clear correlation.
         """
         return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
 
@@ -81,7 +81,7 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 class Relation(NamedTuple):
     """Terms of an identity (two sides that are equal by physics): left = gain · right + offset + Σ
-    k · term, each an array (n,).
+    k · term. Each side and each further term is an array (n,).
 
     If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
     given, the left side also contains an unknown share of right · bend (understeer). This share has
@@ -257,11 +257,12 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Return (share of `bend` (the understeer term) in the right side, standard deviation of ln
-    gain that follows from the uncertainty of this share).
+    """Return (share of `bend`, the understeer term, in the right side x; standard deviation of the
+    ln gain that follows from the uncertainty of this share). y is the left side, and `constant` the
+    term of the offset, (n,) each.
 
-    The share is the posterior mean over the candidate values BENDS. The cost of a candidate (-2
-    times its log posterior) consists of the residual of the left side over `count` independent
+    The share is the posterior mean over the candidate values BENDS. The cost of a candidate is -2
+    times its log posterior. It consists of the residual of the left side over `count` independent
     moments and the squared deviation of the candidate from the share on usual cars.
     """
     costs = np.zeros(len(BENDS))
@@ -303,9 +304,9 @@ def _fit_with_priors(
 
 
 def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
-    """Return the gain of an identity (ratio of two quantities that are equal by physics) in each of
-    PARTS consecutive parts of the samples with enough excitation (mask `excited`). Parts that are
-    too short are left out.
+    """Return the gain of an identity (slope of y over x, two quantities that are equal by physics)
+    in each of PARTS consecutive parts of a drive. Only the samples of the mask `excited`, in which
+    the signals change enough, are used. Parts that are too short are left out.
     """
     rows = np.flatnonzero(excited)
     found = []
@@ -337,8 +338,8 @@ def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def shift_series(x: FloatArray, seconds: float) -> FloatArray:
-    """Return an evenly sampled signal x (n,) delayed by `seconds`. A positive value is the
-    correction for a signal that is early, a negative one for a signal that is late.
+    """Return an evenly sampled signal x (n,) delayed by `seconds`. A positive delay corrects a
+    signal that is early, a negative delay one that is late.
     """
     n = np.arange(len(x))
     good = np.isfinite(x)
@@ -350,8 +351,8 @@ def shift_series(x: FloatArray, seconds: float) -> FloatArray:
 
 
 def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
-    """Return the delay of `left` relative to `right` [s] and its error [s], from the peak of
-    |correlation|.
+    """Return the delay of `left` (n,) relative to `right` (n,) [s] and the error of this delay [s].
+    The delay is at the peak of |correlation| over the samples with `moving` = 1.
 
     The error is infinite if the delay is unknown. It grows with the difference between the lags of
     the two halves of the drive.

@@ -56,8 +56,8 @@ def find_lags(
     least: float = LEAST_LIKE,
     names: Collection[str] = tuple(LEAD),
 ) -> dict[str, float]:
-    """Return the lags [s] of a drive by quantity, from times t (T,) [s] and signals (T, 18), for
-    the quantities `names`.
+    """Return the lags [s] of a drive, by name, for the lags `names` ("wheel_lag", "steer_lag"). The
+    drive has the times t (T,) [s] and the signals (T, 18).
 
     A lag whose correlation is below `least` is left out. Signals are smoothed less than in other
     checks of the signals, because after smoothing over half a second the peak of the correlation
@@ -113,8 +113,8 @@ def _find_delay(
 ) -> _Peak | None:
     """Return the delay [s] of the yaw rate `side` (n,) relative to the gyroscope's, with the
     correlation at that delay, over the samples of the mask `among`. `turning` (n,) is the
-    gyroscope's yaw rate without its slow part. Return None if a signal varies too little, or if the
-    correlation is below `least`.
+    gyroscope's yaw rate without its slow changes. Return None if a signal varies too little, or if
+    the correlation is below `least`.
     """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
@@ -145,10 +145,12 @@ def _find_delay(
 def _correlate_by_spectra(
     left: FloatArray, right: FloatArray, among: BoolArray, most: int
 ) -> FloatArray:
-    """Return the correlation of `left` (n,) with `right` (n,) shifted by -most to most samples,
-    over the samples of the mask `among` at which both are known, to about ten digits. All sums over
-    samples are correlations, computed together by fast Fourier transforms. The result is NaN where
-    too few samples or too little variation are left for this.
+    """Return the correlation of `left` (n,) with `right` (n,) for every shift of `right` by -most
+    to most samples. Only samples of the mask `among` count, and only those at which both signals
+    are known.
+
+    All sums over samples are computed together by fast Fourier transforms, with an accuracy of
+    about ten digits. The result is NaN where too few samples or too little variation are left.
     """
     size = 1 << (len(left) + most).bit_length()
     known = among & np.isfinite(left)

@@ -30,8 +30,8 @@ GAINS_M_S2: Final = 0.4  # [m/s^2] root mean square of the wheels' acceleration
 
 
 def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
-    """Return True if wheels turn while the car stands. `t` are times (T,) [s], `signals` readings
-    (T, 18).
+    """Return True if wheels turn while the body of the car stands, as on a lift or on rollers. `t`
+    are times (T,) [s], `signals` readings (T, 18).
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
     if len(at) < LEAST_S * RATE_HZ:

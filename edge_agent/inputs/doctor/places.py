@@ -34,7 +34,9 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
-    """Return findings (reported faults) about the signal of the yaw angle."""
+    """Return findings (reported faults) about the yaw angle, for example that it is a compass
+    angle. The angle in `signals` is compared with the course and the turns of the drive.
+    """
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []
@@ -63,8 +65,8 @@ def _total_turn(angle: FloatArray) -> float:
 
 
 def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
-    """Return the mean cosine of the difference between yaw and course over ground [rad]; 1 if both
-    are equal.
+    """Return the mean cosine of the difference between the yaw angle and the course over ground,
+    (n,) [rad] each. It is 1 if both are always equal.
     """
     return float(np.mean(np.cos(yaw - course)))
 

@@ -44,8 +44,8 @@ STYLE: Final = (
 
 
 def report_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the diagnosis as text lines: one per finding (fault), unknown channel, lag and channel
-    without fault.
+    """Return the diagnosis of a log as text lines: one for each fault, each unknown channel, each
+    measured lag and each channel without fault.
     """
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [
@@ -64,8 +64,8 @@ def report_lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def report_document(diagnosis: Diagnosis) -> dict[str, object]:
-    """Return the diagnosis as a JSON-compatible document for programs. To correct a channel, apply
-    scale, offset and delay of a finding (fault), in this order.
+    """Return the diagnosis of a log as a JSON-compatible document for programs. To correct a
+    channel, a program applies scale, offset and delay of its finding (fault), in this order.
     """
     return {
         "passed": diagnosis.is_passed,
@@ -103,8 +103,8 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
 
 
 def report_page(diagnosis: Diagnosis, title: str) -> str:
-    """Return an HTML page with the verdict, the findings (faults), and a plot of each identity (two
-    quantities that are equal by physics).
+    """Return an HTML page with the verdict on a log, the findings (faults), and a plot of each
+    identity (two quantities that are equal by physics). `title` is the title of the page.
     """
     rows = [
         f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}"

@@ -46,7 +46,9 @@ WRONG_SIGN: Final = 60.0
 
 
 class Mistake(NamedTuple):
-    """A fault of a quantity: its name, and the factor by which it multiplies the true value."""
+    """A fault of a recorded quantity, such as a wrong unit: the fault's name, and the factor by
+    which it multiplies the true value.
+    """
 
     name: str
     factor: float
@@ -67,7 +69,7 @@ class Law(NamedTuple):
     Attributes:
         centre: expected gain (slope of the left side over the right side).
         spread: standard deviation of ln(gain) between cars.
-        members: quantities on both sides.
+        members: measured quantities on both sides.
     """
 
     centre: float
@@ -120,8 +122,8 @@ CLOCK_COST: Final = 4.0
 
 
 def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
-    """Return the possible faults (wrong units and signs) of each measured quantity for this
-    vehicle, by quantity.
+    """Return, for each measured quantity, its possible faults (wrong units and signs) for this
+    vehicle. `ground` is the fit of the speed over ground to the wheels' speed.
     """
     g = 1.0 / GRAVITY
     deg = 1.0 / DEG
@@ -244,9 +246,9 @@ def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
-    """Return the one late device that best explains the lags of the identities (pairs of quantities
-    that are equal by physics), as device → (delay of its clock [s], margin). The margin is by how
-    much the best other explanation (another device, or none) costs more.
+    """Return the device with a late clock that best explains the lags of the identities (pairs of
+    quantities that are equal by physics), as device → (delay of its clock [s], margin). The margin
+    is the difference in cost to the best other explanation (another device, or none).
 
     The result is empty if the delay is below LATE_S, or if the explanation without a late device
     costs less.

@@ -1,5 +1,5 @@
-"""Tests that distinguish a sliding wheel from a faulty sensor: signs of slip, and signs of constant
-errors.
+"""Tests that distinguish a sliding wheel from a faulty sensor. They look for signs of slip, and for
+errors that stay constant throughout a drive.
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ TURNS_LIKE: Final = 0.8
 
 
 def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
-    """Return True if a wheel speed differs from the others by sudden steps of a few fixed sizes, at
-    least FEWEST_STEPS times. Such steps indicate a sensor fault, not slip.
+    """Return True if a wheel speed jumps away from the other wheels at least FEWEST_STEPS times, by
+    one of a few fixed amounts. Such steps indicate a sensor fault, not slip.
 
-    `above` (n,) is the difference from the other wheels, `off` (n,) is True where it is large.
+    `above` (n,) is the wheel's speed minus that of the other wheels, and `off` (n,) is True where
+    the difference is large.
     """
     enters = np.flatnonzero(~off[:-1] & off[1:])
     if len(enters) < FEWEST_STEPS:
@@ -61,7 +62,8 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
     """Return True if a wheel disagrees with the other three wheels most of the time while those
     agree with each other. `rest` (n, 3) are the speeds of the other wheels, `others` (n,) their
-    common speed, and `off` (n,) is True where the wheel differs from it.
+    common speed, and `off` (n,) is True where the wheel differs from it. `fast` is a high speed of
+    the car in this drive.
 
     No wheel spins for that long, so the caller reports that the signal is not the speed of this
     wheel.
@@ -76,11 +78,11 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axles with exchanged left and right wheels, as (name, wheel indices). An axle is
-    found only if the wheels of the other axle are not exchanged.
+    """Return the axle whose left and right wheels are exchanged, as a list with (name, indices of
+    its two wheels). An axle is found only if the wheels of the other axle are not exchanged.
 
-    If both axles are exchanged, they agree with each other, and this test finds nothing. The
-    comparison of the wheels' yaw rate with the gyroscope then shows the fault.
+    If the sides are exchanged on both axles, the axles agree with each other, and this test finds
+    nothing. The comparison of the wheels' yaw rate with the gyroscope then shows the fault.
     """
 
     def yaw_likeness(yaw: FloatArray) -> float:
@@ -169,9 +171,9 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return how much a quantity (n,) differs between the parts of a drive: the standard deviation
-    of its medians in the parts. If it is small, the quantity is a constant sensor error such as a
-    tilt, because a slide does not last over all parts.
+    """Return how much a quantity, given by its readings (n,), differs between the parts of a drive:
+    the standard deviation of its medians in the parts. If it is small, the quantity is a constant
+    sensor error such as a tilt, because a slide does not last over all parts.
     """
     parts = [
         float(np.nanmedian(part))
@@ -232,8 +234,8 @@ def measure_lags_twice(
 
 
 def _holds_with_lag(fit: Fit) -> bool:
-    """Return True if an identity (two sides that are equal by physics) holds throughout a drive, so
-    that a lag between its sides comes from a device.
+    """Return True if an identity (two sides that are equal by physics) holds throughout a drive. A
+    lag between its sides then comes from a late device and not from a slide.
     """
     return (
         fit.is_known

@@ -22,8 +22,8 @@ OWN: Final = "gripmap"
 class Decoder:
     """Decoder of CAN frames to signals, by a CAN database.
 
-    Messages that the profile (assignment of signals to channels) assigns to another bus are left
-    out.
+    `profile` assigns signals to channels, and `bus` is the number of the bus. Messages that the
+    profile assigns to another bus are left out.
     """
 
     def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
@@ -44,8 +44,8 @@ class Decoder:
         }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals, by name, that received CAN frames contain; a frame is (time,
-        (identifier, extended, data)).
+        """Return the signals that received CAN frames contain, by name. Each element of `heard` is
+        a frame (time, (identifier, extended, data)).
         """
         log: Log = {}
         for time, (identifier, extended, data) in heard:

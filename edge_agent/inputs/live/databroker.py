@@ -21,7 +21,7 @@ NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double
 
 
 class DatabrokerFeed(Feed):
-    """Live source for paths of a databroker.
+    """Live source for the signals of a Kuksa databroker; a signal is named by its VSS path.
 
     Args:
         name: name of the source.
@@ -88,7 +88,7 @@ class DatabrokerFeed(Feed):
         super().close()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the values that the databroker has sent, by signal path."""
+        """Return the values that received updates of the databroker contain, by signal path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
         for time, (path, value) in heard:

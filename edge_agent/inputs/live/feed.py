@@ -1,11 +1,12 @@
 """Base of a live source: a thread that listens, reopens a lost connection, and stores the received
 messages.
 
-Times are the host's: seconds since its start, by a monotonic clock. If the time stamps of a source
-are at most BELIEVED_S old on arrival, the clocks of source and host are assumed to agree, and the
-stamps are used unchanged. For any other source, the difference between the two clocks is estimated.
-The message with the smallest delay within the last WHILE_S to 2 WHILE_S is assumed to have arrived
-without delay (minimum of the delays, as in Cristian, Distrib. Comput. 3 (1989)).
+Times are those of the host (this computer): seconds since the start of its clock, which is
+monotonic. If the time stamps of a source are at most BELIEVED_S old on arrival, the clocks of
+source and host are assumed to agree, and the stamps are used unchanged. For any other source, the
+difference between the two clocks is estimated. The message with the smallest delay within the last
+WHILE_S to 2 WHILE_S is assumed to have arrived without delay (minimum of the delays, as in
+Cristian, Distrib. Comput. 3 (1989)).
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HostClock:
-    """Clock of the host (this computer) since its start: it holds the UTC time [ns] of the start,
-    and the reading of a monotonic clock [s] at that moment.
+    """Clock of the host (this computer). It stores the UTC time [ns] at which it was started, and
+    the reading of a monotonic clock [s] at that moment.
     """
 
     start_ns: int = field(default_factory=time.time_ns)
@@ -57,7 +58,7 @@ class HostClock:
 
 
 class Stamps:
-    """Conversion of the time stamps of one live source to the host's clock."""
+    """Conversion of the time stamps of one live source to the clock of the host (this computer)."""
 
     def __init__(self) -> None:
         self._before = self._lately = float("inf")
@@ -109,15 +110,15 @@ class Feed(ABC):
 
     @abstractmethod
     def listen(self) -> None:
-        """Open the live source, increment `openings`, and call `hear` for each message until
-        `stopping` is set.
+        """Open the live source, increment `openings`, and call `hear` for each message until the
+        event `stopping` is set.
 
         If this method returns earlier or raises, the source counts as lost and is opened again.
         """
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals by name, with times and values, that the received messages `heard`
+        """Return the signals (times and values), by name, that the received messages `heard`
         contain.
         """
 
@@ -127,22 +128,22 @@ class Feed(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening to the live source. Wait at most LEAVE_S for the thread, because it may
-        hang in a driver.
+        """Stop listening to the live source. Wait at most LEAVE_S [s] for the listening thread,
+        because it may hang in a driver.
         """
         self.stopping.set()
         self._thread.join(LEAVE_S)
 
     @property
     def listening(self) -> bool:
-        """Return True if the thread is still running. After `close` this means that it hangs in a
-        driver, and the driver's library may block the exit of the process.
+        """Return True if the listening thread is still running. After `close`, True means that the
+        thread hangs in a driver, whose library may block the exit of the process.
         """
         return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:
-        """Store the received message `what` with the source's own time stamp [ns UTC], for the next
-        `take`.
+        """Store a received message `what` for the next call of `take`. `stamp_ns` is the time stamp
+        that the source gave to the message [ns UTC].
         """
         self.last = self.clock.now()
         self.heard += 1
@@ -154,20 +155,20 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count a message of the live source that cannot be read. The first message with this
-        reason is logged.
-        """
+        """Count a message of the live source that cannot be read, and log a new reason."""
         self.broken += 1
         self.say(reason)
 
     def take(self) -> dict[str, Series]:
-        """Return the signals that the source has received since the last call of this method."""
+        """Return the signals, by name, that the source has received since the last call of this
+        method.
+        """
         heard = [self._waiting.popleft() for _ in range(len(self._waiting))]
         return self.series(heard) if heard else {}
 
     @property
     def trouble(self) -> str | None:
-        """Return the reason why the live source delivers nothing; None while it delivers."""
+        """Return a message if the live source has delivered nothing for SILENT_S; else None."""
         silent = self.clock.now() - self.last
         return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None
 
@@ -186,9 +187,7 @@ class Feed(ABC):
             self.stopping.wait(RETRY_S)
 
     def say(self, reason: str) -> None:
-        """Log the reason of a problem with the live source; each different reason is logged only
-        once.
-        """
+        """Log a problem with the live source. Each different `reason` is logged only once."""
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)
             log.warning("%s: %s", self.name, reason)

@@ -17,7 +17,9 @@ CONNECT_S: Final = 5.0
 
 
 class GpsdFeed(Feed):
-    """Live source for the position reports (TPV) of a gpsd at the address (host, port)."""
+    """Live source for the position reports (TPV) of a gpsd (position daemon) at the address (host,
+    port).
+    """
 
     def __init__(self, name: str, clock: HostClock, address: tuple[str, int]) -> None:
         super().__init__(name, clock)
@@ -59,7 +61,9 @@ class GpsdFeed(Feed):
             self.hear(fix.time, fix)
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the received positions as the signals latitude, longitude, speed and course."""
+        """Return the positions in received gpsd reports as the signals latitude, longitude, speed
+        and course.
+        """
         t = np.array([time for time, _ in heard])
         return {
             name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name])

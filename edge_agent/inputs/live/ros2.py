@@ -1,11 +1,11 @@
 """Live source for ROS 2 topics by the Zenoh transport of ROS (rmw_zenoh), without a ROS
 installation.
 
-It subscribes at a Zenoh router, and the library rosbags decodes the messages. The key of a topic is
-DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, and the payload is CDR. The attachment begins with a
-sequence number and the time of publication (int64 each, little endian; rmw_zenoh_cpp, design.md),
-so lost messages can be counted. Signals have the same names as in a bag, /topic.field.field. Topics
-with the type can_msgs/Frame are CAN buses.
+The source subscribes to the topics at a Zenoh router, and the library rosbags decodes the messages.
+The key of a topic is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, and the payload is CDR. The
+attachment begins with a sequence number and the time of publication (int64 each, little endian;
+rmw_zenoh_cpp, design.md), so lost messages can be counted. Signals have the same names as in a bag,
+/topic.field.field. Topics with the type can_msgs/Frame are CAN buses.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ class Ros2Feed(Feed):
         self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
     def _publication_time(self, attachment: bytes) -> int:
-        """Return the time of publication [ns] in a message's attachment; 0 if it is missing. Gaps
-        in the attachment's sequence number are counted as lost messages.
+        """Return the time of publication [ns] that a message's attachment contains; 0 if it is
+        missing. Gaps in the sequence numbers of the attachments are counted as lost messages.
         """
         if len(attachment) < ATTACHMENT.size:
             return 0

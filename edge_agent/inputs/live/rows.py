@@ -1,6 +1,6 @@
-"""Rows (samples) at a fixed rate, built from the messages of live sources, a tenth of a second at a
-time. The same profile (assignment of signals to channels) and merging are used as in the importer
-of recordings.
+"""Construction of rows (samples) at a fixed rate from the messages of live sources, a tenth of a
+second at a time. The profile (assignment of signals to channels) and the merging are the same as in
+the importer of recordings.
 
 A row is built DELAY_S after its time, so that readings before and after it have arrived. If an
 active source is delayed because its host is busy, the row waits for up to PATIENCE_S. Readings that
@@ -49,7 +49,7 @@ UNSTEERED: Final = STEERING[2:]
 
 
 class LiveRows:
-    """Generator of blocks with one vehicle's samples from its live sources.
+    """Generator of blocks (arrays of consecutive samples) of one vehicle from its live sources.
 
     Args:
         feeds: the live sources; the method `blocks` starts them.
@@ -123,10 +123,10 @@ class LiveRows:
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
 
     def _may_deliver(self, time: float) -> bool:
-        """Return True if a source may still deliver readings that belong to the given time.
+        """Return True if a source may still deliver readings for rows before `time` [s].
 
-        Silent sources do not count, and neither do position receivers, because their fixes are
-        rare.
+        Sources that are silent do not count, and neither do position receivers, because their fixes
+        are rare.
         """
         return any(
             feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
@@ -174,8 +174,8 @@ class LiveRows:
         )
 
     def _recent_recording(self, place: int, feed: Feed, oldest: float) -> Recording:
-        """Return the readings of a live source since the time `oldest` [s], including those that
-        were already used.
+        """Return the readings of the live source `feed` since the time `oldest` [s], including
+        those that were already used for rows. `place` is the index of the source.
         """
         kept = self._readings[place]
         fresh_ones = feed.take()
@@ -204,9 +204,9 @@ class LiveRows:
         return Recording(feed.name, dict(kept))
 
     def _place_fixes(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
-        """Write each position fix into the row (sample) nearest to its time. If that row has
-        already been sent to the estimator, move the fix along its course to the first row of the
-        block.
+        """Write each position fix into the row (sample) of `signals` nearest to its time; `t` are
+        the times of the rows [s]. If that row has already been sent to the estimator, move the fix
+        along its course to the first row of the block.
         """
         half = 0.5 / self.rate_hz
         speed = fixes.get(GROUND)
@@ -250,8 +250,8 @@ class LiveRows:
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
     def _start_ns(self) -> int:
-        """Return the date [ns UTC] at which the host's clock started, corrected by the clock of a
-        position receiver. The first position fix determines the correction permanently.
+        """Return the date [ns UTC] at which the host's clock started. The first position fix
+        corrects this date permanently by the clock of the position receiver.
         """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [

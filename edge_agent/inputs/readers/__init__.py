@@ -1,3 +1,3 @@
-"""Readers of foreign recordings. Each returns a `Recording`; optional libraries are imported at
-first use.
+"""Readers of recordings in formats of other tools. Each reader returns a `Recording`. Optional
+libraries are imported at first use.
 """

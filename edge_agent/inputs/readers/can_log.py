@@ -1,10 +1,10 @@
 """Reader of CAN logs (BLF, ASC, candump, TRC, bus-logging MF4); a CAN database decodes the frames
 to series.
 
-Times are those of arrival, counted from the log's first frame in whole microseconds, so that a
-drive has the same times in every format. Buses are numbered as python-can does. If several buses
-carry a message, the frames of the bus named in the profile are used; otherwise those of the bus
-with the most frames of the wanted messages.
+A frame's time is that of its arrival. It is counted from the log's first frame in whole
+microseconds, so that a drive has the same times in every format. Buses are numbered as python-can
+does. If several buses carry a message, the frames of the bus named in the profile are used;
+otherwise those of the bus with the most frames of the wanted messages.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 
 @dataclass
 class Frames:
-    """CAN frames of one identifier on one bus: times of arrival [s as logged], and data bytes,
-    padded to LONGEST.
+    """CAN frames of one identifier on one bus: times of arrival [s as logged], and data bytes. Each
+    frame is padded to LONGEST bytes; `shortest` is the least length before padding.
     """
 
     times: list[float] = field(default_factory=list)
@@ -42,7 +42,7 @@ class Frames:
     shortest: int = LONGEST
 
     def add(self, time: float, data: bytes | bytearray) -> None:
-        """Add one received CAN frame: time of arrival [s] and data bytes."""
+        """Append one received CAN frame with its time of arrival [s] and its data bytes."""
         self.times.append(time)
         self.shortest = min(self.shortest, len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
@@ -71,7 +71,7 @@ def decode_log(
     """Return the signals of a CAN log by their full names `MESSAGE.SIGNAL`.
 
     Args:
-        take: function that returns the log's frames.
+        take: function that returns the log's frames with the wanted identifiers.
         name: name of the log.
         database: CAN database that decodes the frames.
         wanted: full names of signals; names that the database or the log does not have are left
@@ -103,15 +103,15 @@ def decode_log(
 
 
 def no_database(path: Path) -> InputError:
-    """Return the error for a log of CAN frames without a database."""
+    """Return the error that a log of CAN frames cannot be decoded without a CAN database."""
     return InputError(
         "dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile"
     )
 
 
 def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the CAN frames of a log with the wanted identifiers, read by python-can, and the time
-    of the log's first frame [s].
+    """Read a log of CAN frames with python-can. Return the frames whose identifier is in `wanted`,
+    and the time of the log's first frame [s].
     """
     log: Log = defaultdict(Frames)
     first = np.inf
@@ -133,8 +133,8 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 a number, a name or None
-    """Return the number of a CAN bus from its channel in a log: 1 for "can1" and for 1, 0 for a
-    name without a number.
+    """Return the number of a CAN bus from the name or number of its channel in a log: 1 for "can1"
+    and for 1, 0 for a name without a number.
     """
     if isinstance(channel, int):
         return channel

@@ -39,8 +39,8 @@ def is_bare_trace(path: Path) -> bool:
 
 
 def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the CAN frames with the wanted identifiers in a GVRET CSV file, and the time of the
-    first frame [s].
+    """Return the CAN frames of a GVRET CSV file whose identifier is in `wanted`, and the time of
+    the file's first frame [s].
 
     Raises:
         InputError: a row has another format; the error names the row.
@@ -74,10 +74,8 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
 
 
 def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the CAN frames with the wanted identifiers from a PCAN trace without header, and the
-    time of the first frame [s].
-
-    The trace has times in milliseconds.
+    """Return the CAN frames of a PCAN trace without header whose identifier is in `wanted`, and the
+    time of the trace's first frame [s]. The trace itself has times in milliseconds.
 
     Raises:
         InputError: no line is a frame.

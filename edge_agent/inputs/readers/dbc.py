@@ -56,8 +56,8 @@ class Signal:
     switch: int | None = None  # value of the multiplexer at which the signal is present
 
     def decode(self, data: Bytes) -> FloatArray:
-        """Return the physical values (n,) of the signal in n CAN frames, data bytes (n,
-        LONGEST).
+        """Return the physical values (n,) of the signal in n CAN frames with the data bytes `data`
+        (n, LONGEST).
         """
         raw = self._raw_values(data)
         number: NDArray[np.int64] | NDArray[np.uint64] = (
@@ -92,7 +92,7 @@ class Signal:
 
     @property
     def last_byte(self) -> int:
-        """Return the index of the last byte of a CAN frame that contains bits of the signal."""
+        """Return the index of the last byte of the CAN frame that contains bits of the signal."""
         if self.little:
             return (self.start + self.size - 1) // 8
         return self.start // 8 + max(0, -(-(self.size - self.start % 8 - 1) // 8))
@@ -112,8 +112,9 @@ class CanMessage:
     multiplexer: str | None = None
 
     def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
-        """Decode n CAN frames of this message, data bytes (n, LONGEST): return the physical values
-        (n,) by signal; NaN where a frame does not contain a multiplexed signal.
+        """Decode n CAN frames of this message with the data bytes `data` (n, LONGEST). Return the
+        physical values (n,) of the signals `names`; NaN where a frame does not contain a
+        multiplexed signal.
         """
         found = {name: self.signals[name].decode(data) for name in names}
         switched = [name for name in names if self.signals[name].switch is not None]
@@ -128,7 +129,7 @@ Database: TypeAlias = dict[str, CanMessage]
 
 
 def read_dbc(path: Path) -> Database:
-    """Return the messages of a CAN database file by name.
+    """Read a CAN database file, and return its messages by name.
 
     Raises:
         InputError: the file cannot be read, is too large, or contains no message with a signal.

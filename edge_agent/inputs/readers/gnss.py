@@ -1,5 +1,5 @@
-"""Reader of positions from NMEA 0183 sentences or gpsd's JSON, one per line; broken lines are left
-out and counted.
+"""Reader of positions from a file with one NMEA 0183 sentence or gpsd JSON object per line. Broken
+lines are left out and counted.
 
 Of the NMEA sentences, RMC is used: time with date, position, speed, course. A sentence with a wrong
 checksum is broken.
@@ -38,8 +38,8 @@ class Fix(NamedTuple):
 
 
 def parse_nmea(line: str) -> Fix | None:
-    """Return the fix in an RMC sentence; None for any other sentence, or if the receiver has no
-    position.
+    """Return the position fix in an NMEA line with an RMC sentence. Return None for any other
+    sentence, or if the receiver has no position.
 
     Raises:
         ValueError: the sentence is broken.
@@ -70,7 +70,8 @@ def parse_nmea(line: str) -> Fix | None:
 
 
 def parse_gpsd(line: str) -> Fix | None:
-    """Return the fix in a TPV report; None for any other object, or if the report has no position.
+    """Return the position fix in a TPV report of gpsd. Return None for any other JSON object, or if
+    the report has no position.
 
     Raises:
         ValueError: the line is not a JSON object, or a field is not a number.

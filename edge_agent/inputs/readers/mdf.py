@@ -96,7 +96,7 @@ def _linked_blocks(file: BinaryIO, address: int, size: int, path: Path) -> list[
 
 class MdfContent(NamedTuple):
     """Content of an MDF file: either CAN frames and the time of the first one [s since 1970 UTC],
-    or the channels of a measurement. The other field is None.
+    or the channels of a measurement. The unused field is None.
     """
 
     frames: tuple[Log, float] | None
@@ -104,13 +104,13 @@ class MdfContent(NamedTuple):
 
 
 def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
-    """Read a file in a separate process, because asammdf's compiled parts crash on some broken
+    """Read an MDF file in a separate process, because asammdf's compiled parts crash on some broken
     files.
 
     Args:
-        path: the file.
+        path: path of the file.
         identifiers: frame identifiers to read from a bus log; None if no database can decode
-            them.
+            the frames.
         names: channels to read from a measurement; None for all.
 
     Raises:
@@ -147,8 +147,8 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
 
 
 def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the CAN frames with the wanted identifiers in an MDF file, and the start of the log [s
-    since 1970 UTC].
+    """Return the CAN frames of an MDF file whose identifier is in `wanted`, and the start of the
+    log [s since 1970 UTC].
     """
     log: Log = {}
     first = np.inf
@@ -178,8 +178,8 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
 
 
 def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the channels of a measurement in an MDF file by name; all channels if `wanted` is
-    None.
+    """Return the channels `wanted` of a measurement in an MDF file, by name; all channels if
+    `wanted` is None.
 
     If several channels have the same name, the first one with samples is used.
     """

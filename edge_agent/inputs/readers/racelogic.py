@@ -70,7 +70,9 @@ def read_vbo(path: Path) -> Recording:
 def convert_vbo(
     path: Path, columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> Recording:
-    """Return a recording of VBO columns (T,), converted from the units of that format."""
+    """Return a recording of the columns of a VBO file, (T,) each, converted from the units of that
+    format to those of the signal log. `units` are the stated units by column.
+    """
     lower = {name.lower(): name for name in columns}
     clock = columns[lower["time"]]
     whole = np.floor(clock / 100.0)

@@ -37,8 +37,8 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """Open a bag for a `with` block, and close it at the end. For the path of a database file, its
-    folder is opened.
+    """Open a ROS bag for a `with` block, and close it at the end of the block. If `path` is a
+    database file of a bag folder, the folder is opened.
     """
     highlevel = import_optional("rosbags.highlevel")
     typesys = import_optional("rosbags.typesys")
@@ -71,7 +71,7 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
 
 
 def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the CAN frames in a ROS bag with the wanted identifiers, and the time of the first
+    """Return the CAN frames of a ROS bag whose identifier is in `wanted`, and the time of the first
     frame [s since 1970 UTC]. Each topic counts as a bus.
     """
     log: Log = {}
@@ -87,7 +87,7 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
 
 
 def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals of a ROS bag by name; all signals if `wanted` is None."""
+    """Return the signals `wanted` of a ROS bag by name; all signals if `wanted` is None."""
     topics = [
         c
         for c in reader.connections
@@ -136,8 +136,9 @@ def stamp_of(message: Any) -> int:  # noqa: ANN401
 
 
 def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
-    """Yield a pair for each number in a ROS message: its signal name, which begins with `prefix`,
-    and a function that reads it from a message of the same type.
+    """Yield a pair for each number in a ROS message: the signal name, which begins with `prefix`,
+    and a function that reads the number from a message of the same type. `depth` is the level of
+    nesting.
     """
     for name in getattr(message, "__dataclass_fields__", {}):
         if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):

@@ -113,8 +113,8 @@ def _read_csv(path: Path) -> pa.Table:
 
 
 def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
-    """Return the table in a RaceChrono CSV file of version 3: a preamble, then one row each of
-    names, units and sources, then the data.
+    """Return the data of a RaceChrono CSV file of version 3, whose lines are `lines`. It has a
+    preamble, then one row each of names, units and sources, then the data.
 
     Raises:
         InputError: there is no row of names.
@@ -191,8 +191,9 @@ def _parse_seconds(
     name: str,
     unit: str | None,
 ) -> tuple[FloatArray, int | None]:
-    """Convert the time column of a table. Return the seconds (n,) since the first row, and the time
-    of that row [ns UTC], or None if the column has no dates.
+    """Convert the time column `column` of a table to seconds; `unit` is the unit of its numbers, if
+    stated. Return the seconds (n,) since the first row, and the time of that row [ns UTC], or None
+    if the column has no dates.
     """
     if pa.types.is_timestamp(column.type):
         ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())

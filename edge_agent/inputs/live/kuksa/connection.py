@@ -18,7 +18,7 @@ LOOPBACK: Final = ("127.", "localhost:", "[::1]:", "unix:")
 
 
 class BrokerConnection:
-    """Settings of a connection, and methods that open it.
+    """Settings of a connection to a Kuksa databroker, and methods that open it.
 
     Attributes:
         grpc: the imported gRPC module.
@@ -58,7 +58,7 @@ class BrokerConnection:
             )
 
     def open_channel(self) -> Any:  # noqa: ANN401 grpc has no types
-        """Return a gRPC channel, which connects at the first call."""
+        """Return a gRPC channel to the databroker. It connects at the first call."""
         if self._authority is None:
             return self.grpc.insecure_channel(self._address)
         return self.grpc.secure_channel(
