@@ -41,7 +41,7 @@ class LowerVertices:
     Attributes:
         feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
             [1]; 1 means up to the peak.
-        out_feet: these shares for the output sets.
+        out_feet: the same shares for the output sets (sets of the step of ln R).
         peaks: upper vertices of the sets of the mismatch [1].
         out_peaks: upper vertices of the output sets [nat].
 
@@ -94,9 +94,9 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table of `step` at `knots` mismatches for linear interpolation, two arrays
-        (knots,): the mismatches (actual over theoretical variance of the innovations, minus 1) [1],
-        and the steps of ln R [nat] for them. R is the measurement noise.
+        """Return a table for linear interpolation of the function `step`, as two arrays (knots,):
+        the mismatches (actual over theoretical variance of the innovations, minus 1) [1], and the
+        steps of ln R [nat] for them. R is the measurement noise.
         """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
@@ -112,8 +112,8 @@ class LowerVertices:
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> LowerVertices:
-        """Return the fuzzy sets with the free parameters `vector` (16,). Where two neighbouring
-        sets would leave a gap between them, both sets are widened.
+        """Return the fuzzy sets with the free parameters `vector` (16,). If the vector would leave
+        a gap between two neighbouring sets, both sets are widened.
         """
         shares = np.asarray(vector, float).copy()
         pairs = shares[:FEET].reshape(-1, 2)

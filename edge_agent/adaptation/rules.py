@@ -40,8 +40,8 @@ RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s] peaks of the sets o
 
 
 def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
-    """Convert a rule table, whose entries are names of output sets, to levels (ln of the factor on
-    R), (5, 7) [nat].
+    """Convert a printed rule table, whose entries are names of output sets, to an array (5, 7) of
+    levels (ln of the factor on the measurement noise R) [nat].
 
     Raises:
         InputError: a name is unknown, the shape is wrong, or the level at zero mismatch and zero

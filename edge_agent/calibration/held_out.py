@@ -117,8 +117,9 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
 
 
 def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
-    """Return pairs (drives to learn from, drive to validate on). A single drive is cut into two
-    halves.
+    """Return pairs (drives to learn from, drive to validate on). In each pair, one drive serves for
+    validation and all others for learning; there are at most MOST_FOLDS pairs. A single drive is
+    cut into two halves, which serve in turn; a drive that is too short gives no pair.
     """
     if len(drives) == 1:
         t, signals = drives[0]
@@ -148,7 +149,8 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     """Return True if the predictions `tried` are worse than `best`. They are worse if their mean
     log-likelihood is lower by more than WORSE, or if on some drive the flag CONTRADICTION
-    (measurements contradict the model) is set for longer, by more than LONGER.
+    (measurements contradict the model) is set for a share of the time that is larger by more than
+    LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

@@ -198,7 +198,7 @@ def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEsti
     """Return the sensor and vehicle errors estimated from one drive, by quantity, for times t (T,)
     [s] and signals (T, 18).
 
-    Quantities without enough excitation are left out.
+    Quantities that the drive does not excite enough are left out.
     """
     return _estimate_quantities(prepare_drive(t, signals, vehicle), vehicle) | find_lags(
         t, signals, vehicle
@@ -256,8 +256,8 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
 
 
 def _estimate_radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """Return, for each wheel, how much faster it turns than the mean of the four wheels, as a
-    relative difference, corrected for yaw and slip.
+    """Return, for each wheel, the relative difference between its speed and the mean speed of the
+    four wheels, corrected for yaw and slip.
     """
     calm = (
         (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)

@@ -68,7 +68,7 @@ def advance_velocity(
     """Return (v_x, v_y) [m/s] after `step` [s] with constant accelerations a_x, a_y and yaw rate r.
     The solution is exact: a rotation by -r*step.
 
-    The solution replaces Euler's rule, with which the error of v_y is four times larger (errata).
+    It replaces Euler's rule, with which the error of v_y is four times larger.
     """
     angle = yaw_rate * step
     cos = math.cos(angle)

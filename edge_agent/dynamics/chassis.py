@@ -110,7 +110,9 @@ def tyre_forces(
 
 
 class PlanarMotion(NamedTuple):
-    """Motion of the body: velocity [m/s], yaw rate [rad/s], accelerations [m/s^2]."""
+    """Motion of the body: velocity [m/s] forward and to the left, yaw rate [rad/s], and
+    accelerations [m/s^2], from which the wheel loads follow.
+    """
 
     vx: float
     vy: float
@@ -120,7 +122,9 @@ class PlanarMotion(NamedTuple):
 
 
 class WheelInputs(NamedTuple):
-    """Inputs of the four wheels: steering, wheel speed, given longitudinal force, friction."""
+    """Inputs of the four wheels: steering angle, wheel speed, friction, and a given longitudinal
+    force that replaces that of the tyre model (NaN: none).
+    """
 
     cos: Four  # cosine of the steering angle
     sin: Four  # sine of the steering angle
@@ -180,8 +184,9 @@ def _wheel_force(
 ) -> tuple[float, float]:
     """Return the (forward, left) force [N] of a wheel in body axes.
 
-    `wheel` is (load, mu, cos, sin, omega, given longitudinal force). If the given force is not NaN,
-    it replaces the tyre's longitudinal force.
+    `ahead` and `aside` [m/s] are the velocity of the wheel centre in body axes. `wheel` is (load,
+    friction, cosine and sine of the steering angle, wheel speed, given longitudinal force). If the
+    given force is not NaN, it replaces the tyre's longitudinal force.
     """
     load, mu, cos, sin, omega, given_x = wheel
     slip = _wheel_slips(body.radius, ahead, aside, cos, sin, omega)

@@ -77,8 +77,9 @@ def combined_magic(
     """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
     directions, by similarity with the Magic Formula.
 
-    slip (longitudinal, tangent of the slip angle) [1], stiffness (longitudinal [N], lateral
-    [N/rad]), mu [1], load [N].
+    `slip` is (longitudinal slip, tangent of the slip angle) [1], `stiffness` (longitudinal [N],
+    lateral [N/rad]), `mu` the friction [1], `load` the wheel load [N]; `c` and `e` are shape and
+    curvature of the curve [1].
     """
     grip = mu * load
     if grip <= 0.0:

@@ -63,10 +63,10 @@ def update_by_downdate(
     """Run the measurement update in place as in paper 003: the covariance factor is downdated (its
     covariance is reduced) by one column per measurement.
 
-    The arguments are as in `householder.update`. Return number of measurements used, log-likelihood
-    [nat], squared innovation over its covariance, and True if a downdate was refused because the
-    result would not be a covariance. In that case `householder.update`, which cannot fail, performs
-    the step instead.
+    The arguments are as in `householder.update`. Return the number of measurements used, the
+    log-likelihood [nat], the squared innovation over its covariance, and a flag that is True if a
+    downdate was refused because the result would not be a covariance. In that case
+    `householder.update`, which cannot fail, performs the step instead.
     """
     n, points = state_deviations.shape
     measured_deviations, innovation, noise_std = measurement

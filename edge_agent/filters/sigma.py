@@ -24,7 +24,8 @@ EXACTNESS = 1e-9  # tolerance of the moments; with alpha = 1e-3 six of sixteen d
 
 @dataclass(frozen=True)
 class SigmaRule:
-    """Points and weights of one rule. The constructor rejects wrong moments.
+    """Points and weights of one sigma rule. The constructor checks that the rule has the right
+    moments.
 
     Raises:
         InputError: shapes do not agree, a moment up to the second is not exact, or a covariance

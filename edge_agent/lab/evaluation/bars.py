@@ -76,8 +76,9 @@ def mean(values: FloatArray | None) -> float:
 
 
 def false_per_hour(results: Results) -> float:
-    """Return how often per hour the default estimator falsely reports a change of friction (see
-    `measures.false_changes`), in scenarios whose friction is constant.
+    """Return how often per hour the default estimator falsely reports a change of friction, in
+    scenarios whose friction is constant. A false report is a stretch in which the friction interval
+    does not agree with the true friction.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -219,9 +220,9 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures (named numbers) of the evaluation. Figures with a target come first (with
-    `quick`, only the measured ones). The others are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and
-    come with a standard deviation.
+    """Return all figures (named numbers) of the evaluation. Figures with a target come first; with
+    `quick`, those that were not measured are left out. Most other figures are named
+    `KIND.SCENARIO.ESTIMATOR.MEASURE` and have a standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
@@ -248,9 +249,9 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the figures (named numbers) on filter consistency: the bounds of NEES and NIS
-    (normalised squared errors and innovations), and for every estimator the share of true frictions
-    below each stated quantile.
+    """Return the figures (named numbers) on filter consistency: the bounds within which the means
+    of NEES and NIS (normalised squared errors and innovations) should lie, and for every estimator
+    the share of true frictions below each stated quantile.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

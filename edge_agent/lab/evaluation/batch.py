@@ -29,8 +29,8 @@ FINE_HZ = 500.0
 
 @dataclass(frozen=True)
 class DriveSpec:
-    """Specification of a simulated manoeuvre, from a paper or for the default estimator's
-    evaluation: vehicle, speed [m/s], friction, sampling rate, duration.
+    """Specification of a simulated manoeuvre, taken from a paper or made for the default
+    estimator's evaluation: vehicle, speed [m/s], friction, sampling rate, duration.
 
     `road` is the name of the relief (slopes of the road), and `slope` a constant slope added to it.
     `torque` is False if wheel torque is not recorded.
@@ -51,7 +51,7 @@ class DriveSpec:
 @dataclass(frozen=True)
 class DriveSet:
     """N simulated drives of T samples: times t (T, N) [s], sensor readings `signals` (T, N, 18),
-    true values by name (T, N), nominal vehicles.
+    true values by name (T, N), and the N vehicle files that the estimators get.
     """
 
     t: FloatArray
@@ -84,8 +84,8 @@ def realistic(
 
 
 def ideal(scenario: DriveSpec) -> DriveSet:
-    """Simulate one drive with error-free sensors and an exact vehicle file. The simulation uses
-    finer time steps than the sampling interval of the scenario.
+    """Simulate one drive with error-free sensors and an exact vehicle file. The simulation runs at
+    a higher rate than the scenario's sampling rate.
     """
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return join_drives(

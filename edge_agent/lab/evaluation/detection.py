@@ -77,8 +77,9 @@ Stretches: TypeAlias = list[tuple[int, int]]
 
 @dataclass
 class DetectionTally:
-    """Sums of the detection evaluation over one or several towns. By name of a measure, it holds
-    the sum and count of values, from which the mean is computed, and a list of detection times [s].
+    """Sums of the detection evaluation over one or several towns. For each measure, by name, the
+    tally holds the sum and count of its values, from which the mean is computed, or a list of
+    detection times [s].
     """
 
     total: dict[str, float] = field(default_factory=dict)
@@ -97,7 +98,7 @@ class DetectionTally:
         self.add(name, np.array([holds]))
 
     def merge(self, other: DetectionTally) -> None:
-        """Add the sums and detection times of another tally (sums over towns) to this one."""
+        """Add the sums and detection times of another tally (`other`) to this tally."""
         for name, value in other.total.items():
             self.total[name] = self.total.get(name, 0.0) + value
             self.count[name] = self.count.get(name, 0) + other.count[name]
@@ -136,8 +137,8 @@ def runs_of(on: NDArray[np.bool_]) -> Stretches:
 
 
 def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
-    """Return the mask `on` (T,) of samples, in which every gap (stretch of False between True) of
-    at most `seconds` is set to True.
+    """Return a copy of the mask `on` (T,) in which every gap (stretch of False between True
+    samples) of at most `seconds` [s] is filled with True.
     """
     out = on.copy()
     most = round(seconds * RATE_HZ)
@@ -149,7 +150,7 @@ def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
 
 def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretches:
     """Return the slides of a car, as pairs (first index, last index + 1): stretches where the
-    normalised slip θ (T, 4) of some wheel exceeds SLIDING for at least `seconds`.
+    normalised slip θ (T, 4) of some wheel exceeds SLIDING for at least `seconds` [s].
     """
     some = bridge_gaps(np.asarray((theta > SLIDING).any(axis=1)), BRIDGED_S)
     least = round(seconds * RATE_HZ)
@@ -188,8 +189,8 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
     """Evaluate all samples of the town, and add the results to the tally (sums of the evaluation):
-    coverage and interval score of the friction interval, false ice (grip reported as slippery), and
-    false grip (lower end too far above the true friction).
+    coverage and interval score of the friction interval, false ice (a road with grip reported as
+    slippery), and false grip (lower end of the interval too far above the true friction).
     """
     mu = drive.mu
     apart = ~drive.stood

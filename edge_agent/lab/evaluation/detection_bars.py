@@ -58,7 +58,7 @@ def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
     """Return a function that takes a tally (sums of the evaluation by name) and returns 1000 times
-    the sum `over` divided by the sum `under`.
+    the sum of the measure named `over` divided by the sum of the measure named `under`.
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 

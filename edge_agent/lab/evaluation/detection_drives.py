@@ -167,9 +167,10 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Run the estimators on one chunk of a drive. Return the estimates, with the evidence on
-    friction if the estimator computes it, and an array (T, N) of how much [nat] the friction belief
-    favours a slippery road (NaN without belief).
+    """Run the estimators on one chunk (stretch of time) of the drives: times `t` (T, N) [s], and
+    signals. `closes` (T, N) is True where a visit of a map cell ends. Return the estimates, with
+    the evidence on friction if the estimator computes it, and an array (T, N) of how much [nat] the
+    friction belief favours a slippery road (NaN without belief).
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)
@@ -189,8 +190,8 @@ def _estimate_chunk(
 
 
 def slippery_favoured(log_likelihood: FloatArray) -> FloatArray:
-    """Return how much a slippery road is favoured [nat]: the largest log-likelihood below
-    SLIPPERY_MU minus the largest above it, for log-likelihoods (…, 32) on the friction grid.
+    """Return the evidence for a slippery road [nat]: the largest log-likelihood below SLIPPERY_MU
+    minus the largest above it, for log-likelihoods (…, 32) on the friction grid.
     """
     low = mugrid.CENTRES < SLIPPERY_MU
     return np.asarray(

@@ -43,8 +43,8 @@ def in_order(t: FloatArray) -> FloatArray:
 
 
 def kept_samples(t: FloatArray) -> FloatArray:
-    """Return the time stamps t (T, N) with three seconds added from time BEGINS on, which looks
-    like a gap of three seconds in the signals.
+    """Return the time stamps t (T, N) with three seconds added from time BEGINS on, as if no
+    samples had arrived for three seconds.
     """
     return np.where(t < BEGINS, t, t + 3.0)
 
@@ -59,7 +59,8 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of sensor faults. `flag` is the health flag (reason for less reliable
+    """One row of the table of sensor faults: the faults, the expected effect in words, and a
+    function that changes the time stamps. `flag` is the health flag (reason for less reliable
     estimates) that estimators must report, or OK if no estimator can detect the fault.
     """
 

@@ -71,7 +71,7 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Return the NEES (normalised estimation error squared): the squared error of (v_x, v_y) over
-    its stated variance, per component, (T, N).
+    its stated variance, as the mean over the two components, (T, N).
     """
     off = errors(batch, reported)
     return np.asarray(
@@ -103,8 +103,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Return two measures by name, one value per drive, for drives on a road with different
-    friction left and right. Over the last LAST_S, they are the friction error on the side with less
-    friction, and the coverage of the friction interval on the other side.
+    friction left and right. Both are computed over the last LAST_S [s] of each drive: the friction
+    error on the side with less friction, and the coverage of the friction interval on the other
+    side.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel

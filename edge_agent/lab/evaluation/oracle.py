@@ -140,8 +140,8 @@ def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """Return two arrays with one value per seed: the friction error |μ − true value| of the oracle
-    (an ideal observer) at the end of the drive 003.accel, and the error that the oracle itself
-    expects.
+    (an ideal observer) at the end of the drive 003.accel, and the mean error that the oracle
+    expects from its own posterior.
     """
     scenario = PAPERS["003.accel"]
     exact = realistic(scenario, seeds[:1], "ideal")
@@ -175,8 +175,9 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
 
 
 def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
-    """Return the normalised slips (n,) on the rising branch at which the tyre uses the shares
-    `force` (n,) of its grip.
+    """Return the normalised slips (n,) at which a tyre uses the shares `force` (n,) of its grip.
+    The slips lie on the rising branch of the force curve with this `shape` and `curvature` (Magic
+    Formula).
     """
     curve = _force_curve(shape, curvature)
     return np.interp(force, curve, THETA[: len(curve)])
@@ -184,8 +185,8 @@ def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
 
 @cache
 def _force_curve(shape: float, curvature: float) -> FloatArray:
-    """Return the tyre's force curve: an array of force over peak force at the normalised slips
-    THETA, up to the peak.
+    """Return the force curve of a tyre (Magic Formula with `shape` and `curvature`): an array of
+    force over peak force at the normalised slips THETA, up to the peak.
     """
     curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
     return curve[: int(np.argmax(curve)) + 1]

@@ -119,7 +119,9 @@ def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
 
 
 def _line(estimator: str) -> dict[str, Any]:
-    """Return the line style of an estimator. It is the same in every plot."""
+    """Return the line style of an estimator: colour, dashes and width. An estimator has the same
+    style in every plot.
+    """
     style = line_of(estimator)
     return {"color": style.colour, "linestyle": style.dash, "lw": 1.0}
 

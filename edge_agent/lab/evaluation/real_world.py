@@ -78,8 +78,8 @@ class Tally:
     count: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, value: FloatArray | BoolArray, among: BoolArray | None = None) -> None:
-        """Add values (T, N) to the mean with the name `name`. If `among` (T, N) is given, only
-        values where it is True are added; NaN are left out.
+        """Add values (T, N) to the mean of the measure called `name`. If the mask `among` (T, N) is
+        given, only values where `among` is True are added. NaN values are left out.
         """
         taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
         taken = taken[np.isfinite(taken)]
@@ -224,8 +224,8 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Simulate cars of all presets that stand on a slope, some with ordinary sensors, some with
-    inaccurate sensors and without torque.
+    """Simulate cars of all vehicle presets that stand on a slope of `slope` [1], some with ordinary
+    sensors, some with inaccurate sensors and without torque.
     """
     batches = []
     for sensors in (USUAL, "rough"):

@@ -49,8 +49,8 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
 
 
 def join_estimates(parts: list[Estimates]) -> Estimates:
-    """Return the estimates of successive parts of one drive, joined into one object, without the
-    evidence (likelihoods of friction).
+    """Join the estimates of successive parts of the same drives into one object, and return it. The
+    joined object has no evidence (likelihoods of friction).
     """
     return Estimates(np.concatenate([part.values for part in parts]))
 
@@ -91,10 +91,11 @@ def between_quantiles(
     truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray
 ) -> FloatArray:
     """Return the probability (N,) of friction below the true value `truth`, for Gaussian
-    distributions with these 5, 50 and 95 % quantiles.
+    distributions whose 5, 50 and 95 % quantiles are `lower`, `mu` and `upper` (N,).
 
-    Either outer quantile may be clipped to the friction range, so the standard deviation comes from
-    the one farther from the median. An interval as wide as the prior's counts as uniform.
+    One of the outer quantiles may be clipped to the friction range. Therefore the standard
+    deviation is computed from the outer quantile that is farther from the median. If the interval
+    is as wide as the prior's, the distribution is assumed to be uniform.
     """
     from scipy.stats import norm
 

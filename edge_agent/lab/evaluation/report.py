@@ -152,7 +152,8 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
     """Return the mean of the figure (named number) `name` as text for the report. With `spread`, "±
-    standard deviation" is added if it is known. If the figure was not measured, return a dash.
+    standard deviation" is added if the standard deviation is known. If the figure was not measured,
+    return a dash.
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
@@ -222,7 +223,7 @@ def world(values: dict[str, float]) -> str:
 
 def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
     """Return the names of the estimators that occur in the keys of `values` between `prefix` and
-    `suffix`, each once and in order.
+    `suffix`, each once, in the order of their first occurrence.
     """
     found = [
         name[len(prefix) : -len(suffix)]
@@ -295,8 +296,9 @@ def verdict(shares: Sequence[float]) -> str:
 
 
 def consistency(values: dict[str, float]) -> str:
-    """Return a Markdown table with one row per estimator: NEES and NIS over all scenarios, and the
-    share of instants at which they lie within their bounds.
+    """Return a Markdown table with one row per estimator: NEES and NIS (normalised squared errors
+    and innovations) over all scenarios, and the share of instants at which their means lie within
+    the bounds for a consistent filter.
     """
     names = estimators(values, "reliability.", ".below_05")
     rows = []

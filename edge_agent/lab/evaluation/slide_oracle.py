@@ -83,8 +83,8 @@ def visit_evidence(
 def _evidence(
     force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray
 ) -> FloatArray:
-    """Return the log-likelihood ln L on the friction grid for each of the random tyres, (TYRES,
-    BINS).
+    """Return the log-likelihood ln L of the oracle's data on the friction grid, assuming each of
+    the random tyres in turn, (TYRES, BINS).
 
     force and slip are force over load and slip with noise, (T, 4); noise (T,) is the standard
     deviation of the slip noise; tyres (TYRES, 3) is the result of `tyres_drawn`.

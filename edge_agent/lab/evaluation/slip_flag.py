@@ -52,7 +52,7 @@ def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]
     Args:
         t: (T, N) [s].
         signals: (T, N, channels); NaN is a missing reading.
-        vehicles: nominal vehicles, N of them.
+        vehicles: the N vehicle files that the cars' controllers know.
     """
     out = np.empty(t.shape)
     for n, vehicle in enumerate(vehicles):

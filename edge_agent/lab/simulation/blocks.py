@@ -18,7 +18,8 @@ def blocks(
     fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None
 ) -> Iterator[Block]:
     """Yield blocks of simulated samples without end, each BLOCK_S [s] long. The first block begins
-    at the current time of the computer's clock. `recorder` receives the true values.
+    at the current time of the computer's clock. The `recorder`, if given, stores the true friction
+    of every block.
     """
     steps = max(1, round(BLOCK_S * rate_hz))
     start_ns = 0

@@ -30,7 +30,7 @@ ONE: Final = np.uint64(1)
 
 
 def checked_seed(seed: int) -> int:
-    """Return the seed of the random numbers if it is valid.
+    """Return the seed unchanged if it is valid.
 
     Raises:
         InputError: the seed is negative.

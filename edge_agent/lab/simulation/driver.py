@@ -124,8 +124,8 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     """Advance the route state `g` (lane and point on it) to the position of the vehicle with the
     state `x`. At the end of a lane, the next lane is chosen at random.
 
-    Return the distance [m] to the next point of the lane, limited to the distance between two
-    points.
+    Return the distance [m] from the vehicle to the next point of the lane, at most the distance
+    between two points.
     """
     points, first, size, spacing, ways = lanes
     while True:
@@ -181,8 +181,8 @@ def budget(d: FloatArray) -> float:
 
 @compiled
 def cruise(d: FloatArray) -> float:
-    """Return the speed that the driver with the state `d` chooses on an open road [m/s]; it is
-    lower where the driver believes that the road is slippery.
+    """Return the speed that the driver with the state `d` chooses on an open road [m/s]; the speed
+    is lower where the driver believes that the road is slippery.
     """
     return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
@@ -224,7 +224,8 @@ def heeds_warning(d: FloatArray) -> bool:
 @compiled
 def traffic_braking(t: float, key: Key) -> float:
     """Return the braking that traffic ahead demands at time t [s], as a share of the driver's
-    budget (acceleration that the driver accepts); 0 most of the time.
+    budget (acceleration that the driver accepts). The share is 0 most of the time; `key` is the
+    random key of the traffic.
     """
     window = int(t / ALERT_S)
     if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:

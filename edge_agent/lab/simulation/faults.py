@@ -44,7 +44,7 @@ class Fault:
 
     @property
     def indices(self) -> list[int]:
-        """Return the indices of the channels that the fault affects."""
+        """Return the indices, in the signals' last axis, of the channels that the fault affects."""
         if self.channel in CHANNELS:  # a full name: "yaw" does not also select "yaw_rate"
             return [CHANNELS.index(self.channel)]
         return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]

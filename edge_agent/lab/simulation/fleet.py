@@ -259,8 +259,8 @@ class SimulatedFleet:
         return t, signals
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
-        """Return the path that vehicle k will drive: (latitude, longitude) [deg] of points about a
-        metre apart, over at least `length` [m].
+        """Return the path that vehicle k will drive, at least `length` [m] long, as two arrays:
+        latitudes and longitudes [deg] of points about a metre apart.
         """
         network = self.scenario.network
         key = self._keys[0][k]

@@ -114,7 +114,9 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
 def look_up_many(
     table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray
 ) -> FloatArray:
-    """Return the road friction, as `look_up` does, for arrays t [s], x, y [m] of equal length."""
+    """Return the values of `column` (true or expected friction) in the friction table at many
+    points, for arrays t [s], x, y [m] of equal length.
+    """
     values = np.empty(x.size)
     for i in range(x.size):
         values[i] = look_up(table, column, t[i], x[i], y[i])

@@ -60,12 +60,12 @@ class WarnedDrivers:
         return bool(self.warned[k])
 
     def route_of(self, k: int) -> GivenRoute | None:
-        """Return the route ahead of vehicle k; None before the first block of samples."""
+        """Return the route ahead of vehicle k; None if no route has been stored yet."""
         return self._routes.get(k)
 
     def hear(self, name: str, warning: GripWarning) -> None:
-        """Store a warning for the driver of the vehicle called `name`. It is passed to the driver
-        with the next block of samples, and the driver's reaction time starts then.
+        """Store a warning for the driver of the vehicle called `name`. The driver gets the warning
+        with the next block of samples; the driver's reaction time starts then.
 
         The method may be called from any thread.
         """

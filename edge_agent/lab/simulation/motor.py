@@ -41,7 +41,9 @@ Q_SUM = 3
 
 
 class Pmsm(NamedTuple):
-    """Constants of one permanent-magnet synchronous motor, and of its speed control."""
+    """Constants of one permanent-magnet synchronous motor (PMSM), of its current control and of the
+    vehicle's speed control.
+    """
 
     resistance: float = 0.10  # R [ohm]
     inductance_d: float = 3.0e-4  # L_d [H]

@@ -77,8 +77,8 @@ STILL: Final = 0.02
 
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
-    """Return (g_x, g_y, share): the gravity along the body's axes [m/s^2] on the slope in the
-    inputs `u`, and the share of gravity that acts normal to the road.
+    """Return (g_x, g_y, share): the components of gravity along the body's axes [m/s^2] on the
+    slope in the inputs `u`, and the share of gravity that acts normal to the road.
     """
     ahead = u[Control.TILT, 0]
     left = u[Control.TILT, 1]
@@ -335,7 +335,8 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 
     The steered wheels follow Ackermann geometry: their axes meet at one point on the line of the
     rear axle. If the rear wheels steer too, `steer` is the angle that a car without rear steering
-    would need on the same circle. The front wheels then turn by another angle.
+    would need on the same circle. The front wheels then turn by a different angle, because the rear
+    wheels contribute to the turn.
     """
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     curvature = math.tan(steer) / base
@@ -403,7 +404,7 @@ def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
 
 @compiled
 def strongest_pull(p: FloatArray, vx: float) -> float:
-    """Return the largest driving force of the engine [N] at the speed `vx` [m/s]: limited by its
-    power, and below 5 m/s by the gearbox.
+    """Return the largest driving force of the engine [N] at the speed `vx` [m/s]: it is limited by
+    the engine's power, and below 5 m/s by the gearbox.
     """
     return float(p[TrueParameter.POWER] / max(vx, 5.0))

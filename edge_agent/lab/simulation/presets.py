@@ -26,7 +26,7 @@ class TrueVehicle:
 
     With the tyre's shape c and curvature e, the force has its peak between the normalised slips θ =
     2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e .1) and decreases beyond. An estimator that assumes the
-    textbook shape has force errors of 5 to 15 % there.
+    textbook shape has force errors of 5 to 15 % at these slips.
     """
 
     vehicle: Vehicle

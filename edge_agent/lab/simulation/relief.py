@@ -55,8 +55,8 @@ class Wave:
 @dataclass(frozen=True)
 class Relief:
     """Slopes of the roads in a scenario. They are the sum of three parts: the slopes `waves`, the
-    `crossfall` (sideways slope) of every lane [1], and the `banking` (sideways slope of a bend)
-    divided by the bend's curvature [m].
+    `crossfall` (sideways slope) of every lane [1], and the sideways slope of bends, which is
+    `banking` [m] times the curvature of the bend.
     """
 
     waves: tuple[Wave, ...] = ()
@@ -101,8 +101,8 @@ def cross_slope(table: FloatArray, curvature: float) -> float:
     """Return the cross slope [1] of a lane with this `curvature` [1/m], positive if the road rises
     to the left.
 
-    The cross slope is the crossfall minus the banking; in a bend to the left it is therefore
-    smaller.
+    The cross slope is the crossfall minus the banking of the bend. In a bend to the left it is
+    therefore smaller than on a straight road.
     """
     return float(table[0, 0] - table[0, 1] * curvature)
 
@@ -203,8 +203,8 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
-    """Return the relief (slopes of the road surface) with that name, with a constant `slope` [1]
-    along the track added.
+    """Return the relief (slopes of the road surface) called `name`, or the given relief, with a
+    constant `slope` [1] along the track added.
 
     Raises:
         InputError: there is no relief with that name, or the slope is too steep.

@@ -139,8 +139,8 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
 
 
 def round_corners(corners: list[tuple[float, float]], radius: float) -> FloatArray:
-    """Return a line along the corners, (n, 2), rounded by arcs of `radius` [m] at the inner
-    corners. Its points are a quarter of a metre apart.
+    """Return a line (n, 2) [m] from the first to the last of `corners`, rounded by arcs of `radius`
+    [m] at the corners between. Its points are a quarter of a metre apart.
     """
     line = [np.array(corners[0])]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
@@ -253,7 +253,7 @@ def network_of(
 
 def _lane_table(lane: FloatArray) -> FloatArray:
     """Return the table of the points of one lane, one row each, with position, heading and smoothed
-    curvature. Its speed profile is not yet computed.
+    curvature. The speed profile is infinite until it is computed.
     """
     step = np.gradient(lane, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))

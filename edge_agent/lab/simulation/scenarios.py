@@ -70,8 +70,8 @@ class Scenario:
 
     @cached_property
     def table(self) -> FloatArray:
-        """Return the friction table (one row per patch of road surface, the first is the
-        background), for `friction.look_up`.
+        """Return the friction table, in which `friction.look_up` finds the friction of a point: one
+        row per patch of road surface; the first row is the background.
         """
         return friction_table(self.background, self.patches)
 
@@ -166,7 +166,7 @@ def demo() -> Scenario:
 def hills() -> Scenario:
     """Return the demonstration town with hills: slopes, crossfall, and banked bends.
 
-    Slopes reach 8 %. They are small on ice, because otherwise no car could climb them.
+    Slopes reach 8 %. Slopes on ice are small, because no car could climb steep ice.
     """
     relief = Relief(
         (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
@@ -185,8 +185,8 @@ def frost() -> Scenario:
     """Return the hilly town in the first frost: at 35 s black ice appears at five places in its
     eastern half.
 
-    The demonstration uses it. Every driver meets the new ice several times, so that warned and
-    unwarned drivers can be compared.
+    The demonstration uses this town. Every driver meets the new ice several times, so that warned
+    and unwarned drivers can be compared.
     """
     town = hills()
     kept = tuple(patch for patch in town.patches if not math.isfinite(patch.start))
@@ -319,8 +319,9 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
 def _lay_patch(
     name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
 ) -> Patch:
-    """Return a patch of road of `size` (length, width) [m] with friction `mu`. It is aligned with
-    the lane `points` at its point number `row`, `left` [m] to the left of the lane's centre.
+    """Return a patch of road of `size` (length, width) [m] with friction `mu`. The patch lies at
+    point number `row` of the lane whose points are `points`, aligned with the lane and `left` [m]
+    to the left of the lane's centre line.
     """
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])

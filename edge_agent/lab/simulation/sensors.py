@@ -154,7 +154,7 @@ ERRORS: Final = int(ErrorColumn.MOUNTED) + COLUMNS
 
 
 def sensors_named(name: str | Sensors) -> Sensors:
-    """Return the sensor set with that name.
+    """Return the sensor set called `name`, or the given sensor set itself.
 
     Raises:
         InputError: there is no such set.

@@ -44,8 +44,8 @@ STATES: Final = 38
 
 
 class TrueParameter(IntEnum):
-    """Index of a parameter that only the true vehicle has. In a row of parameters, these follow the
-    parameters of `edge_agent.dynamics.parameters.Parameter`.
+    """Index of a parameter that only the true vehicle has. In a row of parameters, these parameters
+    come after those of `edge_agent.dynamics.parameters.Parameter`.
     """
 
     SHAPE = len(Parameter)  # shape c and curvature e of the tyre curve

@@ -104,8 +104,8 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
 
 def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
     """Return the pheromone Δτ (V, K) that P paths (P, V) with weights (P,) deposit on V vertices
-    (variables) with K positions (values) each. Each path adds its weight at its position of every
-    vertex.
+    (variables) with K positions (values) each. Each path adds its weight at the position that it
+    selects at every vertex.
     """
     laid = np.zeros(reachable.shape)
     vertices = np.arange(reachable.shape[0])

@@ -97,8 +97,8 @@ class SearchTally:
         return np.asarray(np.clip(vector, self.lower, self.upper))
 
     def uniform(self, rng: np.random.Generator) -> FloatArray:
-        """Return a random vector (V,) that the problem admits, uniform over the whole range of
-        every variable.
+        """Return a random vector (V,) that is admissible for the problem, drawn uniformly over the
+        whole range of every variable.
 
         Raises:
             InputError: no vector out of REDRAWS draws is admissible.

@@ -26,9 +26,9 @@ def optimise(
 ) -> Result:
     """Search for the vector with the largest objective, and return the best one found.
 
-    The search evaluates ants·iterations vectors one after the other. It has no ants: the two
-    arguments only set this total, and have these names so that all search methods can be called
-    alike.
+    The search evaluates ants·iterations vectors one after the other. This method has no ants: the
+    arguments `ants` and `iterations` only set the total, and have these names so that all search
+    methods can be called in the same way.
     """
     tally = SearchTally(problem)
     begin = tally.uniform(rng) if problem.start is None else np.asarray(problem.start, float)

@@ -16,8 +16,8 @@ def optimise(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Return the best of `ants`·`iterations` vectors that are drawn uniformly from the possible
-    values; `progress` is called after each iteration.
+    """Return the best of `ants`·`iterations` vectors whose values are drawn uniformly from the
+    possible values of each variable. `progress` is called after each iteration.
     """
     graph = Graph.from_choices(problem.choices)
     ledger = Ledger(problem.objective, graph, problem.admissible)

@@ -92,8 +92,8 @@ class Graph:
 
     @classmethod
     def from_choices(cls, choices: Sequence[FloatArray]) -> "Graph":
-        """Return the graph for a list with one array per vertex (variable): its positions (possible
-        values).
+        """Return the graph for `choices`, a list with one array per vertex (variable): the vertex's
+        positions (possible values).
 
         Raises:
             InputError: a vertex has no position.

@@ -157,8 +157,9 @@ def campaign(
     only: str = "",
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[ConstantChange]:
-    """Run the filter with each constant changed, and return the changes of its measures, the
-    largest effect first. Only constants whose name contains `only` are changed.
+    """Run the filter with one constant changed at a time, and return the changes of the filter's
+    measures. The list begins with the constant of the largest effect. Only constants whose name
+    contains `only` are changed.
     """
     memberships = shipped_memberships(ESTIMATOR)
     usual = design_of(memberships, adaptive=True)
@@ -217,7 +218,7 @@ def to_markdown(changes: Sequence[ConstantChange]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the sensitivity analysis, print its table, and write the table and the numbers to the
-    folder `--out`.
+    folder given by the option `--out`.
     """
     parser = argparse.ArgumentParser(description="Sensitivity of the estimator to its constants")
     parser.add_argument("--out", type=Path, default=Path(".evaluation/sensitivity"))

@@ -152,7 +152,9 @@ def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> Stud
 def _noisy(
     exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition
 ) -> FloatArray:
-    """Return a copy of the signals `exact` (T, N, 18) with white noise on a_x, a_y and yaw rate."""
+    """Return a copy of the signals `exact` (T, N, 18) with white noise added to a_x, a_y and yaw
+    rate: the noise of the given condition, with one seed per drive.
+    """
     variance = scheduled_variance(t) if condition.schedule else np.full(len(t), VARIANCE)
     noisy = exact.copy()
     for n, seed in enumerate(seeds):

@@ -108,9 +108,9 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return the figures (named numbers) of the study for each kind of search. They are the scores
-    under each condition of the measurement noise on held-out drives, the objective on both sets of
-    drives, and the progress of the searches.
+    """Return the figures (named numbers) of the study for each kind of search. These are the scores
+    on held-out drives under each condition of the measurement noise, the objective on search and
+    held-out drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -184,7 +184,7 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 def scores(done: Study, way: str) -> dict[str, Score]:
     """Return the scores that the file of tuned memberships (fuzzy sets) states, for the search
-    drives and for the held-out drives. They are the scores of the best memberships found by the
+    drives and for the held-out drives. These scores are those of the best memberships found by the
     kind of search `way`, averaged over all conditions of the measurement noise R.
     """
     found = {}
@@ -201,7 +201,7 @@ def scores(done: Study, way: str) -> dict[str, Score]:
 
 
 def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
-    """Plot, for each kind of search, the best objective found so far over the number of
+    """Plot, for each kind of search, the best objective found so far as a function of the number of
     evaluations: mean and one standard deviation over the searches. The plot is written to `path`.
     """
     import matplotlib as mpl

@@ -97,7 +97,7 @@ class PlotPanel(NamedTuple):
 
 
 class Heat(NamedTuple):
-    """One panel of a reproduction's plot: a table of numbers shown as colours."""
+    """One panel of a reproduction's plot: a matrix of numbers, shown as a colour map."""
 
     title: str
     x: str

@@ -60,8 +60,8 @@ def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet,
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run the experiment of paper 000. `seeds` are the seeds of the drives with ordinary
-    sensors.
+    """Run the experiment of paper 000, and return the tables and plots of the reproduction. `seeds`
+    are the seeds of the drives with ordinary sensors.
     """
     done = Reproduction(
         "000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS

@@ -62,7 +62,9 @@ class MotionRun:
 
 
 def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRun:
-    """Simulate a drive, and run the filters on it with the true friction as initial value."""
+    """Simulate a drive with error-free sensors, and run the filters, one per entry of `settings`,
+    on it. Each starts with the true friction.
+    """
     batch = ideal(spec)
     friction = float(batch.mu[0, 0])
     reported = {
@@ -76,7 +78,9 @@ BOTH: Final = {"improved": AdaptiveSetting(), "FKF": FKF}
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all drives of paper 001. `seeds` are the seeds of the drives with ordinary sensors."""
+    """Run all drives of paper 001, and return the tables and plots of the reproduction. `seeds` are
+    the seeds of the drives with ordinary sensors.
+    """
     done = Reproduction(
         "001", "Adaptive fuzzy federated cubature filter", adaptive_federated_ckf.ELEMENTS
     )

@@ -151,7 +151,9 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both drives of paper 002. `seeds` are the seeds of the drives with ordinary sensors."""
+    """Run both drives of paper 002, and return the tables and plots of the reproduction. `seeds`
+    are the seeds of the drives with ordinary sensors.
+    """
     done = Reproduction(
         "002", "Weighted cubature filters with tyre-force compensation", compensated_wckf.ELEMENTS
     )

@@ -45,8 +45,8 @@ WHEEL_SPEED_NOISE: Final = 0.003  # [rad/s] standard deviation
 
 @dataclass(frozen=True)
 class FrictionCase:
-    """One experiment of paper 003: the errors that the paper prints for its filters SR-UKF and UKF,
-    and the time until convergence that it prints [s].
+    """One experiment of paper 003: the friction errors that the paper prints for its filters SR-UKF
+    and UKF, and the printed time until convergence [s].
     """
 
     name: str
@@ -118,8 +118,8 @@ def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run all experiments of paper 003. `seeds` are the seeds of the drives with ordinary
-    sensors.
+    """Run all experiments of paper 003, and return the tables and plots of the reproduction.
+    `seeds` are the seeds of the drives with ordinary sensors.
     """
     done = Reproduction(
         "003", "Square-root unscented filter for the friction of four wheels", sr_ukf.ELEMENTS

@@ -65,8 +65,8 @@ class NoisyRun:
 
     def values(self, name: str) -> Values:
         """Return the errors of the states (v_x, v_y, yaw rate, friction) that the filter `name`
-        estimates: MAE and RMSE, averaged over the noise seeds, and the relative errors of the
-        largest absolute values.
+        estimates: MAE and RMSE, averaged over the noise seeds, and the relative error of each
+        state's peak (largest absolute value).
         """
         found: Values = {}
         truth = {key: self.batch.truth[f"true_{key}"] for key in ("vx", "vy", "yaw_rate")} | {
@@ -108,8 +108,8 @@ def run_noise(
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
-    """Run both experiments of paper 004. `seeds` are the seeds of the noise, and of the drives with
-    ordinary sensors.
+    """Run both experiments of paper 004, and return the tables and plots of the reproduction.
+    `seeds` are the seeds of the noise, and of the drives with ordinary sensors.
     """
     done = Reproduction(
         "004", "Fuzzy cubature filter tuned by an ant colony", paper_aco_fckf.ELEMENTS
