@@ -156,8 +156,8 @@ def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 Numba has 
 
 
 def resident() -> None:
-    """Print the resident memory [MB] of a service's process with 10⁶ cells each of which vehicles
-    visited three times in a day.
+    """Print the resident memory [MB] of a service's process with 10⁶ map cells. Vehicles visited
+    each of these cells three times in a day.
     """
     import fleet_service.app.service  # noqa: F401 a service has loaded it
     from fleet_service.serve.map_state import MapState

@@ -107,7 +107,9 @@ def pointer_to(array: FloatArray) -> ctypes.c_void_p:
 
 
 class Limit:
-    """Set of N filters in C, one structure each, on all OpenMP threads."""
+    """Set of N filters in C. Each filter has its own C structure, and all OpenMP threads share the
+    work.
+    """
 
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
@@ -154,8 +156,13 @@ class VectorLimit:
     def __init__(
         self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships
     ) -> None:
-        """Create N filters in C, one per vehicle. The arguments are those of `Limit`, for example
-        the readings (N, 11) of the first sample.
+        """Create N filters in C, one per vehicle.
+
+        Args:
+            parameters: vehicle parameters (N, 12).
+            first: first readings (N, 11), as for `Limit`.
+            speed: initial speed [m/s].
+            memberships: parameters of the fuzzy sets.
         """
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())

@@ -216,7 +216,7 @@ def ack_delays_s(
     session: zenoh.Session, vehicle: str, apart_s: tuple[float, float], count: int
 ) -> list[float]:
     """Return the times [s] from a vehicle's publication to its acknowledgement, for `count` batches
-    sent at random times; the time between two batches is within `apart_s` [s].
+    sent at random times; the time between two batches lies between the two limits `apart_s` [s].
 
     Raises:
         TimeoutError: a batch was not acknowledged.

@@ -118,8 +118,8 @@ class Acks:
 
 
 def drive(endpoint: str) -> None:
-    """Send observations for the given time, wait for the remaining acknowledgements, and print how
-    long each batch waited.
+    """Send observations of all vehicles for a fixed time, and wait for the remaining
+    acknowledgements. Print how long each batch waited.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None

@@ -36,8 +36,8 @@ LIBRARIES: Final = {"zenohpico": ["-DZENOH_LINUX"], "zenohc": ["-DUSE_ZENOH_C"]}
 
 
 def missing_tool(language: str) -> str:
-    """Return the tool that is missing to build and run the client in this language, as a text.
-    Return "" if nothing is missing.
+    """Return the reason why this machine cannot build or run the client in this language, such as a
+    missing tool. Return "" if there is none.
     """
     if language == "c":
         for tool in ("cc", "pkg-config"):

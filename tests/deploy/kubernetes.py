@@ -74,7 +74,7 @@ def find_schema_errors(objects: list[Manifest]) -> list[str]:
 
 
 def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
-    """Return those of the Kubernetes `objects` that have this kind, such as "Service"."""
+    """Return those of the Kubernetes `objects` whose kind is `kind`, such as "Service"."""
     return [one for one in objects if one["kind"] == kind]
 
 
@@ -162,8 +162,8 @@ class Cluster:
             assert fleet_service(["certs", *words]) == 0
 
     def _localize_addresses(self, name: str, text: str) -> str:
-        """Return the text of a pod's configuration file with the addresses of pods replaced by
-        those of this machine.
+        """Return the text of a pod's configuration file, in which each pod's address is replaced by
+        an address of this machine.
         """
         for pod in self.pods:
             for number, port in pod.ports.items():

@@ -162,8 +162,8 @@ def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
-    """The exposure of each unit, scored by systemd from 0 (isolated) to 10 (unprotected), must be
-    at most MOST_EXPOSED.
+    """The exposure of each unit (how much of the system its process can reach), which systemd
+    scores from 0 (isolated) to 10 (unprotected), must be at most MOST_EXPOSED.
     """
     instance = INSTANCES[unit.stem][0]
     file = tmp_path / unit.name.replace("@.", f"@{instance}.")

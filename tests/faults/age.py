@@ -106,8 +106,8 @@ def _measure_smaller(site: Site, millions: float) -> tuple[dict[str, float], dic
 
 
 def _measure_archive(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Measure a service's start from a checkpoint (saved state) of this archive, and a query about
-    the past; return the figures.
+    """Measure how long a service takes to start from a checkpoint (saved state) of the archive
+    `root`, and to answer a query about the past. Return the figures.
     """
     _measure_process("checkpoint", root)
     synthetic.write_archive(

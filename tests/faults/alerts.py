@@ -113,7 +113,7 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
     """Return batches of observations that report ice in `places` cells. Each cell is reported by as
-    many vehicles as an alert needs. Another number `turn` gives other cells.
+    many vehicles as an alert needs. Each value of `turn` stands for another set of cells.
     """
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]

@@ -163,7 +163,7 @@ def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
 
 
 def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
-    """Publish on these keys in `session`; return True if a listener receives any message."""
+    """Publish in `session` on the keys `expressions`; return True if any listener receives it."""
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.await_effects(session)

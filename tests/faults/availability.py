@@ -188,8 +188,8 @@ def _loop_service_past(target: Target) -> Attack:
 
 @contextmanager
 def _loop_service(target: Target, query: str) -> Iterator[None]:
-    """Send a query to the service again and again, in LOOPS threads that share one session, for the
-    duration of the `with` block.
+    """Send the query `query` to the service repeatedly, in LOOPS threads that share one Zenoh
+    session, for the duration of the `with` block.
     """
     session = open_session(ZenohSettings(connect=[target.endpoint]))
     assert session is not None

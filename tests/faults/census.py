@@ -47,9 +47,11 @@ class Census:
 
 
 class Told(NamedTuple):
-    """Content of the load generators' journals. `stored`: number of records, and time [s], of every
-    batch that was stored in an outbox. `settled`: time [s] at which an acknowledgement settled a
-    batch (made it final).
+    """Content of the load generators' journals.
+
+    Attributes:
+        stored: number of records, and time [s], of every batch that was stored in an outbox.
+        settled: time [s] at which an acknowledgement settled a batch (made it final).
     """
 
     stored: dict[Name, tuple[int, float]]

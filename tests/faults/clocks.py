@@ -66,7 +66,7 @@ class Machine:
 
     def has_jumped(self, clock: SteadyClock) -> bool:
         """Return True if the time of a service's clock is more than half a year from the true time.
-        Return True also if this clock reports such a distance of the machine's wall clock.
+        Return True also if this clock reports such an error of the machine's wall clock.
         """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
@@ -112,8 +112,8 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
     seq = 0
 
     def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
-        """Simulate `steps` seconds: let all vehicles report and send their previous batches once
-        more, and then run the service's jobs.
+        """Simulate `steps` seconds. In each second let all vehicles send a new batch and an earlier
+        one again, and then run the service's jobs.
         """
         nonlocal seq
         for _ in range(steps):
@@ -172,7 +172,9 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
 
 
 def _apply_retention(root: Path, engine: Engine, clock: SteadyClock) -> None:
-    """Run the job that removes old rows (retention), as the service does, by the given clock."""
+    """Run the job that removes old rows (retention) as the service does. The time of `clock`
+    decides which rows are old.
+    """
     jobs = archive_jobs(engine, CONFIG, root, clock.moment)
     next(job for job in jobs if job.name == "retention").work(threading.Event())
 

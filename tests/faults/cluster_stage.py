@@ -312,8 +312,8 @@ class Machines:
         )
 
     def fail_over(self, name: str) -> Failover | None:
-        """Let the active service fail, and return the result. Return None if no standby (waiting
-        service) had to take over.
+        """Let the active service fail in the way `name`, and return the result. Return None if no
+        standby (waiting service) had to take over.
         """
         gone = self.serving
         way = WAYS[name]

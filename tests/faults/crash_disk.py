@@ -247,8 +247,9 @@ class CrashDisk:
                 )
 
     def _draw_surviving(self, synced: bytes | None, written: bytes) -> bytes:
-        """Return a random possible content of a file after power loss: the synced bytes, or a
-        prefix of the bytes written since, possibly followed by random bytes.
+        """Return a random possible content of a file after power loss. This is the synced content
+        if nothing was written after it. Otherwise it is a prefix of the written content, and the
+        rest may be random bytes.
         """
         if written == synced:
             return synced

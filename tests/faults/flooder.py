@@ -26,7 +26,9 @@ ROWS = (1, 1, 1, 50)
 
 
 def main() -> None:
-    """Send observations as fast as possible for the given time."""
+    """Send observations as fast as possible, with the settings and for the time that the line on
+    standard input states.
+    """
     told = json.loads(sys.stdin.readline())
     name = told["name"]
     cells = told["cells"]

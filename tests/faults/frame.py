@@ -37,7 +37,8 @@ class Site:
     """Environment of a campaign.
 
     Attributes:
-        folder: the campaign's own empty folder; it is not deleted if a figure misses its target.
+        folder: empty folder of this campaign; the framework does not delete it if a figure misses
+            its target.
         quick: True for a run of seconds instead of minutes.
         seed: seed of all random numbers.
         say: function that prints a line of progress.

@@ -162,8 +162,8 @@ def _make_visit(name: str, seq: int, now: int, second: int) -> Batch:
 
 
 def _make_scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
-    """Return a batch of the insider. It draws fifty random places within `degrees` [deg] of the
-    road, and reports those in the same region as the first.
+    """Draw fifty random places within `degrees` [deg] of the road. Return a batch in which the
+    insider reports those that lie in the same region as the first.
     """
     spread = random_.uniform(-degrees, degrees, (2, 50))
     latitude = np.clip(LATITUDE + spread[0], -80.0, 80.0)

@@ -153,9 +153,9 @@ def old_days(archive: Path) -> list[Path]:
 
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
-    """Return the names of the background jobs whose results exist in the archive, which shows that
-    these jobs ran during the kills. Compaction (sorting) of the old rows does not count, because
-    they were sorted before the first kill.
+    """Return the names of those jobs (checkpoints, compaction) whose results exist in the archive:
+    they ran during the kills. Compacted (sorted) files of the old days do not count, because they
+    existed before.
     """
     old = old_days(archive)
     compacted = (file.parents[1] not in old for file in archive.glob("observations/*/*/*.parquet"))

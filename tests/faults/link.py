@@ -263,8 +263,9 @@ def change_address(
 
 
 def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
-    """Return the p50 and p99 delay of alerts [ms], the numbers of alerts that arrived and were
-    lost, and the share of tiles that arrived, over a lossy link.
+    """Send alerts and map tiles to a car over a lossy link. Return the p50 and p99 delay of the
+    alerts [ms], the numbers of alerts that arrived and that were lost, and the share of tiles that
+    arrived.
     """
     with open_namespaces(site.folder / f"lossy-{protocol}") as there:
         there.start_router()

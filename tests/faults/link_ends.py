@@ -44,8 +44,8 @@ def open_end(given: dict[str, Any]) -> zenoh.Session:
 
 
 def receive(given: dict[str, Any]) -> None:
-    """Receive messages until stdin is closed. Then print number, delay [s] and time of arrival [s]
-    of each message by key.
+    """Receive messages until stdin is closed. Then print, for each Zenoh key, the number, the delay
+    [s] and the arrival time [s] of each message.
     """
     arrived: dict[str, list[tuple[int, float, float]]] = {}
 
@@ -65,8 +65,8 @@ def receive(given: dict[str, Any]) -> None:
 
 
 def send(given: dict[str, Any]) -> None:
-    """Publish messages of several streams until stdin is closed. Then print the number of messages
-    by key.
+    """Publish messages of several streams until stdin is closed. Then print how many messages were
+    sent on each Zenoh key.
 
     Each stream has a key, a message size [bytes] and a rate [1/s]. Its quality of service is that
     of its topic. A stream with rate 0 sends as fast as the session accepts messages.

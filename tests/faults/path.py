@@ -70,8 +70,9 @@ def _offset_position(north_m: Numbers, east_m: Numbers) -> tuple[FloatArray, Flo
 def _make_visits(
     name: str, seq: int, when: IntArray, place: tuple[FloatArray, FloatArray], mu: float
 ) -> list[Batch]:
-    """Return one batch per region of observations at the given times [ns] and places (latitude,
-    longitude).
+    """Return batches, one per map region, in which the vehicle `name` reports the friction `mu` at
+    the places `place` (latitude, longitude). The vehicle leaves these places at the times `when`
+    [ns].
     """
     cell = grid.cell_of(*place)
     regions = grid.region_of(cell)

@@ -172,8 +172,8 @@ class Town:
 
 
 def _suspects(before: pa.Table | None, after: pa.Table) -> Iterator[tuple[float, int]]:
-    """Yield (size of change, cell) for each cell whose published values changed by more than ageing
-    explains; these cells betray a passing vehicle.
+    """Yield (size of the change, cell) for each cell whose published values changed by more than
+    their normal ageing explains. Such a change shows that a vehicle passed.
     """
     known = {}
     if before is not None:

@@ -55,7 +55,9 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """Working folder that all measurements share: it contains a synthetic archive."""
+    """Working folder that all measurements share, with a synthetic archive and the files of the
+    mistakes.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -235,7 +237,9 @@ def wrong_logs_unnoticed(house: House) -> float:
 
 
 def count_tracebacks(house: House) -> float:
-    """Return the number of mistakes at the command line that end in a traceback or in success."""
+    """Return the number of mistakes at the command line that the program answers with a traceback
+    or with success.
+    """
     count, bad = mistakes.find_tracebacks(house.folder, house.archive)
     house.print_measured("mistakes", f"{count} made, bad: {bad}")
     return float(len(bad)) if count >= 60 else float("nan")
@@ -323,7 +327,9 @@ def bugs_of_the_list(house: House) -> float:
 
 
 def install_to_first_map_s(house: House) -> float:
-    """Return the time [s] from an empty environment and a wheel to a map in a browser."""
+    """Return the time [s] from the installation of the wheel in an empty environment until a
+    browser shows a map.
+    """
     wheel = build_wheel(house)
     began = time.monotonic()
     place = house.folder / "venv"
@@ -352,7 +358,7 @@ def figures_stale(house: House) -> float:
 
 
 def alerts_per_stretch(house: House) -> float:
-    """Return the number of alerts per slippery road section in the last demo."""
+    """Return the number of alerts per slippery road section in the last run of the demo."""
     path = ROOT / ".demo" / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else []
     values = {row["name"]: row["value"] for row in rows if "name" in row}

@@ -146,8 +146,8 @@ def prepare_files(folder: Path) -> None:
 
 
 def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
-    """Run the mistaken command lines. Return their number, and a list of those that ended with a
-    traceback or with exit code 0.
+    """Run the command lines that contain a mistake. Return their number, and a list of those that
+    ended with a traceback or with exit code 0.
     """
     bad = []
     lines: list[tuple[Callable[[list[str]], int], str]] = [

@@ -135,7 +135,7 @@ def drive_town(
     seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool
 ) -> None:
     """Simulate one town, and add its approaches to slippery stretches and its warnings to `counts`.
-    With `routed`, the cars know their route.
+    If `routed` is True, the cars know their route.
     """
     fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
     known = map_of_places(places_of(fleet.scenario, AFTER_S), START_NS)
@@ -242,8 +242,8 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
 def _stopping_shortfall(
     metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float
 ) -> float:
-    """Return the stopping distance of the car at the time `at` [s] minus its distance to the
-    slippery stretch [m]. The result is 0 or less if the car can stop in time.
+    """Return the car's stopping distance at the time `at` [s] minus its distance to the slippery
+    stretch, which begins at `start` [m]. The result is 0 or less if the car can stop in time.
     """
     v = float(speed[at])
     on_the_way = (metre >= metre[at]) & (metre <= start)

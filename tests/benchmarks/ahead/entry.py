@@ -64,8 +64,8 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Simulate a drive through one town per seed. Return three figures over all towns: the error of
-    the friction estimate when a vehicle enters a cell, and the delay that a wrong map causes, each
+    """Simulate a drive through one town per seed. Return figures over all towns: the error of the
+    friction estimate when a vehicle enters a cell, and the delay that a wrong map causes, each
     divided by the value without a map; and the largest change of a published likelihood that the
     map causes.
     """

@@ -254,8 +254,9 @@ def _save_course(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Return figures of the time from sending to acknowledgement: of all batches sent in the
-    measured ten minutes, and of those in the slowest regions.
+    """Return figures of the time from sending to acknowledgement of the batches that were sent in
+    the measured ten minutes: over all batches, and the slowest region's divided by the fastest
+    region's.
     """
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)

@@ -62,8 +62,8 @@ class Waits:
 
 
 def main() -> int:
-    """Send reports for the given time, wait for the last acknowledgements, write the waiting times
-    of the batches, and return the exit code.
+    """Send the reports of all vehicles for the time that the command line states, and wait for the
+    last acknowledgements. Write the waiting times of the batches, and return the exit code.
     """
     parser = argparse.ArgumentParser(prog="sender")
     parser.add_argument("endpoint")

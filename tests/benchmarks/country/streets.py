@@ -104,8 +104,8 @@ def _make_drive(rows: pd.DataFrame) -> Drive | None:
 
 
 def make_streets(found: list[Drive], seed: int) -> Streets:
-    """Return a scenario with streets along these drives, on random hills, with some wet, snowy and
-    icy parts.
+    """Return a scenario whose lanes are the paths of the drives `found`, on random hills, with some
+    wet, snowy and icy parts.
     """
     allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
     lanes = network_of(

@@ -108,8 +108,8 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """Return the drive with a recording error as of a wrongly decoded message: in two of seven
-    readings of one wheel speed, an upper bit of the number is set, because it is a status bit.
+    """Return the drive with an error as of a wrongly decoded message: an upper bit of a wheel speed
+    is really a status bit. This bit is set in two of seven readings of one wheel.
     """
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
