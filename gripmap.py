@@ -4,10 +4,10 @@
     log, vehicle = gripmap.simulate_manoeuvre("slalom", mu=0.5)
     bank = gripmap.make_bank("fckf", [vehicle])
 
-The distribution contains four top-level packages with plain names. If another package or folder
-with one of these names, for example your own folder `schemas`, comes first on Python's search path,
-it hides GripMap's package. Importing this module then raises an error that names the package and
-the place of the other one.
+The distribution contains four top-level packages with plain names. Another package or folder with
+one of these names, for example your own folder `schemas`, hides GripMap's package if it comes first
+on Python's search path. Importing this module then raises an error that names the hidden package
+and the path of the package or folder that hides it.
 """
 
 from __future__ import annotations

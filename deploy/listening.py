@@ -3,10 +3,10 @@
     python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario
     hills-SEED]
 
-No network is used. Every second the cars' observations are fused, as in a service. Alerts and, at
-intervals, tiles are passed to the listening cars as bytes. The drive of each random seed is
-simulated twice from the same start: once with all cars receiving the map and alerts, once with
-none. The figures are written to DIR/figures.json.
+No network is used. Every second the cars' observations are fused (combined into a map), as in a
+fleet service. Alerts and, at intervals, tiles are passed to the listening cars as bytes. The drive
+of each random seed is simulated twice from the same start: once with all cars receiving the map and
+alerts, once with none. The figures are written to DIR/figures.json.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ LOST: Final = 0.98  # share of the available grip at which a wheel counts as sli
 
 @dataclass
 class Drive:
-    """Result of one simulated drive of all cars. It is computed from the simulator's true values;
-    "new ice" is the ice that appears during the drive. A lap is one passage of a car over it.
+    """Result of one simulated drive of all cars, computed with the simulator's true values. "New
+    ice" is the ice that appears during the drive. A lap is one passage of a car over the new ice.
     """
 
     # (vehicle, lap) of the laps in which a wheel lost its grip on the new ice.
@@ -76,8 +76,8 @@ class Drive:
 
 
 class ListeningTown:
-    """Simulated town with its cars and the fusion of their reports into a map, advanced second by
-    second during one drive.
+    """Simulated town: its cars, and the fusion of their reports into a map. One object simulates
+    one drive, second by second.
     """
 
     def __init__(
@@ -102,8 +102,9 @@ class ListeningTown:
         self._true: dict[int, float] = {}  # friction of each place when it was last driven over
 
     def run(self, duration_s: float) -> Drive:
-        """Simulate a drive of the town's cars for `duration_s` [s], and evaluate the map at its
-        end. Return how many cars lost grip, and how well the map fits.
+        """Simulate a drive of the town's cars for `duration_s` [s], and evaluate the map at the end
+        of the drive. Return the results, among them the laps in which cars lost grip, and the cells
+        whose map interval contains the true friction.
         """
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
@@ -116,9 +117,9 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Compare the map with the true friction at the end of the drive. Return, for each cell and
-        heading sector that several vehicles visited, True if the friction interval of the map
-        contains the true friction of the last visit.
+        """Compare the map with the true friction at the end of the drive. Return a list with one
+        truth value for each cell and heading sector that several vehicles visited. It is True if
+        the friction interval of the map contains the true friction of the last visit.
         """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -139,8 +140,8 @@ class ListeningTown:
         return seen.columns | {"vehicle": seen.vehicle}
 
     def _truth(self, now: float) -> None:
-        """Record which cars are on the new ice, and which of them slide there, from the true values
-        of the simulator.
+        """Record, from the true values of the simulator at the time `now` [s], which cars are on
+        the new ice and which of them slide there.
         """
         true = self.fleet.truth
         patch = self.ice
@@ -287,9 +288,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """Return the figures of the comparison between two groups of simulated drives: with the same
-    seeds, the cars receive the map and its alerts in the drives `with_`, and receive nothing in the
-    drives `without`.
+    """Return the figures of the comparison between two groups of simulated drives with the same
+    seeds. In the drives `with_`, the cars receive the map and its alerts. In the drives `without`,
+    they receive nothing.
     """
     slid, before = (
         sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without)

@@ -37,8 +37,9 @@ DEFAULT: Final = "aco-fckf"
 
 
 def main(words: list[str]) -> int:
-    """Compile the frequently used functions of service and agent, with one process per core; always
-    return 0.
+    """Compile the frequently used functions of service and agent, or those of the papers' filters
+    if `words` is ["papers"]. Use one process per core. Always return 0, because a function that
+    cannot be compiled now is compiled at its first use.
     """
     began = time.monotonic()
     papers = words == ["papers"]
@@ -68,8 +69,8 @@ def _estimate_command(name: str) -> tuple[str, ...]:
 
 
 def _run_process(folder: str, code: str, *words: str) -> list[str]:
-    """Run Python code in a process; return the lines of its output that contain the word
-    "error".
+    """Run the Python code `code` in a separate process, with the arguments `words`. Return the
+    lines of the process's output that contain the word "error".
     """
     done = subprocess.run(
         [sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True

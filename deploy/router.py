@@ -30,8 +30,8 @@ CONFIG = Path(__file__).with_name("router.json5")
 def load_configuration(
     config: Path = CONFIG, listen: str | Sequence[str] | None = None
 ) -> zenoh.Config:
-    """Return the router's configuration from a file; `listen` replaces the listen endpoints of the
-    file.
+    """Return the router's configuration from a file; if given, `listen` replaces the endpoints in
+    the file on which the router listens.
 
     Raises:
         InputError: the file is not a Zenoh configuration, or the endpoint is not valid.
@@ -54,10 +54,11 @@ def load_configuration(
 def open_router(
     config: Path = CONFIG, listen: str | Sequence[str] | None = None
 ) -> tuple[zenoh.Session, list[str]]:
-    """Start a router in this process; return its session and the endpoints on which it listens.
+    """Start a Zenoh router in this process. Return its Zenoh session, and the endpoints on which it
+    listens.
 
     Raises:
-        InputError: the configuration is wrong, or the endpoint is in use.
+        InputError: the configuration is invalid, or an endpoint is used by another process.
     """
     settings = load_configuration(config, listen)
     try:

@@ -1,4 +1,4 @@
-"""`python -m deploy.whole_way`: old name of `python -m deploy.end_to_end`."""
+"""`python -m deploy.whole_way`: old name of the command `python -m deploy.end_to_end`."""
 
 import sys
 

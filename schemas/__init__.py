@@ -1,3 +1,3 @@
-"""The contract, that is, the common definitions of vehicles, service and clients: messages, tables
-on disk, Zenoh keys and queries.
+"""The contract, that is, the definitions that vehicles, fleet service and clients share: messages,
+tables on disk, Zenoh keys and queries.
 """

@@ -19,8 +19,8 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base of every settings table. Unknown names are refused, so that a misspelt name is reported
-    and not ignored.
+    """Base class of all groups of settings in a configuration file. Unknown names of settings are
+    refused, so that a misspelt name is reported and not ignored.
     """
 
     model_config = ConfigDict(
@@ -29,8 +29,8 @@ class Settings(BaseModel):
 
 
 class ZenohSettings(Settings):
-    """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh
-    configuration file).
+    """Settings of the connection to Zenoh routers. The content of `config` is passed to Zenoh and
+    has the same keys as a Zenoh configuration file.
     """
 
     connect: list[str] = Field(
@@ -109,7 +109,7 @@ class AgentConfig(MonitoringSettings):
 
     def spool_of(self, name: str) -> Path:
         """Return the file path of the outbox (stored unsent reports) of the vehicle or process
-        `name`; `{name}` in the setting is replaced.
+        `name`. The path is the setting `spool`, in which `{name}` is replaced by that name.
         """
         return Path(str(self.spool).replace("{name}", name))
 
@@ -135,8 +135,9 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """Return the options of the setting `store` by name, with which the archive's bucket
-        (object store) is opened. Secrets are in plain text.
+        """Return the options, by name, with which the archive's bucket (object store) is opened.
+        They come from the setting `store`; secrets among them, such as keys, are returned in plain
+        text.
         """
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
@@ -261,8 +262,9 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """Convert the text of an ISO 8601 date, with or without a time of day, to nanoseconds since
-    1970. A time without a zone is UTC.
+    """Convert `text`, an ISO 8601 date with or without a time of day, to nanoseconds since 1970.
+    `field` is the name of the option or parameter, for the error message. A time without a zone is
+    UTC.
 
     Raises:
         InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.
@@ -290,7 +292,8 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def load(path: Path | str | None, model: type[Model]) -> Model:
-    """Read a configuration file (JSON) into `model`; None gives the defaults.
+    """Read a configuration file (JSON), and return its settings as an object of the class `model`.
+    If `path` is None, return the default settings.
 
     Raises:
         InputError: the file cannot be read, or a setting is unknown or out of range.
@@ -308,8 +311,8 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
 
 
 def explain(error: ValidationError, where: str) -> InputError:
-    """Convert the first validation error that pydantic reports to an InputError, which names the
-    wrong field and states how to correct it.
+    """Convert the first validation error that pydantic reports to an InputError. It names the wrong
+    field, and asks the user to correct this field in `where`, the file or source of the values.
     """
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"

@@ -80,8 +80,8 @@ def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
 
 
 def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """Return the cell that contains a position [deg], as int64 of the same shape. Positions must be
-    finite.
+    """Return the grid square at `zoom` (by default a map cell) that contains each position [deg],
+    as int64 of the same shape. Positions must be finite.
     """
     n = 1 << zoom
     phi = np.radians(np.clip(np.asarray(latitude, dtype=np.float64), -MAX_LATITUDE, MAX_LATITUDE))
@@ -91,8 +91,8 @@ def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) ->
 
 
 def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
-    """Return the quadint (number) of the grid square at `zoom` that contains a cell whose own zoom
-    is `of`; arrays of any shape.
+    """Return the quadint (number) of the larger grid square at `zoom` that contains each square in
+    `cell`. The squares in `cell` have the zoom `of`. Arrays may have any shape.
     """
     return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
 
@@ -127,8 +127,8 @@ def _longitude(column: NDArray[Any], zoom: int) -> FloatArray:
 
 
 def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude [deg] of the centre of a cell at `zoom`, in the shape of
-    `cell`.
+    """Return latitude and longitude [deg] of the centres of grid squares. `cell` contains the
+    squares' numbers at `zoom`; the results have its shape.
     """
     x, y = deinterleave(cell)
     return _latitude(y + 0.5, zoom), _longitude(x + 0.5, zoom)
@@ -137,8 +137,8 @@ def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
 def bounds(
     cell: ArrayLike, zoom: int = CELL_ZOOM
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the west, south, east and north edges [deg] of a cell at `zoom`, each in the shape of
-    `cell`.
+    """Return the west, south, east and north edges [deg] of grid squares. `cell` contains the
+    squares' numbers at `zoom`; each result has its shape.
     """
     x, y = deinterleave(cell)
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
@@ -148,8 +148,9 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
     """Return longitudes and latitudes [deg] of the corners of cells (n,), each (n, 4),
     counter-clockwise from the south-west.
 
-    With heading sectors (n,), return triangles (n, 3) instead: the quarter of the cell on the side
-    of the heading, starting at the cell's centre. The triangles of a cell do not overlap.
+    If heading sectors (n,) are given, return triangles (n, 3) instead. Each triangle is the quarter
+    of the cell on the side to which the vehicle heads; its first corner is the cell's centre. The
+    four triangles of a cell do not overlap.
     """
     west, south, east, north = bounds(cell)
     x = np.stack([west, east, east, west], axis=-1)
@@ -168,16 +169,17 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:
-    """Return a mask of areas: True if the area and the box overlap in more than a border. Box and
-    areas are given as west, south, east, north [deg].
+    """Return a mask of the areas in `area`: True if an area and the rectangle `box` overlap in more
+    than a border. Both are given by their west, south, east and north edges [deg].
     """
     west, south, east, north = (np.asarray(side) for side in area)
     return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
 
 
 def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
-    """Return the eight cells around a cell, (…, 8), row by row from the north-west. Columns wrap
-    around the earth; a cell beyond the poles is -1.
+    """Return the numbers of the eight grid squares around each square in `cell` at `zoom`, (…, 8),
+    row by row from the north-west. Columns wrap around the earth; a neighbour beyond the map's
+    northern or southern edge is -1.
     """
     n = 1 << zoom
     x, y = deinterleave(cell)
@@ -211,7 +213,8 @@ def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
 
 def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """Return two arrays in the shape of `yaw`. The first is the heading sector of each yaw [rad].
-    The second is the neighbouring sector if the yaw lies within 15° of the edge to it, else -1.
+    The second is the neighbouring sector if the yaw lies within 15° of the border between the two
+    sectors, else -1.
     """
     angle = np.asarray(yaw, dtype=np.float64)
     first = sector_of(angle)

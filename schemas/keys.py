@@ -35,9 +35,11 @@ class Topic(NamedTuple):
         name: first chunk of the key after the root.
         zoom: zoom of the grid square in the key; None if the key has no grid square.
         named: True if the last chunk is a name (of a vehicle or a service).
-        message: payload; None for a liveliness token (sign that a process is alive).
+        message: name of the message type of the payload; None for a liveliness token (sign that a
+            process is alive), which has no payload.
         priority: name of the Zenoh priority.
-        block: congestion control: block (True) or drop (False).
+        block: congestion control of Zenoh: when the link is overloaded, the sender waits (True) or
+            the message is dropped (False).
         express: True to send at once, False to wait up to a millisecond for other messages in the
             same frame.
     """
@@ -82,8 +84,8 @@ def chunks(quadint: int, zoom: int) -> str:
 
 
 def observation_key(region: int, vehicle: str) -> str:
-    """Return the key under which a vehicle publishes its observations (one report per visited map
-    cell) of a region.
+    """Return the Zenoh key under which a vehicle publishes its observations (one report per visited
+    map cell) in a region.
     """
     return f"{ROOT}/obs/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
 
@@ -165,14 +167,15 @@ class ServiceToken(NamedTuple):
     @property
     def key(self) -> str:
         """Return the key of the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all`
-        in place of `*`, because a concrete key must not contain `*`.
+        in place of `*` in the region, because a concrete key must not contain `*`.
         """
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
         """Return the key of a token (sign that a service is alive) whose first part is `root`
         instead of `gripmap/v1/serves`. The root CLAIMS means that the service serves or will soon
-        serve the region, and WAITS that it is a standby service.
+        serve the region. The root WAITS means that it is a standby service, which waits to take
+        over the region.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
@@ -191,8 +194,8 @@ def parse_served(key: str, root: str = SERVES) -> ServiceToken:
 
 
 class Parsed(NamedTuple):
-    """Parts of a concrete key (without wildcards): topic, quadint (number of a grid square) and
-    name. Quadint or name is None if the topic has none.
+    """Parts of a concrete key (without wildcards): topic, quadint (number of a grid square), and
+    name of a vehicle or service. Quadint or name is None if keys of this topic do not contain it.
     """
 
     topic: Topic
@@ -201,7 +204,8 @@ class Parsed(NamedTuple):
 
 
 def parse(key: str) -> Parsed:
-    """Parse a concrete key (without wildcards) into topic, area and name.
+    """Parse a concrete key (without wildcards) into its topic, the number of its grid square, and
+    the name of its vehicle or service.
 
     Raises:
         InputError: the key has a wildcard, an unknown topic, a wrong number of chunks or digits, or

@@ -37,7 +37,8 @@ class Format(StrEnum):
 
     @property
     def encoding(self) -> str:
-        """Return the name of the Zenoh encoding of a reply in this format."""
+        """Return the name of the Zenoh encoding with which an answer in this data format is sent.
+        """
         return {"arrow": wire.ARROW, "geojson": wire.GEOJSON, "json": wire.JSON}[self.value]
 
 

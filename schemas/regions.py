@@ -1,5 +1,5 @@
-"""Key expressions of regions, the regions along a route, and the areas that no service serves. The
-module is pure (no I/O).
+"""Region expressions (Zenoh key patterns that select regions), the regions along a route, and the
+areas for which no fleet service answers. The module is pure (no I/O).
 
 A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` matches any chunk.
 """
@@ -29,8 +29,8 @@ Box = tuple[float, float, float, float]
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return True if there is a region that both region expressions (key patterns that select
-    regions) match.
+    """Return True if at least one region matches both region expressions (key patterns that select
+    regions).
     """
     return all(
         a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True)
@@ -53,11 +53,12 @@ def region_of(tile: int) -> str:
 
 def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
     """Return region expressions (key patterns that select regions), as few as possible, that cover
-    the part of a query for which no service answers. If the query names no place, it covers the
-    whole earth, so that the result is the area outside every service's regions.
+    the part of the queried area for which no service answers. `asked` is the query, and `served`
+    are the region expressions of all services. A query without route and box asks for the whole
+    earth.
 
     Raises:
-        InputError: the route is too long.
+        InputError: the route in the query is too long.
     """
     if asked.route is not None:
         ahead = grid.region_of(keys_along(asked.route) // grid.SECTORS)
@@ -85,7 +86,7 @@ def _regions_without(
 
 
 class Rank:
-    """Sort order of places (one per cell and heading sector) along a route; places that are not on
+    """Sort order of places (one per cell and heading sector) along a route. Places that are not on
     the route come last.
     """
 
@@ -93,8 +94,9 @@ class Rank:
         self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
 
     def of(self, cell: int, sector: int) -> int:
-        """Return the rank of a place (one cell and heading sector): a number that grows along the
-        route. It only serves to compare positions; it is not a distance.
+        """Return the rank of a place (one cell and heading sector): the index of the place in the
+        sequence of places along the route. It is not a distance. A place off the route gets the
+        number of places on the route.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 

@@ -81,7 +81,9 @@ class S(IntEnum):
 
 
 class Health(IntFlag):
-    """Reasons why an estimate is less reliable, as bit flags; 0 means no such reason."""
+    """Reasons why a friction estimate is less reliable, as bit flags; 0 means that there is no such
+    reason.
+    """
 
     OK = 0
     NO_TORQUE = 1  # wheel torque is missing; the accelerometer alone gives the longitudinal force

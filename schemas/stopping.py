@@ -11,9 +11,9 @@ from schemas.thresholds import GRAVITY, REACTION_S
 
 
 def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
-    """Return the highest speed [m/s] from which a vehicle can stop within a sight distance [m] on a
-    level road. The driver reacts after REACTION_S, and the deceleration is g·mu. The result is 0
-    without grip.
+    """Return the highest speed [m/s] from which a vehicle can stop within the sight distance
+    `sight_m` [m] on a level road with friction `mu`. The driver reacts after REACTION_S seconds,
+    and the deceleration is g·mu. The result is 0 if `mu` is 0.
 
     The speed v solves v·REACTION_S + v²/(2·g·mu) = sight_m.
     """

@@ -17,12 +17,12 @@ class Field(NamedTuple):
     """One column of a table.
 
     Attributes:
-        name, type, unit, meaning: description of the column.
+        name, type, unit, meaning: name of the column, Arrow type, unit, and meaning in words.
         step: the service rounds stored values to multiples of this step; None: no rounding. The
             step is a power of two far below the value's uncertainty. Finer digits are noise and
             would take a quarter more bytes.
         range: smallest and largest value that a report may contain; NaN means 'absent'. None for
-            columns that are not reported.
+            columns that vehicles do not report.
     """
 
     name: str
@@ -56,7 +56,9 @@ _ARROW: Final = {
 
 
 def _make_field(column: message_columns.MessageColumn) -> Field:
-    """Return the table column in which a column of a message is stored."""
+    """Return the table column in which the values of a message's column are stored: the same name,
+    unit and meaning, with an Arrow type.
+    """
     return Field(**column._asdict() | {"type": _ARROW[column.type]})
 
 
@@ -259,8 +261,8 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
 def stored_columns(*fields: Field) -> tuple[Field, ...]:
-    """Return the given columns with the types in which they are stored on disk: times in
-    microseconds instead of nanoseconds.
+    """Return the given columns with the types in which they are stored on disk. Times are stored in
+    microseconds instead of nanoseconds; other types stay the same.
     """
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields

@@ -29,8 +29,8 @@ Learned = tuple[Annotated[float, Field(allow_inf_nan=False)], Spread]
 
 
 class Calibration(BaseModel):
-    """Sensor and wheel errors learned from a car's own drives: value and standard deviation of
-    each; None if not learned.
+    """Sensor and wheel errors learned from a car's own drives. Each error is a pair (value,
+    standard deviation), or None if it was not learned.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -79,7 +79,7 @@ class Calibration(BaseModel):
 
 
 class Vehicle(BaseModel):
-    """Nominal parameters of one vehicle, SI units."""
+    """Nominal parameters of one vehicle, as in its vehicle file, in SI units."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -162,8 +162,8 @@ class Vehicle(BaseModel):
 
     def understeer_per_g(self) -> float | None:
         """Return the understeer gradient [rad per g]: the steering angle beyond L·r/v (wheelbase ×
-        yaw rate / speed) that the axle stiffnesses in the file imply. Return None if the file does
-        not contain them.
+        yaw rate / speed) that the axle stiffnesses in the file imply. Return None if the vehicle
+        file contains no axle stiffness and no steering compliance.
 
         The slip angles of the axles at 1 g differ by 1/k_f - 1/k_r, where k is the cornering
         stiffness of a wheel divided by its static load.
@@ -186,7 +186,7 @@ def load_vehicle(path: Path | str) -> Vehicle:
 
     Raises:
         InputError: the file cannot be read, a field is missing or out of range, or mass and yaw
-            inertia do not fit together; names the field and the fix.
+            inertia do not fit together. The error names the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))

@@ -5,7 +5,8 @@ at static load, relative to the angle of the rim. It includes the compliance of 
 compliance of the suspension bushes, and the effect of roll. Therefore the front axle is softer than
 the rear axle and every car understeers, by 20 to 35 mrad per g. Measured stiffnesses of six cars
 (Volvo S90, VW Golf, Ferrari 250LM and others) are 10 to 17 times the load per radian at the front
-axle and 15 to 25 times at the rear axle. Sizes follow the makers' data sheets of each class.
+axle and 15 to 25 times at the rear axle. Masses and dimensions follow manufacturers' data sheets of
+cars of each class.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ INERTIA_SHARE: Final = 0.97
 
 class Size(NamedTuple):
     """Dimensions of a vehicle class: mass [kg], distances of the axles from the centre of gravity
-    [m], track [m], height of the centre of gravity [m], wheel radius [m] and steering ratio.
+    [m], track [m], height of the centre of gravity [m], wheel radius [m], and steering ratio (angle
+    of the steering wheel over that of the road wheels).
 
     `drive_front` is the share of the driving torque at the front axle; None if the class has front,
     rear and all-wheel drive.
@@ -58,7 +60,7 @@ CLASSES: Final = {
 
 
 def fields_of_class(name: str) -> dict[str, str | float | None]:
-    """Return the fields of the vehicle file for a class of vehicles.
+    """Return the fields of the vehicle file for the vehicle class `name`, such as "compact".
 
     Raises:
         InputError: there is no class of this name.

@@ -29,7 +29,7 @@ PRIOR_SUM_ERROR: Final = 0.01  # tolerance of the sum: float32 values, or a few 
 
 @dataclass(frozen=True)
 class Report:
-    """Weather of a region from `time` [ns] on.
+    """Weather of a region (grid square of zoom 10) from the time `time` [ns UTC] on.
 
     Air and road temperature are in °C and precipitation in mm/h of water, each NaN where unknown.
     `prior` is a friction distribution (32,) of the region's roads, or None.
@@ -66,8 +66,9 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
 
 
 def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
-    """Return the first rule that a weather report violates, as an error; None if the report is
-    valid.
+    """Return an error that names the first validation rule that a weather report violates; None if
+    the report is valid. `values` are the report's numbers by name, and `prior` is its friction
+    distribution (32,) or None.
     """
     for name, (least, most) in RANGES.items():
         if not (np.isnan(values[name]) or least <= values[name] <= most):

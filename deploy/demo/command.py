@@ -1,4 +1,5 @@
-"""`gripmap demo`: from wheel speeds to the map on this machine, in about three minutes.
+"""`gripmap demo`: runs the whole system on this machine, from the wheel speeds of simulated cars to
+the map, in about three minutes.
 
 All files are written to `.demo/` in the current folder.
 """
@@ -53,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo.
+    """Run the demo with the parsed options; return the exit code.
 
     Raises:
         InputError: an optional package is missing, or a process of the demo did not start.

@@ -15,14 +15,14 @@ from schemas.wire import Alert
 
 
 def read_tile(payload: bytes) -> pa.Table:
-    """Return the cells of one tile, decoded from the bytes of its message."""
+    """Decode the bytes of a message with one map tile, and return the tile's cells as a table."""
     return pa.ipc.open_stream(payload).read_all()
 
 
 @dataclass
 class Listener:
-    """Subscriber to map and alerts. It stores the newest version of each tile, and every alert with
-    its time of receipt.
+    """Subscriber to all map tiles and alerts of a fleet service. It stores the newest version of
+    each tile, and every different alert with its time of receipt [ns].
     """
 
     session: zenoh.Session
@@ -46,13 +46,14 @@ class Listener:
                 self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
-        """Close the Zenoh session; an open session would prevent the process from ending."""
+        """Close the listener's Zenoh session; an open session would prevent the process from
+        ending.
+        """
         self.session.close()
 
     def progress(self) -> str:
-        """Return one line of text about the received map: the number of known cells, how many of
-        them are measured, how many cells more than one vehicle visited, and the number of active
-        alerts.
+        """Return one line of text about the received map. It states the number of known cells, of
+        measured cells, of cells that two or more vehicles visited, and of active alerts.
         """
         with self._lock:
             cells = pa.concat_tables(self.tiles.values()) if self.tiles else None

@@ -1,5 +1,5 @@
-"""HTML file that shows the demo's map next to the true road. It opens offline and shows the
-interval of each cell.
+"""HTML file that shows the demo's map next to a map of the true friction. A browser can open it
+offline. It shows the friction interval of each cell.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ NAMES = (
 
 
 def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
-    """Write an HTML file with the two maps and the table of figures. The file loads nothing from
-    the network.
+    """Write an HTML file with two maps (friction according to the fleet's map, and true friction)
+    and a table of the demo's figures. The file loads nothing from the network.
     """
     cells = comparison.cells
     boxes = np.stack(

@@ -1,5 +1,5 @@
-"""Image (PNG) of the demo's map next to the true road. The square of each cell is divided into four
-parts, one per heading sector (quarter of the compass in which a vehicle drives).
+"""Image (PNG) of the demo's map next to a map of the true friction. The square of each cell is
+divided into four parts, one per heading sector (quarter of the compass in which a vehicle drives).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from schemas.runtime.palette import SURFACES, UNKNOWN
 
 
 def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
-    """Draw three panels: the true friction, the median of the map, and the width of the map's
-    interval.
+    """Draw an image with three panels: the true friction, the map's median friction, and the width
+    of the map's friction interval.
 
     The first panel also shows where warned and unwarned drivers lost or kept their grip on the new
     ice.
@@ -52,8 +52,8 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
 
 
 def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
-    """Draw a mark for each pass over the new ice: a circle if the driver was warned, else a square;
-    black if grip was lost, else white.
+    """Draw a mark for each pass of a car over the new ice. The mark is a circle if the driver was
+    warned, else a square. It is black if a wheel lost grip, else white.
     """
     # Shapes of the passes, in the coordinates of the picture.
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]

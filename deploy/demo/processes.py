@@ -40,14 +40,15 @@ class ManagedProcess:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def lines(self) -> list[str]:
-        """Return the lines that this process of the demo has printed so far."""
+        """Return the lines of text that this process of the demo has printed so far."""
         return self.log.read_text().splitlines()
 
     def line_with(self, start: str, patience_s: float = START_S) -> str:
-        """Wait for the first line that begins with `start`, and return it.
+        """Wait for the first line of the process's output that begins with `start`, and return this
+        line.
 
         Raises:
-            DemoError: the process ended, or did not print such a line in time.
+            DemoError: the process ended, or did not print such a line within `patience_s` seconds.
         """
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
@@ -71,7 +72,8 @@ class ManagedProcess:
                 tick()
 
     def stop(self) -> None:
-        """Send SIGTERM to the process; if it does not end in time, kill it."""
+        """Send SIGTERM to this process of the demo; if the process does not end in time, kill it.
+        """
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -81,7 +83,8 @@ class ManagedProcess:
                 self.process.wait()
 
     def report(self) -> dict[str, float]:
-        """Return the counts that the process printed as JSON in its last line.
+        """Return the counts, by name, that this process of the demo printed as JSON in its last
+        line.
 
         Raises:
             DemoError: the last line is not JSON.
@@ -133,7 +136,7 @@ def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 @contextmanager
 def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
     """Run the live page with the streets of the simulated town until the `with` block ends; yield
-    its address. The page can draw the true friction over the map.
+    the page's address. A user of the page can draw the true friction over the map.
     """
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write_files(scenario_named(SCENARIO), folder)
@@ -159,8 +162,8 @@ def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) ->
 def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Start the process of the simulated vehicles and return it. Each vehicle has its own network
-    session and name. The share `warned` of the drivers receives warnings of ice.
+    """Start the process that simulates all vehicles, and return this process. Each vehicle has its
+    own network session and name. The share `warned` of the drivers receives warnings of ice.
     """
     scripts = Path(sys.executable).parent
     options = {

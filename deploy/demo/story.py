@@ -32,8 +32,8 @@ REPORT_S = 5.0
 def drive_fleet(
     folder: Path, endpoint: str, args: argparse.Namespace
 ) -> tuple[Listener, dict[str, float]]:
-    """Let the simulated fleet drive. Return the listener, which holds the received map and alerts,
-    and the counts that the fleet's process printed.
+    """Let the simulated fleet drive. Return two results: the listener, which holds the received map
+    and alerts, and the counts that the fleet's process printed.
     """
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
@@ -51,7 +51,9 @@ def drive_fleet(
 
 
 def show_clients(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
-    """Run one query with a client without GripMap code, and print how to read the Parquet files."""
+    """Run a client that uses no GripMap code and sends one map query; then print how to read the
+    archive's Parquet files.
+    """
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
     bbox = ",".join(
         f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max())
@@ -74,8 +76,8 @@ def report_figures(
     grip: compare.LostGrip,
     seed: int,
 ) -> list[figures.Figure]:
-    """Write and print all figures of the demo, and draw the map with the passes that lost grip;
-    return the figures.
+    """Write and print all figures of the demo, and draw the map with marks where cars lost grip on
+    the new ice; return the figures.
     """
     found = [*measured, *grip.figures()]
     figures.write(folder / "figures.json", "demo", [seed], found)
@@ -96,8 +98,8 @@ def report_figures(
 def run(args: argparse.Namespace) -> int:
     """Run the whole demo; return 1 if a figure misses a target that the demo must meet.
 
-    The delay of the first alert, the number of passes and the duration are only goals: a miss is
-    reported but does not make the demo fail.
+    Missed targets for the delay of the first alert, the number of passes and the duration are
+    reported, but do not make the demo fail.
     """
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)

@@ -50,8 +50,8 @@ _PER_TILE: Final = EXTENT
 
 @dataclass
 class StreetPlan:
-    """Shapes of the simulated town in metres: streets with names, polygons by map layer, and names
-    of places.
+    """Shapes of the simulated town, with coordinates in metres: lines of streets with names,
+    polygons with their map layer, and names of places with their positions.
     """
 
     streets: list[tuple[str, FloatArray, str]] = field(default_factory=list)
@@ -83,8 +83,8 @@ def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
 
 
 def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
-    """Return a smooth closed outline, points (48, 2) [m], around a point; `shape` is x, y and the
-    two radii [m].
+    """Return a smooth, irregular, closed outline, points (48, 2) [m]. `shape` is x and y of its
+    centre and its two radii [m]; `seed` determines its form.
     """
     x, y, a, b = shape
     rng = np.random.default_rng(seed)
@@ -95,8 +95,9 @@ def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatA
 
 
 def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
-    """Yield the outlines of houses, points (n, 2) [m], along the streets, parallel to them. Houses
-    do not touch streets, parks or each other.
+    """Yield the outlines of houses, points (n, 2) [m], along the streets, parallel to them.
+    `centres` are points (n, 2) [m] on the streets' centre lines. Houses do not touch streets, parks
+    or each other.
     """
     rng = np.random.default_rng(5)
     placed: list[tuple[float, float, float]] = []
@@ -131,7 +132,7 @@ def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
 
 def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
     """Return roads, with points (n, 2) [m], that lead from the simulated streets out of the town.
-    They are only drawn; no simulated car uses them.
+    These roads are only drawn; no simulated car uses them.
     """
     out = []
     for name, angle in (("E20", 0.55), ("E20", math.pi + 0.35), ("Skogsvägen", 2.2)):
@@ -145,7 +146,9 @@ def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
 
 
 def write_files(scenario: Scenario, folder: Path) -> tuple[Path, Path]:
-    """Write the base map (MBTiles) and the roads (GeoJSON); return their paths."""
+    """Write the town's base map (MBTiles) and its roads (GeoJSON) as two files into `folder`;
+    return the two paths.
+    """
     found = town_of(scenario)
     tiles = folder / "town.mbtiles"
     roads = folder / "roads.geojson"
@@ -247,7 +250,9 @@ def _touches_tile(points: Sequence[tuple[int, int]]) -> bool:
 
 
 def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
-    """Yield the parts of a line (street of the town) that lie within a tile or its margin."""
+    """Yield those parts of a line (street of the town) that lie within a map tile or the margin
+    around it. Points are in coordinates of the tile.
+    """
     part: list[tuple[int, int]] = []
     for first, second in itertools.pairwise(points):
         if _touches_tile((first, second)):

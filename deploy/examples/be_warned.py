@@ -20,9 +20,9 @@ SPEED = 14.0  # [m/s] speed of the car
 def main(
     endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0
 ) -> str:
-    """Receive the map of the road ahead of a position, and print each warning. Return the first
-    warning, or "" if there was none within `within_s` [s]. `latitude` and `longitude` are in
-    degrees, `yaw` is in radians from east.
+    """Receive the map of the road ahead of a position from the router `endpoint`, and print each
+    warning. Return the text of the first warning, or "" if there was none within `within_s` [s].
+    `latitude` and `longitude` are in degrees, `yaw` is in radians from east.
     """
     warnings: queue.Queue[str] = queue.Queue()
     lookout = edge_agent.Lookout(

@@ -29,7 +29,8 @@ PRIOR_SLIPPERY = 0.3  # P(mu < 0.4) of the same prior
 
 
 class AtLeast:
-    """Estimator for N vehicles; its only state is the largest grip that each vehicle has used.
+    """Estimator of friction for N vehicles. Its only state is the largest grip that each vehicle
+    has used so far.
 
     Args:
         vehicles: nominal parameters of the N vehicles.

@@ -1,4 +1,5 @@
-"""Example: query the map as a table, and decode one tile without GripMap code as any client can.
+"""Example: query the map as a table, and decode one tile without GripMap code, as a client in any
+language can do.
 
 python deploy/examples/query_map.py tcp/127.0.0.1:7447
 """
@@ -13,8 +14,8 @@ import fleet_service
 
 
 def main(endpoint: str) -> int:
-    """Query the map, print its cells, those with the lowest friction first, and return their
-    number.
+    """Query the map through the router `endpoint`, and print its cells, those with the lowest
+    friction first. Return the number of cells.
     """
     cells = fleet_service.ask_map(endpoint, min_vehicles=1).to_pandas()
     # For the other cells only a lower bound is known, and their mu is null.

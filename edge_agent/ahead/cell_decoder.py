@@ -27,12 +27,13 @@ _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
 def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells]:
-    """Return the tile (its number at zoom 14) and the cells in a message about the map.
+    """Return the tile (its grid number at zoom 14) and the cells in a message with a map tile.
 
-    A message is its `key` and its `payload`; `now` is the car's time [ns UTC].
+    `key` and `payload` are the Zenoh key and the bytes of the message; `now` is the car's time [ns
+    UTC].
 
     Raises:
-        WireError: the message is invalid; ignore it completely.
+        WireError: the message is invalid; the caller must ignore the whole message.
     """
     tile = _tile_of_key(key, "map")
     if len(payload) > MOST_TILE_BYTES:
@@ -84,7 +85,8 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
 
 
 def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
-    """Return the alert in a published message.
+    """Return the alert in a message that a fleet service published under the Zenoh key `key`; `now`
+    is the car's time [ns UTC].
 
     Raises:
         WireError: the message is invalid.
@@ -95,8 +97,8 @@ def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
 
 
 def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
-    """Return the tile (its number at zoom 14) and the active alerts in a message about all alerts
-    of a tile.
+    """Return the tile (its grid number at zoom 14) and the active alerts in a message that lists
+    all active alerts of a tile.
 
     Raises:
         WireError: the message is invalid.

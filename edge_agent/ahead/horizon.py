@@ -1,7 +1,7 @@
 """Horizon: the map's values for each metre of the road ahead, and the safe speed there. The module
 is pure (no I/O, no clock).
 
-A metre that the map does not know limits no speed and causes no warning.
+A metre without map data limits no speed and causes no warning.
 """
 
 from __future__ import annotations
@@ -38,20 +38,21 @@ LEAST_VEHICLES: Final = 2
 
 
 class Horizon(NamedTuple):
-    """Knowledge of the map about one path ahead, for each of M metres; NaN where unknown.
+    """Map values along one path ahead of the car, one value per metre, (M,) each; NaN where
+    unknown.
 
     Attributes:
         path: the path, divided into M steps of one metre.
         key: map cell and heading sector of each metre (cell·4 + sector), NONE where nothing is
             known.
-        mu: median; NaN also where only lower bounds are known.
-        mu_lower, mu_upper: 5 % and 95 % quantiles.
-        p_slippery: P(mu < 0.4).
-        age_s: time since the last observation [s].
+        mu: median friction; NaN also where only lower bounds are known.
+        mu_lower, mu_upper: 5 % and 95 % quantiles of the friction.
+        p_slippery: probability that the friction is below 0.4.
+        age_s: time since a vehicle last observed the place [s].
         basis: origin of the values, a constant of `local_map`: UNKNOWN, BOUND (only a lower bound),
             MEASURED or BORROWED (from neighbouring places).
-        slippery: True if the metre justifies a warning.
-        alerted: True if an alert is active there.
+        slippery: True if the metre is slippery with enough certainty for a warning.
+        alerted: True if a fleet service's alert is active at that metre.
         safe_speed: speed from which the car can take the bends and stop in time [m/s]; NaN where
             unknown.
     """
@@ -70,16 +71,16 @@ class Horizon(NamedTuple):
 
 
 def horizon_length(speed: float) -> float:
-    """Return how far to look ahead at `speed` [m/s]: the stopping distance on an unknown road
-    [m].
+    """Return the distance [m] over which the car must look ahead at `speed` [m/s]. It is the
+    stopping distance on a road of unknown friction.
     """
     stop = speed * (REACTION_S + 2.0) + MARGIN_M + speed**2 / (2.0 * UNKNOWN_LOWER * GRAVITY)
     return float(min(max(stop, SHORTEST_M), LONGEST_M))
 
 
 def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
-    """Return the horizon (knowledge of the map about each metre) along a path, at the time `now`
-    [ns UTC].
+    """Return the horizon (map values for each metre) along a path. The values come from the local
+    map `known`, at the time `now` [ns UTC].
     """
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
@@ -121,8 +122,9 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
-    """Return a mask (n,) of the places (one per map cell and heading sector) in `found`: True if a
-    place is slippery with enough certainty for a warning.
+    """Return a mask (n,) of the n places (one per map cell and heading sector) in `found`. It is
+    True if an alert is active, or if enough vehicles measured the place and it is probably
+    slippery.
     """
     firm = (
         (found.basis == MEASURED)
@@ -133,13 +135,14 @@ def justifies_warning(found: PlaceBelief) -> BoolArray:
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the safe speed [m/s] at each metre (M,). At this speed a car can take the bends and
-    stop within SIGHT_M, with friction at the lower end of its interval.
+    """Return the safe speed [m/s] at each metre (M,). At this speed a car can take the bends of the
+    given `curvature` [1/m] and stop within SIGHT_M metres, if the friction is `mu_lower`, the lower
+    end of its interval.
 
-    Before a place with a lower safe speed, the speed falls towards it with a comfortable
-    deceleration, or with a smaller one if cornering leaves less grip for braking. Where nothing is
-    measured (NaN in `mu_lower`) the result is NaN, except before a slower place; there the braking
-    is at most that of an unknown road.
+    Before a place with a lower safe speed, the result falls along the road with a comfortable
+    deceleration, or with a smaller deceleration if cornering leaves less grip for braking. Where
+    `mu_lower` is NaN (not measured), the result is NaN, except on the braking distance before a
+    slower place. There the assumed deceleration is at most that possible on an unknown road.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))
@@ -162,11 +165,12 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Return the braking energy per mass up to each metre (M,) [m^2/s^2]: half the square of the
-    speed that can be removed by braking between the car and that metre.
+    """Return, for each metre ahead, the energy per mass (M,) [m^2/s^2] that braking can remove
+    between the car and that metre. It is half the square of the highest speed from which the car
+    can stop before that metre.
 
-    The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road. It
-    is limited to a comfortable deceleration.
+    The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road.
+    The deceleration is limited to a comfortable one.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

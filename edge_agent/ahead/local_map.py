@@ -2,9 +2,9 @@
 module is pure: no I/O, and time is an argument.
 
 A map tile contains four values per cell: lower end, median and upper end of μ, and P(slippery).
-From them this module reconstructs the belief, a probability distribution of the friction. The
-belief then fades as in the fleet's map: with time, the probability grows that the road has changed,
-and the friction of a changed road is unknown.
+From these four values this module reconstructs the belief, a probability distribution of the
+friction. The belief then fades towards the distribution of an unknown road, as in the fleet's map,
+because the probability that the road has changed grows with time.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class ReceivedCells(NamedTuple):
 
 
 class PlaceBelief(NamedTuple):
-    """Map's values for n places (a place is a map cell with a sector of heading), (n,) each; NaN
-    and UNKNOWN where the map knows nothing.
+    """Map values for n places (one per map cell and heading sector), (n,) each. Where the map has
+    no data, numbers are NaN and `basis` (origin of the values) is UNKNOWN.
     """
 
     key: IntArray
@@ -106,8 +106,8 @@ NOTHING: Final = ReceivedCells(
 
 
 class LocalMap:
-    """Local map of one car: the map tiles received last, with up to MOST_CELLS cells in total, and
-    the active alerts.
+    """Local map of one car: the map tiles that the car received last, with at most MOST_CELLS cells
+    in total, and the active alerts.
     """
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
@@ -128,8 +128,9 @@ class LocalMap:
         return [alert for alert, _ in self._alerts.values()]
 
     def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
-        """Store the received cells of a map tile in the local map. They replace stored cells only
-        if they are newer.
+        """Store the received cells of a map tile in the local map. Of each map cell and heading
+        sector, the values received last are kept. Values received more than HELD_S seconds before
+        `now` [ns UTC] are removed.
         """
         before = self._tiles.pop(tile, NOTHING)
         both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
@@ -141,8 +142,8 @@ class LocalMap:
             self._tiles.popitem(last=False)
 
     def store_alert(self, alert: Alert, now: int) -> bool:
-        """Store a received alert, or remove an alert that ended; return True if this changes the
-        set of active alerts.
+        """Store a received alert that a place became slippery, or remove the stored alert if the
+        received one reports its end. Return True if this changes the set of active alerts.
         """
         key = alert.cell * grid.SECTORS + alert.sector
         before = self._alerts.get(key)
@@ -170,7 +171,9 @@ class LocalMap:
         return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
 
     def drop_old(self, now: int) -> None:
-        """Remove those cells and alerts from the local map that are too old at `now` [ns]."""
+        """Remove from the local map all tiles and alerts that the car received too long before
+        `now` [ns UTC].
+        """
         for tile in [
             tile
             for tile, cells in self._tiles.items()
@@ -185,8 +188,8 @@ class LocalMap:
         """Return the current values of n places, given by their keys (cell·4 + sector), `key` (n,).
 
         Ice and water usually cover the lanes of both directions. Therefore an alert for the
-        opposite direction also counts for this direction, unless a vehicle has measured better
-        friction here afterwards.
+        opposite driving direction in the same cell also counts, unless a vehicle has later measured
+        better friction in the place's own direction.
         """
         belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -261,9 +264,9 @@ class LocalMap:
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
         """Return arrays for n places (one per map cell and heading sector), given by their keys
-        `key` (n,). They are the belief (probabilities of friction, (n, 32)) and, each (n,), the
-        basis (origin of the values), the time of the last observation, the time of receipt and the
-        number of observing vehicles.
+        `key` (n,). The arrays are the belief (probabilities of friction, (n, 32)) and four arrays
+        (n,): basis (origin of the values), time of the last observation [ns], time of receipt [ns],
+        and number of observing vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

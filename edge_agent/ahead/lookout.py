@@ -1,7 +1,8 @@
 """Lookout: a thread that looks up the map's values for the road ahead of each vehicle. It does so
 once a second, and immediately when alerts change.
 
-The estimation loop only passes positions to the thread, by `see`, which never waits.
+The estimation loop passes positions to this thread by the method `see`, which never blocks the
+loop.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class _Watcher:
 @dataclass
 class LookoutCounts:
     """Counters of the lookout (thread that looks up the map ahead): number of look-ups, warnings
-    and failures, and processor time.
+    and failed look-ups, and processor time [s]. `subscribers` are the map receivers of the
+    vehicles, by name.
     """
 
     looks: int = 0
@@ -63,7 +65,9 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum of the counter with the name `what` over all vehicles."""
+        """Return the sum, over all vehicles, of the map receiver's counter with the name `what`,
+        such as "bytes".
+        """
         return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
@@ -88,13 +92,15 @@ class Lookout:
     """Thread that looks up the map ahead of several vehicles, which are identified by name.
 
     Args:
-        names: the vehicles; row k of the poses belongs to vehicle k.
-        hear: called with the vehicle's name and each warning, on the lookout's thread.
-        route_of: returns the route that the user gave for vehicle k, or None to follow the roads
-            visible in the map.
-        listening: returns True for a vehicle that looks ahead; by default all vehicles do.
-        on_horizons: called after each look-up with the vehicle's name, its horizons (map values
-            along each possible path) and its pose.
+        names: names of the vehicles; vehicle k below has the name with index k.
+        hear: function that the lookout's thread calls for each warning, with the vehicle's name and
+            the warning.
+        route_of: function that returns the route that the user gave for vehicle k, or None to
+            follow the roads visible in the map.
+        listening: function that returns True for vehicle k if the lookout must serve this vehicle;
+            by default it serves all vehicles.
+        on_horizons: function that is called after each look-up, with the vehicle's name, its
+            horizons (map values along each possible path) and its pose.
     """
 
     def __init__(
@@ -141,12 +147,14 @@ class Lookout:
         self._poses = poses
 
     def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
-        """Combine the friction beliefs (probabilities) of the vehicles' filters with the map as a
-        prior, and store the quantiles of the result.
+        """Combine the friction beliefs (probabilities) of the vehicles' filters with the map's
+        belief as a prior. Store median and interval of the result as the friction at each vehicle.
 
         Args:
             places: (N,) current place (cell·4 + sector) of each vehicle, -1 where unknown.
-            beliefs: beliefs of the filters, as `EstimatorBank.beliefs` returns them.
+            beliefs: result of `EstimatorBank.beliefs`: the filters' own beliefs, and the
+                likelihoods of the measurements in the current visits (passages of a place). None
+                for an estimator without beliefs.
         """
         if beliefs is None:
             return
@@ -166,8 +174,8 @@ class Lookout:
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
-        """Return the latest result of the lookout for the vehicle `name`: its warnings and the road
-        ahead. Return None before the first result.
+        """Return the latest outlook of the vehicle `name` (its warnings, and the map values of the
+        road ahead). Return None before the first look-up.
         """
         return self._watchers[self._number[name]].outlook
 
@@ -269,7 +277,7 @@ def paths_ahead(
     """Return the possible paths ahead of a vehicle, `length` [m] long: the route given by the user,
     else the roads visible in the map, else one path straight on.
 
-    The caller must hold the subscriber's lock.
+    `subscriber` holds the received map; the caller must hold its lock.
     """
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
@@ -278,8 +286,8 @@ def paths_ahead(
 
 
 def runs_of_places(horizon: Horizon) -> Runs:
-    """Divide a horizon (values of the map for each metre ahead) into runs: consecutive metres that
-    lie in the same place (cell and heading sector). Return the runs.
+    """Divide a horizon (map values for each metre ahead) into runs, and return the runs. A run is a
+    sequence of metres that lie in the same place (map cell and heading sector).
     """
     key = horizon.key
     starts = np.append(

@@ -35,13 +35,15 @@ _TOPIC: Final = keys.TOPICS["ahead"]
 
 
 class MapSubscriber:
-    """Receiver of the map ahead for one vehicle: subscribes to alerts, and queries cells.
+    """Receiver of the map ahead of one vehicle. It subscribes to alerts of slippery places, and
+    queries map cells.
 
     Args:
         vehicle: name of the vehicle.
         session: open session of the vehicle; the caller closes it.
-        urgent: called with the places (cell·4 + sector) whose alerts have changed.
-        clock: returns the time [ns UTC].
+        urgent: function that is called, when alerts change, with the keys (cell·4 + sector) of
+            their places.
+        clock: function that returns the time [ns UTC].
     """
 
     def __init__(
@@ -94,8 +96,8 @@ class MapSubscriber:
         """Subscribe to alerts and send map queries along the possible paths, the most likely path
         first. The call does not wait for an answer.
 
-        The subscriptions cover the first `within` metres of the paths. The queries also cover cells
-        beyond that, see `RequestLog.missing_boxes`.
+        The subscriptions cover the first `within` metres of the paths. When these metres contain an
+        area that was not requested recently, the queries cover the paths to their ends.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

@@ -65,10 +65,10 @@ class Path(NamedTuple):
 
     Attributes:
         kind: "route" (given by the user), "road" (visible in the map) or "corridor" (straight on).
-        distance: (M,) [m].
+        distance: (M,) distance from the car along the path [m].
         places: (M, C) keys of the map places of each metre.
         curvature: (M,) [1/m], positive to the left; NaN where unknown.
-        x, y: (M,) [m] east and north of the car.
+        x, y: (M,) coordinates [m], east and north of the car.
     """
 
     kind: Way
@@ -94,8 +94,9 @@ class Path(NamedTuple):
 def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return east and north coordinates [m] of points relative to the car, in the shape of
-    `latitude`; the error is below a centimetre within a kilometre.
+    """Return east and north coordinates [m], relative to the car, of points given by latitude and
+    longitude [deg]. Both results have the shape of `latitude`. Within a kilometre of the car the
+    error is below a centimetre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (
@@ -114,10 +115,11 @@ def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, Fl
 def path_along(
     kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None
 ) -> Path:
-    """Return the path along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
+    """Return the path of the given kind along a line that begins at the car; it is at most `length`
+    [m] long. The line has n points (n, 2) [m], east and north of the car.
 
     `first` (n,) are the keys of map places (cell·4 + sector) at the line's points, if the caller
-    knows them. They take precedence over the keys computed from the positions.
+    knows them. The path then lists them before the keys computed from the positions.
     """
     run = _distance_along(line)
     count = max(int(min(run[-1], length)), 1)
@@ -148,8 +150,8 @@ class GivenRoute:
     """Route given by the user, and the car's progress on it.
 
     Args:
-        latitude: (n,) latitude of its points [deg], at least two points.
-        longitude: (n,) longitude of its points [deg].
+        latitude: (n,) latitudes of the route's points [deg], at least two points.
+        longitude: (n,) longitudes of the route's points [deg].
     """
 
     def __init__(self, latitude: FloatArray, longitude: FloatArray) -> None:
@@ -158,8 +160,8 @@ class GivenRoute:
         self._metre = 0.0
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
-        """Return the next `length` metres of the route as a path ahead of the car; None if the car
-        has left the route.
+        """Return the next `length` metres of the route as a path ahead of the car. Return None if
+        the car has left the route or reached its end.
         """
         x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
@@ -174,10 +176,11 @@ class GivenRoute:
         return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match_position(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
-        """Return the car's distance along the route [m], at the point that best fits its position
-        and heading. Points shortly after the previously matched point are preferred.
+        """Return the distance [m] from the start of the route to the route point that best fits the
+        car's position and heading. Points shortly after the previously matched point are preferred.
 
-        Return None if no point matches.
+        `line` (n, 2) are the route's points [m] relative to the car, and `run` (n,) their distances
+        along the route [m]. Return None if no point fits.
         """
         step = np.diff(line, axis=0)
         start = line[:-1]

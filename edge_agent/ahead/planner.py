@@ -7,8 +7,8 @@ the sent limit follows only after HOLD_S, so that it does not fluctuate. A road 
 gives no limit.
 
 Autoware subscribes to `/planning/scenario_planning/max_velocity_candidates`
-(tier4_planning_msgs/msg/VelocityLimit). The message is published in the form of rmw_zenoh: CDR,
-with an attachment of sequence number, time and sender identity.
+(tier4_planning_msgs/msg/VelocityLimit). The message is published in the form that ROS's Zenoh layer
+rmw_zenoh expects: CDR bytes, with an attachment of sequence number, time and sender identity.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
     """Return the highest speed [m/s] at which the vehicle may drive now; inf if no safe speed is
     known.
 
-    Each place ahead has a safe speed. From the returned speed, the vehicle can slow down to that
-    safe speed MARGIN_M before the place, if it begins to brake after a delay of LATE_S with the
-    deceleration COMFORT.
+    Each place ahead has a safe speed. A vehicle that drives at the returned speed can reach each
+    place's safe speed MARGIN_M metres before the place. It is assumed to begin braking after LATE_S
+    seconds, with the deceleration COMFORT.
 
     Args:
         distance: (M,) distance of each place from the vehicle [m].
@@ -71,17 +71,17 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
 
 
 def cautious_bound(mu: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the friction that the road exceeds with a probability of 99.5 %; NaN if unknown. It is
-    extrapolated from the median `mu` and the 5 % quantile `mu_lower` of the friction; the arrays
-    may have any shape.
+    """Return a lower bound that the road's friction exceeds with a probability of 99.5 %; NaN where
+    unknown. The bound is extrapolated from the median `mu` and the 5 % quantile `mu_lower` of the
+    friction. The arrays may have any shape.
     """
     below = np.nan_to_num(mu - mu_lower)
     return np.asarray(np.maximum(mu_lower - CAUTION * below, LEAST_GRIP))
 
 
 def limit_of(horizons: list[Horizon]) -> float:
-    """Return the lowest speed limit [m/s] that the friction on any of the possible paths ahead
-    requires; inf if there is no limit.
+    """Return the speed limit [m/s] for the vehicle: the lowest of the limits that the friction on
+    each possible path ahead requires. Return inf if no path requires a limit.
     """
     found = []
     for one in horizons:
@@ -93,8 +93,9 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Speed limit with hysteresis: it decreases immediately, and increases only after the computed
-    limit has been higher for HOLD_S.
+    """Speed limit with hysteresis, which is sent to the motion planner. It decreases as soon as the
+    computed limit falls, and increases only after the computed limit has been higher for HOLD_S
+    seconds.
     """
 
     def __init__(self) -> None:
@@ -102,7 +103,7 @@ class SteadyLimit:
         self._higher_since: int | None = None
 
     def update(self, limit: float, now: int) -> bool:
-        """Process a computed speed limit [m/s] at the time `now` [ns]. Return True if the limit
+        """Process a computed speed limit [m/s] at the time `now` [ns UTC]. Return True if the limit
         that is sent to the planner has changed.
         """
         if limit < self.value:
@@ -124,8 +125,9 @@ class SteadyLimit:
 
 
 def encode_limit(limit: float, now: int) -> bytes:
-    """Encode a speed limit as the message VelocityLimit in CDR, little endian; inf (no limit) is
-    written as the value FREE."""
+    """Encode a speed limit [m/s] at the time `now` [ns UTC] as the message VelocityLimit in CDR,
+    little endian. A limit of inf (no limit) is written as the value FREE.
+    """
     sender = SENDER.encode() + b"\0"
     speed = min(limit, FREE)
     body = struct.pack("<iIfB3x", now // NS, now % NS, speed, 1) + struct.pack(
@@ -150,8 +152,8 @@ class PlannerKey:
         self._identity = secrets.token_bytes(_GID_BYTES)
 
     def attachment(self, now: int) -> bytes:
-        """Return the attachment (sequence number, time, identity of the sender) of the next
-        speed-limit message, sent at the time `now` [ns].
+        """Return, as bytes, the attachment (sequence number, time, identity of the sender) of the
+        next speed-limit message, which is sent at the time `now` [ns UTC].
         """
         self._number += 1
         return struct.pack("<qqB", self._number, now, _GID_BYTES) + self._identity

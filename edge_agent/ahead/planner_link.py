@@ -1,5 +1,5 @@
 """Zenoh session to the motion planner of a vehicle. It publishes the speed limit whenever the limit
-changes, and repeats it every REPEAT_S.
+changes, and repeats it every REPEAT_S seconds.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class PlannerLink:
 
     def receive_horizons(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
         """Compute the speed limit from the horizons (knowledge of the map about each metre ahead).
-        Publish it if it changed or the last message is REPEAT_S old.
+        Publish the limit if it has changed, or if the last message was sent at least REPEAT_S
+        seconds ago.
         """
         changed = self._limit.update(limit_of(horizons), pose.time)
         if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):

@@ -51,7 +51,7 @@ NOWHERE: Final = -1
 
 class MapPrior:
     """Combination of the map's beliefs (probabilities of friction) with the beliefs of the filters
-    of N vehicles.
+    of N vehicles. It keeps the state of each vehicle's current visit (passage of one place).
     """
 
     def __init__(self, vehicles: int) -> None:
@@ -67,9 +67,9 @@ class MapPrior:
         self._found = np.full(vehicles, SHARE)  # β' of the legend, now
 
     def entered_vehicles(self, keys: IntArray) -> list[int]:
-        """Return the indices of the vehicles that entered another place (one map cell and heading
-        sector) since the last step. For these places, the caller must give the map's beliefs
-        (probabilities of friction) to `step`.
+        """Return the indices of the vehicles that have entered another place (one map cell and
+        heading sector) since the last call of `step`. For each of them the caller must pass the
+        map's belief (probabilities of friction) about the new place to the next call of `step`.
         """
         return np.flatnonzero(keys != self._key).tolist()
 
@@ -85,11 +85,12 @@ class MapPrior:
 
         Args:
             keys: (N,) current place (cell·4 + sector) of each vehicle, NOWHERE where unknown.
-            own: (N, 32) log(posterior/uniform) of each filter.
+            own: (N, 32) log(belief/uniform): logarithm of each filter's own belief relative to the
+                uniform distribution.
             visit: (N, 32) log-likelihood of the measurements in the current visit (passage of one
                 place) so far.
-            map_beliefs: by index of the vehicle, for those in `entered_vehicles`: the map's belief
-                about the vehicle's new place; None where the map knows nothing.
+            map_beliefs: for each index that `entered_vehicles` returned, the map's belief about
+                that vehicle's new place; None if the map has no data there.
         """
         now = _normalise_rows(np.exp(own))
         out = now.copy()

@@ -2,9 +2,9 @@
 needs megabytes and not gigabytes. The module is pure (no I/O).
 
 Each second, the fleet service publishes every changed map tile completely: about 50 kB in a busy
-town. A car needs only the part along its path, and not every second, but it needs news of ice
-immediately. Therefore it requests narrow boxes along its path, and subscribes to the alerts of the
-tiles there.
+town. A car needs only the part of a tile along its path, and not every second. It needs news of ice
+immediately. Therefore the car requests narrow boxes along its path, and subscribes to the alerts of
+the tiles on it.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ class RequestLog:
         """Return the boxes (rectangles of the map) to request now along a path, and record them as
         requested.
 
-        The result is empty while recently requested boxes cover the first `within` metres of the
-        path. Otherwise the boxes cover all parts of the path that no recently requested box covers.
+        The result is empty while boxes requested in the last REFRESH_S seconds cover the first
+        `within` metres of the path. Otherwise the boxes cover all parts of the path that no
+        recently requested box covers.
         """
         latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
@@ -84,8 +85,8 @@ class RequestLog:
 
 
 class Tiles:
-    """Set of map tiles to whose alerts the vehicle subscribes: the tiles ahead, and for LEAVE_S
-    those that were ahead before.
+    """Set of map tiles to whose alerts the vehicle subscribes: the tiles on the paths ahead, and
+    those that lay ahead less than LEAVE_S seconds ago.
     """
 
     def __init__(self) -> None:
@@ -139,8 +140,9 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Return parts of a path ahead as pairs (first metre, last metre). Together they contain every
-    metre of the mask `wanted`, and each has a small bounding box.
+    """Split a path ahead into parts, so that a narrow box can be requested around each part. Return
+    a pair (first metre, last metre) per part. Together the parts contain all points where the mask
+    `wanted` is True.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

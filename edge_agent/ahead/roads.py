@@ -40,7 +40,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     """Return the possible paths ahead along the places in the map (one per cell and heading
     sector), given by their keys `keys` (n,). Each path is at most `length` [m] long.
 
-    The list is empty if the map shows no road at the car.
+    The list is empty if the map contains no place close ahead of the car.
     """
     latitude, longitude = grid.centre(keys // grid.SECTORS)
     x, y = to_plane(latitude, longitude, pose)
@@ -83,8 +83,9 @@ class _Neighbours:
         self.side = side
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Return the keys (cell·4 + sector) of places that may follow the present place on a road,
-        the most likely first, at most one per road.
+        """Return the keys (cell·4 + sector) of the places that may follow the position `here` [m]
+        on a road, for a vehicle with the `heading` [rad]. They lie at most `cells` cell widths
+        away. The most likely place is first; each road that forks off gives at most one place.
         """
         reach = cells * self.side
         found = []
@@ -136,8 +137,9 @@ def _follow_way(
 
 
 def _heading_of_way(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Return the mean heading [rad] of the road's last three steps. A single step is not used,
-    because the cell centres along an oblique road zigzag.
+    """Return the mean heading [rad] over the last three steps from place to place on a road. The
+    mean is used because the cell centres along an oblique road zigzag, so that a single step has a
+    wrong heading.
     """
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx = last[-1][0] - last[0][0]

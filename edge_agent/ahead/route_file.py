@@ -46,7 +46,7 @@ def read_route(path: Path) -> GivenRoute:
 
 
 def route_of(points: list[tuple[float, float]]) -> GivenRoute:
-    """Return the route through points (latitude, longitude) [deg].
+    """Return the route through a list of points, each (latitude, longitude) [deg].
 
     Raises:
         InputError: there are too few or too many points, or a point is out of range.

@@ -39,8 +39,9 @@ SLOWEST: Final = 0.5  # [m/s] at lower speeds a warning contains no time to the 
 
 @dataclass(frozen=True)
 class Active:
-    """A current warning about a slippery stretch: the reported hazard, its places (cell·4 +
-    sector), and the time and distance at which it was last confirmed.
+    """Current warning about a slippery stretch: the warning as last reported to the driver, the
+    keys (cell·4 + sector) of the stretch's places, and the time [ns UTC] and distance [m] at which
+    the stretch was last seen ahead.
     """
 
     warning: GripWarning
@@ -64,12 +65,13 @@ def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
     """Update the active warnings from new horizons (values of the map for each metre ahead). Return
-    the active warnings after the update, and the warnings to report now.
+    the active warnings after the update, and the messages to report now about warnings that were
+    raised, updated or ended.
 
     Args:
         active: active warnings before the update.
         horizons: horizons of all possible paths, the most likely first.
-        pose: pose of the car.
+        pose: position, heading, speed and time of the car.
         known: the local copy of the map in the car.
     """
     issued: list[GripWarning] = []
@@ -112,8 +114,9 @@ def update_warnings(
 
 
 def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
-    """Return the slippery stretches of a horizon (knowledge of the map about each metre ahead);
-    stretches at most LINK_M apart are joined."""
+    """Return the slippery stretches of a horizon (map values for each metre ahead). Stretches at
+    most LINK_M metres apart are joined.
+    """
     brakes = np.concatenate([[0.0], braking_from(horizon)])
     # Metre at which the car begins to brake at the latest.
     begins = math.ceil(speed * (REACTION_S + UPDATE_S) + MARGIN_M)

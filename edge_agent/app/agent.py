@@ -52,11 +52,11 @@ class AgentOptions:
     """Settings of an agent.
 
     Attributes:
-        vehicles: vehicle files.
-        names: names under which the vehicles publish.
+        vehicles: parsed vehicle files (nominal parameters), one per vehicle.
+        names: names under which the vehicles publish, in the same order.
         config: configuration of the agent.
         estimator: name of the estimator; None for the one named in the configuration.
-        memberships: fuzzy sets that replace the estimator's own.
+        memberships: fuzzy sets that replace the estimator's own; None to keep those.
         duration_s: time after which the agent stops [s].
     """
 
@@ -73,9 +73,11 @@ class AgentSource(NamedTuple):
 
     Attributes:
         blocks: blocks (consecutive samples of all vehicles), in real time or faster.
-        is_admitted: returns True if the records of the current block may be published.
-        health_problems: returns one message per problem of the source.
-        end: function that is called when the loop has ended.
+        is_admitted: function that returns True if the records of the current block may be
+            published.
+        health_problems: function that returns one message per problem of the source, for the health
+            check.
+        end: function that the agent calls when its loop over the blocks has ended.
     """
 
     blocks: Iterator[Block]
@@ -96,13 +98,13 @@ class AgentPart(Protocol):
         """
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Update this component of the agent from the pipeline after a block of samples. `admitted`
-        is True if the records of the block are published.
+        """Update this component after the pipeline (estimation and making of records) has processed
+        a block of samples. `admitted` is True if the records of the block are published.
         """
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop this component of the agent; return its counts for the agent's last line of
-        output.
+        """Stop this component of the agent; return its counters by name, which the agent prints in
+        its last line of output.
         """
 
 
@@ -125,7 +127,8 @@ class Agent:
         """Process blocks of samples in real time until the source ends, the duration has passed or
         a signal (SIGTERM, Ctrl-C) arrives; then shut down.
 
-        Print a line of counts and return 0.
+        Before returning 0, print one line with the numbers of processed blocks and published
+        records.
         """
         config = self.options.config
         log_as(config.log, sys.stderr)
@@ -229,8 +232,8 @@ class Agent:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Provide a context with an event that SIGTERM or Ctrl-C sets; a second signal ends the process
-    at once.
+    """Provide a context in which SIGTERM or Ctrl-C sets the yielded event; a second signal ends the
+    process at once.
     """
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}

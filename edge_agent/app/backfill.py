@@ -1,7 +1,8 @@
 """Estimation of many recorded drives in parallel, in processes of this machine or on Spark.
 
-On one machine this process loads the compiled code, and the processes forked from it share its
-memory. Both engines run the same function for each drive and write the same bytes.
+On one machine the main process loads the compiled code, and the worker processes forked from it
+share this memory. Whether run by local processes or by Spark, each drive is estimated by the same
+function, so the written files are equal byte by byte.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ class Outcome(NamedTuple):
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
-    """Return one task per log. The file of its estimates lies in `folder` and has the log's name.
-    The vehicle file lies next to the log unless `vehicle` is given.
+    """Return one task per signal log. Each task writes its estimates to a file in `folder` with the
+    log's name. It reads the vehicle file `vehicle`, or, if that is None, the vehicle file next to
+    the log.
 
     Raises:
         InputError: two logs have the same name, or estimates would replace a log.
@@ -89,12 +91,13 @@ def vehicle_file_of(log: Path) -> Path:
 def estimate_drives(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all drives, `jobs` at a time, and yield the outcomes as they become available.
+    """Estimate all recorded drives in `jobs` parallel processes. Yield the outcome of each drive
+    (number of samples, or error) as soon as it is available.
 
     A drive that fails does not stop the others. After Ctrl-C no further drive begins.
 
     Raises:
-        InputError: jobs is below 1, or the system ended one of the processes.
+        InputError: `jobs` is below 1, or the operating system ended one of the processes.
     """
     if jobs < 1:
         raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
@@ -118,10 +121,10 @@ def estimate_drives(
 
 
 def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
-    """Let an estimator process one sample without readings. This compiles or loads its kernels
-    (compiled functions), so that processes forked afterwards share them. For an estimator of
-    another installed package do nothing: each process loads it itself. An error is ignored here,
-    because the estimation of each drive reports it.
+    """Let an estimator process one sample that has no readings. This compiles or loads the
+    estimator's kernels (compiled functions), so that processes forked afterwards share them. Do
+    nothing for an estimator of another installed package, because each process loads such an
+    estimator itself. Ignore errors here: the later estimation of each drive reports them.
     """
     if estimator not in ESTIMATORS:
         return
@@ -131,9 +134,9 @@ def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
 
 
 def _fork_processes(count: int) -> ProcessPoolExecutor:
-    """Return a pool for `count` worker processes; none is started yet. Only on Linux are they
-    forked from this process, because system libraries of other operating systems do not support a
-    fork.
+    """Return a pool for `count` worker processes; no worker is started yet. On Linux, workers are
+    forked from this process. Elsewhere they start as new processes, because system libraries of
+    other operating systems do not support a fork.
     """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -148,8 +151,9 @@ def _submit_drives(
     estimator: str,
     memberships: Memberships | None,
 ) -> list[Future[Outcome]]:
-    """Submit all drives to a pool of processes, which starts the processes. SIGINT (Ctrl-C) is
-    blocked until each process has installed its own handler.
+    """Submit all drives to a pool of processes, and return one future (later result) per drive.
+    Submitting starts the processes. SIGINT (Ctrl-C) is blocked until each process has installed its
+    own handler.
 
     Python warns if a process with several threads is forked, because a lock that another thread
     holds stays locked in the new process. This warning is suppressed: the libraries whose threads
@@ -197,8 +201,8 @@ def _interrupt_drive(*_: object) -> None:
 
 
 def _estimate_in_process(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive in a worker process and return its outcome. After Ctrl-C no further drive
-    is estimated.
+    """Estimate one drive in a worker process and return its outcome. A worker that was interrupted
+    by Ctrl-C estimates no further drive.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; no file of estimates is written for this drive.
@@ -215,8 +219,8 @@ def _estimate_in_process(task: Task, estimator: str, memberships: Memberships | 
 def backfill_on_spark(
     tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all drives on the machines of Spark, which must all see the same files. Yield the
-    outcomes in the order of the tasks.
+    """Estimate all drives on the machines of a Spark cluster, which must all have access to the
+    same files. Yield the outcomes in the order of the tasks.
 
     Raises:
         InputError: Spark is not available or failed, or the folder of the estimates cannot be
@@ -233,8 +237,9 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write the estimates' file atomically, even if another process
-    estimates the same drive.
+    """Estimate one drive and write its estimates to a temporary file, which then gets its final
+    name. The final file is therefore complete even if another process estimates the same drive at
+    the same time. Return the outcome.
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:

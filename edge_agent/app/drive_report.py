@@ -46,10 +46,10 @@ class Panel:
 
     Attributes:
         name, unit: name of the quantity, and unit in which it is plotted.
-        column: column of the estimates that contains the quantity.
+        column: name of the column in the table of estimates that contains the quantity.
         scale: factor from the column's unit to the displayed unit.
-        band: columns with lower and upper end of the interval, or the column with the standard
-            deviation.
+        band: names of two columns (lower and upper end of the interval), or of one column (standard
+            deviation); empty for a quantity without interval.
         fixed: smallest and largest value on the axis; None to fit the axis to the values.
     """
 
@@ -72,8 +72,8 @@ PANELS: Final = (
 
 @dataclass(frozen=True)
 class RecordedDrive:
-    """Recorded drive with the estimates of several estimators; `title` is the headline of the
-    report.
+    """Recorded drive: its signal log, the table of estimates of each estimator by name, and the
+    headline `title` of the report.
     """
 
     log: SignalLog
@@ -101,8 +101,9 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return, for a plot of one estimated quantity, times, values, and lower and upper end of its
-    interval, (n,) each. The ends are NaN for a quantity without interval.
+    """Return the curve of one estimated quantity as four arrays (n,): times [s], values, and lower
+    and upper ends of the 90 % interval. Values and ends are in the plot's unit. The ends are NaN
+    for a quantity without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
@@ -118,8 +119,9 @@ def curve_of(
 
 
 def thin_parts(count: int) -> list[slice]:
-    """Divide the `count` samples of a curve into at most MOST_POINTS slices; return the slices.
-    Each slice becomes one point of the plot.
+    """Divide the `count` samples of a curve into consecutive slices, at most MOST_POINTS, and
+    return the slices. The plot shows one point per slice, so a long drive does not make a large
+    file.
     """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]
@@ -171,7 +173,9 @@ def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
 
 
 def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
-    """Return, by health flag, the time spans in which the first estimator reported the flag."""
+    """Return a dictionary per health flag that the first estimator reported: the flag's name, and
+    the time spans [s] in which the flag was set.
+    """
     table = next(iter(drive.estimates.values()))
     t = table["t"].to_numpy()
     flags = table["health"].to_numpy()
@@ -186,8 +190,9 @@ def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
 
 
 def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
-    """Return the track of a recorded drive: x and y [m from the mean position], time, and a colour
-    for the mu of the first estimator.
+    """Return the track of a recorded drive: x and y [m from the mean position], time [s], and a
+    colour that shows the friction estimated by the first estimator. The colour is None where the
+    estimate is too uncertain.
 
     Return None if the log has fewer than two positions.
     """

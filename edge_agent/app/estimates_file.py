@@ -58,8 +58,8 @@ def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 an Arr
 
 
 class EstimatesFile:
-    """Writer of a file of estimates, one block of samples after the other. The file gets its final
-    name only when it is complete.
+    """Writer of a file of estimates, which adds one block of samples after the other. The file gets
+    its final name only when it is complete.
 
     Raises:
         InputError: the path cannot be written, or its suffix is not one of ENDINGS.
@@ -91,8 +91,8 @@ class EstimatesFile:
 
 
 def estimates_table(t: FloatArray, estimates: Estimates) -> pa.Table:
-    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA. The columns per wheel are null if the
-    estimator has one friction for all wheels.
+    """Return estimates (T, 1) as a table of ESTIMATES_SCHEMA. The columns with one value per wheel
+    are null if the estimator uses a single friction value for all wheels.
     """
     wheels = estimates.mu_wheel
     columns: list[Any] = []

@@ -1,6 +1,6 @@
-"""Creation of estimator banks (estimators of N vehicles, advanced together) by name. Their
-memberships (fuzzy sets) are those in this package, or those that the caller gives. Estimators of
-other installed packages are included.
+"""Creation of estimator banks (estimators of N vehicles, advanced together) by name. The
+memberships (fuzzy sets) of these estimators are those stored in this package, or those that the
+caller gives. Estimators that other installed packages provide can be created in the same way.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from schemas.vehicle import Vehicle
 
 
 def known_estimators() -> dict[str, str]:
-    """Return all estimators by name, with a one-line description. Estimators of other installed
-    packages are included.
+    """Return a dictionary from the name of each estimator to a one-line description. Estimators of
+    other installed packages are included.
     """
     others = {
         name: f"from {point.value}"

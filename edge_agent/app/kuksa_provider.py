@@ -2,8 +2,8 @@
 
 The signals `Vehicle.ADAS.ESC.RoadFriction.*` are floats in percent. The signal
 `Vehicle.Exterior.RoadSurfaceCondition` (VSS pull request 892) is a word such as "ICE". If a value
-is unknown, a data point without a value is written. Otherwise the broker would continue to show the
-outdated value.
+is unknown, a data point without a value is written. Without this data point the broker would
+continue to show the outdated value.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 
 def surface_condition(signals: Mapping[str, float]) -> str:
-    """Return the value of RoadSurfaceCondition that follows from the friction: "ICE", "DRY" or
-    "UNKNOWN".
+    """Return the word for the signal RoadSurfaceCondition. It is "ICE" if the upper friction bound
+    in `signals` is low, "DRY" if the lower bound is high, and "UNKNOWN" otherwise.
     """
     if signals.get(f"{BRANCH}.UpperBound", 100.0) < ICE_BELOW:
         return "ICE"
@@ -41,8 +41,8 @@ def surface_condition(signals: Mapping[str, float]) -> str:
 
 
 class KuksaProvider:
-    """Writer of one vehicle's signals, on a separate thread, so that an unavailable broker does not
-    delay the agent.
+    """Writer of one vehicle's VSS friction signals to a Kuksa databroker. It writes on a separate
+    thread, so that an unavailable broker does not delay the agent.
 
     Attributes:
         written: number of values that the broker accepted.
@@ -74,7 +74,9 @@ class KuksaProvider:
         self._thread.start()
 
     def write(self, signals: Mapping[str, float], time_ns: int) -> None:
-        """Queue VSS signals [%] for writing. Values that are still waiting are replaced."""
+        """Queue VSS signals (values [%] by signal path) that are valid at `time_ns` [ns UTC]. They
+        replace earlier values that have not been written yet.
+        """
         with self._changed:
             self._latest = (signals, time_ns)
             self._changed.notify()
@@ -117,8 +119,8 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write one value to the databroker at VSS path `path`; return False if the broker is
-        unavailable.
+        """Write one value to the databroker at the VSS path `path`. Return False if the broker is
+        unavailable, and True even if the broker rejects the value.
         """
         messages = self._connection.messages
         point = messages.Datapoint(value=value)

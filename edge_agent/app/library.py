@@ -96,7 +96,8 @@ def estimate(
 
 
 def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
-    """Return the estimates (T, N) of one vehicle as a table; t has shape (T, N) or (T,) [s].
+    """Return the estimates of one of N vehicles as a table with T rows. `vehicle` is the vehicle's
+    index, and the times `t` [s] have shape (T, N) or (T,).
 
     Raises:
         InputError: there is no vehicle with this index.
@@ -114,7 +115,7 @@ def plot(
     estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = ""
 ) -> Figure:
     """Plot speed and friction with its 90 % interval over time, for several estimators by name.
-    `truth` is a simulated log; its true friction and speed are also plotted.
+    `truth` is the table of a simulated log; if given, its true friction and speed are plotted too.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -158,7 +159,9 @@ def plot(
 
 
 def known_estimators() -> Iterator[tuple[str, str]]:
-    """Yield (name, one-line description) of all estimators, including those of other packages."""
+    """Yield (name, one-line description) of all estimators, including estimators of other installed
+    packages.
+    """
     from edge_agent.app.estimator_factory import known_estimators
 
     yield from known_estimators().items()

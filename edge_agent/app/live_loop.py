@@ -1,5 +1,5 @@
-"""Live loop: passes blocks (consecutive samples) in real time through the pipeline, which estimates
-and makes records, to the publisher, until the loop is stopped.
+"""Live loop: in real time, passes blocks (consecutive samples) to the pipeline, which estimates
+friction and makes records. The loop gives these records to the publisher until it is stopped.
 
 The loop waits so that no block is processed before its time. A block counts as late if its
 processing ends more than the block's own duration behind real time. No block is skipped: a loop
@@ -52,12 +52,12 @@ class LoopOptions(NamedTuple):
     """Options of the live loop (estimation in real time).
 
     Attributes:
-        on_status: receives the progress every STATUS_EVERY_S.
+        on_status: function that receives the progress every STATUS_EVERY_S seconds.
         duration_s: time after which the loop ends [s].
-        clock: monotonic clock [s].
-        is_admitted: returns True if the records of a block may be published; other records are
-            held back and counted.
-        after: function that is called after each block of samples.
+        clock: function that returns the time of a monotonic clock [s].
+        is_admitted: function that returns True if the records of a block may be published; records
+            that may not be published are only counted.
+        after: function that the loop calls after each block of samples.
     """
 
     on_status: Callable[[Progress], None] = lambda _: None
@@ -78,7 +78,7 @@ def run_live_loop(
     """Process blocks of samples until the source ends, the duration has passed or `stop` is set;
     then close the open visits (passages of a map cell).
 
-    `progress` is updated during the run, and returned.
+    The counters in `progress` are updated during the run, and returned at the end.
     """
     progress = progress or Progress()
     status_at = STATUS_EVERY_S
@@ -137,9 +137,9 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the numbers that the agent prints at its end, by name. They are the counts of records
-    by result, of observations (a subset of the records) by result, and of blocks of samples, and
-    the largest delay of the loop.
+    """Return the numbers that the agent prints at its end, by name. They are the counts of all
+    records by result, the counts of observations (one kind of record) by result, the counts of
+    blocks of samples, and the largest delay of the loop [s].
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

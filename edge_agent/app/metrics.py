@@ -19,7 +19,9 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
 def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
-    """Return all metrics of an agent with their current values; records are counted by kind."""
+    """Return all metrics of an agent with their current values. Metrics of records have one value
+    per kind of record.
+    """
     counts = publisher.counts
     status = publisher.status
     return [

@@ -51,8 +51,8 @@ def use_agent_library() -> bool:
 
 
 def _load_library(path: Path) -> bool:
-    """Use the kernels of a library; return False, and report the reason, if the system refuses to
-    load it.
+    """Take the kernels (compiled functions) of this process from the library at `path`, and return
+    True. If the operating system refuses to load the library, report the reason and return False.
     """
     try:
         use_native_kernels(Library(path))
@@ -63,11 +63,12 @@ def _load_library(path: Path) -> bool:
 
 
 def build_agent_library(path: Path) -> None:
-    """Build the agent's shared library `path`. It contains the kernels (compiled functions) that a
-    pipeline with one vehicle calls in one step, and when its friction beliefs are read.
+    """Build the agent's shared library `path`. The library contains the kernels (compiled
+    functions) that a pipeline with one vehicle calls in two situations: when it processes a sample,
+    and when its friction beliefs (probabilities) are read.
 
     Raises:
-        OSError, subprocess.CalledProcessError: there is no linker, or it fails.
+        OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
     """
     from schemas.runtime.native_build import CallRecorder, build_library
 

@@ -1,5 +1,5 @@
-"""Plausibility check of the estimates of a recorded drive. It yields a summary line, and the exit
-code IMPLAUSIBLE for implausible estimates.
+"""Plausibility check of the estimates of a recorded drive. A command prints the resulting summary
+line, and exits with the code IMPLAUSIBLE if the estimates are implausible.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ MOST_RESETS_PER_S: Final = 0.2  # [1/s] maximum rate of filter resets
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
-    """Return the grip in use according to the accelerometers (T,) [1], smoothed over SMOOTHED_S; 0
-    where a reading is missing.
+    """Return the grip in use, (T,) [1]: the horizontal acceleration divided by g, smoothed over
+    SMOOTHED_S seconds. A missing reading counts as 0.
 
-    The estimate `mu_utilised` is not suitable here. It is the maximum of the last second, so that
-    just after the road has become slippery it may still exceed the available grip.
+    The plausibility check does not use the estimate `mu_utilised`, which is the largest grip used
+    in the last second. Just after the road has become slippery, that maximum may exceed the
+    available grip.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -43,8 +44,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Sums over the samples of one recorded drive, from which the plausibility of its estimates is
-    judged.
+    """Counts and errors summed over the samples of one recorded drive, from which this class judges
+    the plausibility of the drive's estimates.
     """
 
     radius: float
@@ -86,14 +87,16 @@ class Plausibility:
 
     @property
     def median_speed_error(self) -> float:
-        """Return the median relative error [1] of the estimated v_x against the speed of the
-        wheels; 0 for a car that did not move.
+        """Return the median relative difference [1] between the estimated forward speed v_x and the
+        speed of the wheels; 0 if the car never moved fast enough for a comparison.
         """
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0
 
     def problems(self) -> list[str]:
-        """Return one message per property that makes the estimates implausible."""
+        """Return one message per reason for which the estimates are implausible; an empty list
+        means plausible.
+        """
         n = max(self.samples, 1)
         found = {
             "speed differs much from that of the wheels": self.median_speed_error > FURTHEST_SPEED,

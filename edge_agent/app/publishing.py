@@ -1,5 +1,5 @@
-"""Functions with which commands open a publisher according to the configuration, and close it. When
-it is closed, the final counts of records are printed.
+"""Functions with which commands open a publisher according to the configuration, and close it. The
+closing function prints the final counts of records.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ def open_publisher(
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
     """Return a started publisher with the configured outbox (file of unsent records).
-    `on_open(name, session)` is called with each vehicle's session.
+    `on_open(name, session)` is called with each vehicle's name and its opened Zenoh session.
 
     Raises:
-        InputError: Zenoh rejects its settings, or the outbox is in use or unusable.
+        InputError: Zenoh rejects its settings, or the outbox is used by another process or cannot
+            be written.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.publish.outbox import Outbox
@@ -60,8 +61,9 @@ def open_publisher(
 def close_publisher(
     publisher: Publisher, progress: Progress, drain_s: float, **more: float
 ) -> None:
-    """Wait at most `drain_s` seconds for acknowledgements and close the publisher. Print the counts
-    of records and the values `more` as one line of JSON on stdout.
+    """Wait at most `drain_s` seconds until the service has acknowledged the sent records, and close
+    the publisher. Print the counts of records and the additional values `more` as one line of JSON
+    on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
     next start.

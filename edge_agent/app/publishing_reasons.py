@@ -53,7 +53,7 @@ class SignalWatch:
     wheel speed, and a wheel speed above standstill.
 
     Args:
-        clock: monotonic clock [s].
+        clock: function that returns the time of a monotonic clock [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -84,9 +84,9 @@ class SignalWatch:
         self._seen.update({name: now for name, here in present.items() if here})
 
     def is_missing(self, name: str) -> bool:
-        """Return True if the source has not delivered the signal `name` for longer than MISSING_S.
-        The name is "position", "wheels" (any wheel speed) or "turning" (a wheel speed above
-        standstill).
+        """Return True if the source has not delivered the signal `name` for longer than MISSING_S
+        seconds. The name is "position", "wheels" (any wheel speed) or "turning" (a wheel speed
+        above standstill).
         """
         return bool(self._seen) and self._clock() - self._seen[name] > MISSING_S
 
@@ -94,14 +94,15 @@ class SignalWatch:
 def reasons_not_publishing(
     watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
 ) -> list[str]:
-    """Return the reasons why nothing is published, the first cause first. The list is empty if
-    records can be published.
+    """Return the reasons why nothing is published, as sentences for the user: first problems of the
+    signals, then of the network. The list is empty if records can be published.
 
     Args:
-        watch: observer through which the source's blocks have passed.
+        watch: observer of the blocks of samples that the source has delivered.
         publisher: status of the publisher.
         endpoints: routers that the publisher tries to reach.
-        troubles: problems reported by the sources and by the signal doctor (automatic check).
+        troubles: messages about problems, reported by the signal sources and by the signal doctor
+            (automatic check).
     """
     found = list(troubles)
     if watch.is_missing("wheels"):
@@ -136,13 +137,13 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Printer of the reasons why an agent publishes nothing. It checks the reasons first after
-    FIRST_S and then every EVERY_S, and prints them only if they have changed.
+    """Printer of the reasons why an agent publishes nothing. It determines the reasons first after
+    FIRST_S seconds and then every EVERY_S seconds, and prints them only if they have changed.
 
     Args:
-        find: returns the present reasons.
-        say: prints a line.
-        clock: monotonic clock [s].
+        find: function that returns the present reasons.
+        say: function that prints a line.
+        clock: function that returns the time of a monotonic clock [s].
     """
 
     def __init__(

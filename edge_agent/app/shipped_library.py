@@ -37,8 +37,9 @@ def read_processor_features() -> set[str]:
 
 
 def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
-    """Return the fastest library in `folder` for the present sources and a processor with these
-    features. Return None if there is none; report the reason if there are others.
+    """Return the path of the fastest library in `folder` that was built from the present source
+    files and runs on a processor with these `features`. If the folder has only unsuitable
+    libraries, print the reason. Return None if no library is suitable.
     """
     libraries = set(folder.glob("*.so"))
     sources = describe_sources("edge_agent")
@@ -58,8 +59,8 @@ def build_shipped_libraries() -> None:
     """Build the shared libraries in the folder of the installed package, one process per level of
     the processor architecture. Libraries that are there already are removed first.
 
-    On a processor of another architecture there is nothing to build, so the agent compiles its
-    kernels at its first start.
+    On a processor that is not x86-64, build nothing; the agent then compiles its kernels at its
+    first start.
 
     Raises:
         subprocess.CalledProcessError: a process has failed; it has printed the reason.

@@ -1,12 +1,12 @@
 """Live trip of a car: the signal doctor (automatic check of the signals) verifies the signals, and
-a calibration is learned from them. The result is stored next to the outbox (file of unsent
-records).
+a calibration is learned from them. The doctor's verdict and the learned calibration are stored in a
+file next to the outbox (file of unsent records).
 
 Nothing is published until the doctor has found the signals free of faults, in this trip or in an
 earlier trip with the same vehicle file and profile. A trip is examined in sections of PART_S
 seconds. The calibration is learned from each section without a fault. A section with a fault stops
 the publishing until a later section has no fault. Learned values are used from the next trip on,
-because an estimator's vehicle does not change during a trip.
+because an estimator's vehicle parameters are fixed during a trip.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ log = logging.getLogger(__name__)
 
 class Known(BaseModel):
     """Stored knowledge about a car. `passed` is True if the signal doctor (automatic check) found
-    no fault in the car's signals. `drives` are the sensor errors estimated from each section of the
-    car's trips.
+    no fault in the car's signals. `drives` contains, for each section of the car's trips, the
+    sensor errors estimated from it. `of` identifies vehicle file and profile.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -69,8 +69,8 @@ class Trip:
         vehicle: vehicle file of the car.
         profile: assignment of the car's signals to channels.
         path: file with the stored knowledge about the car; it need not exist.
-        trusted: True to publish regardless of the findings of the signal doctor (automatic check of
-            the signals).
+        trusted: True to publish records regardless of the findings of the signal doctor (automatic
+            check of the signals).
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Trip:
         self._looking: Future[None] | None = None
 
     def is_admitted(self) -> bool:
-        """Return True if the signals of this trip may be published."""
+        """Return True if records made from the signals of this trip may be published."""
         return self._trusted or self._known.passed
 
     def health_problems(self) -> list[str]:
@@ -109,7 +109,8 @@ class Trip:
         """Yield the blocks of samples of a source after correction of the known sensor errors. The
         uncorrected blocks are stored for the signal doctor (automatic check of the signals).
 
-        `ground` returns the speed over ground (T,) [m/s] of the last block.
+        The function `ground` returns the speed over ground (T,) [m/s], for example from a satellite
+        receiver, at the samples of the last block.
         """
         if not self.is_admitted():
             log.info(
@@ -124,13 +125,15 @@ class Trip:
                 yield replace(block, signals=mended[:, None])
 
     def learn_rest(self) -> None:
-        """Start the examination of the last section of the trip, so that the calibration is also
-        learned from this section.
+        """Start the examination (search for sensor faults) of the last section of the trip, so that
+        the calibration is also learned from this section.
         """
         self._start_examination(final=True)
 
     def close(self) -> None:
-        """Wait at most LEAVE_S for the running examination of the signals to end."""
+        """Wait at most LEAVE_S seconds for the running examination of the signals (search for
+        sensor faults) to end.
+        """
         if self._looking is not None:
             try:
                 self._looking.result(LEAVE_S)
@@ -150,8 +153,9 @@ class Trip:
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
-        """Start an examination of the signals in the current section of the trip, on another
-        thread. With `final`, this section ends and the next one begins.
+        """Start, on another thread, an examination of the signals (search for sensor faults) in the
+        current section of the trip. If `final` is True, the current section ends and the next
+        section begins.
         """
         if not self._blocks:
             return
@@ -192,8 +196,8 @@ class Trip:
 
 
 def state_path_for(spool: Path, name: str) -> Path:
-    """Return the path of the file with a car's stored knowledge, next to its outbox (file of unsent
-    batches).
+    """Return the path of the file with the stored knowledge about the car `name`. It lies next to
+    the car's outbox `spool` (file of unsent batches).
     """
     return spool.with_name(f"{spool.stem}.{name}.json")
 
@@ -204,8 +208,8 @@ def _car_identity(vehicle: Vehicle, profile: Profile) -> str:
 
 
 def _read_state(path: Path, identity: str) -> Known:
-    """Return the stored knowledge of the car. Return an empty one if the file is missing, is
-    broken, or belongs to another car.
+    """Return the knowledge about a car that is stored in the file `path`. Return empty knowledge if
+    the file is missing or broken, or belongs to another car than `identity`.
     """
     try:
         known = Known.model_validate_json(path.read_bytes())

@@ -33,7 +33,7 @@ class Record(BaseModel):
 
 class Score(Record):
     """Scores of one set of memberships (fuzzy sets) on one set of drives. Scores that need the true
-    friction are null if it is unknown.
+    friction are null if the drives do not contain it.
     """
 
     interval_score: Annotated[
@@ -70,8 +70,8 @@ class SplitScores(Record):
 
 
 class Budget(Record):
-    """Limits of the search for fuzzy sets: ants, iterations, and the number of parameter vectors
-    that each search evaluated.
+    """Effort of the searches for fuzzy sets: number of ants (candidates per iteration) and of
+    iterations, and, by search, the number of evaluated parameter vectors.
     """
 
     ants: Count
@@ -121,7 +121,8 @@ class Tuned:
 
 
 def parse_tuned(text: str | bytes, where: str) -> Tuned:
-    """Return the tuned memberships in a document.
+    """Return the tuned memberships (fuzzy sets) in the JSON text of a document. `where` names the
+    document in error messages.
 
     Raises:
         InputError: a field is missing, unknown, not a finite number, or a vertex (corner of a fuzzy
@@ -173,8 +174,9 @@ def shipped_memberships(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the memberships (fuzzy sets) that each search found, by kind of search, from the file
-    of memberships in this package. Return an empty dictionary if the file does not contain them.
+    """Return the memberships (fuzzy sets) that each search found, by kind of search. They are read
+    from the file of memberships in this package. Return an empty dictionary if that file contains
+    no results of searches.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {

@@ -112,8 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_command(
     arguments: Sequence[str], *, limited: bool, chosen: str | None
 ) -> tuple[int, bool]:
-    """Run a command; return its exit code, and True if a remaining thread would keep the process
-    from ending.
+    """Run a command. Return its exit code, and a flag: True if a thread of the command is still
+    running and would keep the process from ending.
     """
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Estimate a recorded drive with a vehicle; return a score of how well the estimator with this
-    vehicle predicts the measurements.
+    """Run an estimator with the vehicle parameters `vehicle` on a recorded drive. Return a score of
+    how well the estimator predicts each next measurement of the drive.
     """
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.calibration.held_out import Prediction
@@ -92,7 +92,8 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 def report_lines(found: HeldOut) -> list[str]:
     """Return the lines of the report on a learned calibration: learned values with units, groups of
-    quantities that were left out, and the scores on held-out drives.
+    quantities that were left out because they do not improve the prediction, and the scores on
+    held-out drives.
     """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():

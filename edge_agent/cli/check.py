@@ -97,8 +97,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doubted_flags(log: SignalLog) -> dict[str, str]:
-    """Return the names of controller flags (ABS, ESC, traction control) that the estimator ignores
-    as implausible at some time of a log, each with the reason.
+    """Return the controller flags (ABS, ESC, traction control) that the estimator ignores as
+    implausible at some time of a log. The result maps each flag's name to the reason.
     """
     from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 

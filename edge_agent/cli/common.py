@@ -52,7 +52,7 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
     """Print on stderr the faults that the signal doctor (automatic check) found in a log. Return
-    notes to print after the estimates.
+    notes about these faults, which the caller prints after the estimates.
     """
     found = diagnosis.findings
     for fault in found:

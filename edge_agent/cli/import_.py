@@ -44,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import the recordings into a signal log, or write a draft of a profile (assignment of signals
-    to channels), or list the profiles; return 0.
+    """Convert the recordings to a signal log, write a draft of a profile (assignment of signals to
+    channels), or list the known profiles, as the options ask. Return 0.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import read_source, write_log

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
-    """Compile the functions of the simulation, or load them, by one step before the run."""
+    """Simulate one step of a scenario, so that the functions of the simulation are compiled or
+    loaded before the run begins.
+    """
     from edge_agent.lab.simulation import SimulatedFleet
 
     with progress_messages.show_status("starting the simulation"):
@@ -100,7 +102,7 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     """Return a function that prints warnings on stdout, as text or as JSON, depending on the log
     format.
 
-    In JSON an infinite time is null.
+    In JSON an infinite number of seconds until the stretch is written as null.
     """
     say = line_logger(config.log, sys.stdout)
 

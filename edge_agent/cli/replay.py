@@ -85,9 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay logs (estimate recorded drives). Return 0 if all records were written and
-    acknowledged, 1 if the service rejected records or did not answer, 3 if the estimates of a log
-    are implausible.
+    """Replay logs (estimate recorded drives). Return 0 if all estimates were written and all sent
+    records were acknowledged, 1 if the service rejected records or did not answer, 3 if the
+    estimates of a log are implausible.
     """
     from edge_agent.app.backfill import (
         backfill_on_spark,
@@ -179,8 +179,8 @@ def _split_names(names: str | None) -> list[str]:
 def _write_report(
     args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]
 ) -> list[str]:
-    """Estimate a log with each of the named estimators, write the report, and return notes for the
-    user.
+    """Estimate a log with each estimator in `names`, write the report (plots of the estimates), and
+    return notes for the user.
     """
     import pyarrow as pa
 

@@ -91,8 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the agent until the source ends, the duration has passed, or a signal (SIGTERM, Ctrl-C)
-    arrives; return the exit code.
+    """Run the agent until the source of samples ends, the duration has passed, or a signal
+    (SIGTERM, Ctrl-C) arrives; return the exit code.
     """
     with progress_messages.show_status("loading"):
         from edge_agent.app.native_library import use_agent_library

@@ -190,8 +190,9 @@ def run(args: argparse.Namespace) -> int:
 def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return (drives for the search, held-out drives): simulated drives, or parts of the recorded
-    logs that the options name.
+    """Return two sets of drives: one for the search for fuzzy sets, and one to compare the results
+    (held-out drives). They are simulated drives, or parts of the recorded logs that the options
+    name.
     """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)
@@ -214,8 +215,8 @@ def _tuning_drives(
 def _search_worth(score: Score, objective: str) -> float:
     """Return the value by which the results of searches are compared; larger is better.
 
-    If the true friction is known, the value is minus the cost of false and missed ice. Otherwise it
-    is the value of the objective that the search maximised.
+    If the true friction is known, the value is minus the cost of falsely reported and of missed
+    ice. Otherwise it is the value of `objective`, the function that the search maximised.
     """
     known = {name: value for name, value in score.model_dump().items() if value is not None}
     unknown = {"interval_score": math.nan, "coverage": math.nan}
@@ -282,7 +283,8 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
     """Search for the best fuzzy sets twice, by random search and by an ant colony. Both searches
-    have the same start vector, candidate values and budget. Return the results by search.
+    have the same start vector, candidate values and budget. Return the result of each search by its
+    name, "random" or "colony".
     """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
@@ -362,8 +364,8 @@ def _format_number(value: float | None, digits: int) -> str:
 
 
 def comparison_table(scores: dict[str, SplitScores]) -> str:
-    """Return the scores of each search as a plain-text table, one row per search and set
-    of drives.
+    """Return the scores of the fuzzy sets that each search found as a plain-text table. It has one
+    row per search and set of drives.
     """
     lines = [
         (

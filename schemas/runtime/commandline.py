@@ -29,8 +29,8 @@ _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
 class Command(NamedTuple):
-    """Subcommand of a command-line program: its name, module, help text and example. The module has
-    `add_arguments(parser)` and `run(arguments) -> int`.
+    """Subcommand of a command-line program: its name, the name of its module, its help text and an
+    example. The module defines `add_arguments(parser)` and `run(arguments) -> int`.
     """
 
     name: str
@@ -45,7 +45,9 @@ class OneLineParser(argparse.ArgumentParser):
     """
 
     def error(self, message: str) -> NoReturn:
-        """Print the error with a reference to `--help` on one line, and exit."""
+        """Print the error `message` and a reference to `--help` on one line of stderr, and exit
+        with code 2.
+        """
         self.exit(BAD_INPUT, f"error: {message}; see {self.prog} --help\n")
 
 
@@ -105,12 +107,14 @@ def add_command(
 
 
 def wants_quiet(arguments: Sequence[str]) -> bool:
-    """Return True if a command line, not yet parsed, asks for errors only."""
+    """Return True if an unparsed command line contains `-q` or `--quiet`, by which the user
+    suppresses all messages except errors.
+    """
     return not {"-q", "--quiet"}.isdisjoint(arguments)
 
 
 class VersionAction(argparse.Action):
-    """`--version`: print the version of the installed distribution."""
+    """Action of the option `--version`: print the version of the installed distribution."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: object) -> None:
         super().__init__(
@@ -138,7 +142,8 @@ def version() -> str:
 
 
 def run_guarded(run: Callable[[], int]) -> int:
-    """Run a command; after misuse, Ctrl-C or a closed output pipe, print at most one line.
+    """Run the function of a command. If it ends by misuse, Ctrl-C or a closed output pipe, print at
+    most one line and no traceback.
 
     Returns:
         the exit code.
@@ -165,8 +170,8 @@ def run_guarded(run: Callable[[], int]) -> int:
 
 
 def out_folder(field: str, path: Path) -> Path:
-    """Check that a file can be written at `path`, and return the path. A command calls this before
-    it computes anything.
+    """Check that `path` can be the path of an output file, and return the path. A command calls
+    this before it computes anything. `field` is the name of the option, for the error message.
 
     Raises:
         InputError: the path is a folder, or its parent folder does not exist.
@@ -198,8 +203,9 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
-    """Return the ending of a file name, which selects the format. If several known endings match,
-    the longest is returned.
+    """Return the ending of a file name, which selects the file format. If the name ends with
+    several of the `known` endings, return the longest. `field` is the name of the option, for the
+    error message.
 
     Raises:
         InputError: the ending is unknown.
@@ -213,7 +219,7 @@ def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
 
 
 def refuse_input_path(field: str, out: Path, inputs: Sequence[Path]) -> None:
-    """Refuse to overwrite an input file.
+    """Raise an error if the output file `out` would overwrite one of the input files.
 
     Raises:
         InputError: the file to write is one of the inputs.

@@ -16,8 +16,8 @@ _OWN: Final = ".drafts-"
 
 
 def draft_of(path: Path) -> Path:
-    """Return the path of a file's draft (temporary file). Its leading dot hides it from Spark and
-    pyarrow.
+    """Return the path of the draft (temporary file) in which the file `path` is first written. The
+    leading dot of the draft's name hides it from Spark and pyarrow.
     """
     return path.with_name(f".{path.name}{ENDING}")
 
@@ -27,7 +27,8 @@ def open_durably(
     path: Path, mode: int | None = None, *, named: bool = True
 ) -> Iterator[BufferedWriter]:
     """Open a draft (temporary file) for writing. When the `with` block ends, rename the draft to
-    `path`, complete and durable. If the block fails, nothing changes.
+    `path`, complete and durable. If the block raises an exception, the draft is removed and an
+    existing file at `path` stays unchanged.
 
     Args:
         path: path of the file; an existing file is replaced.
@@ -88,8 +89,8 @@ def sync_directory(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, and sync each parent folder, so that they survive power
-    loss.
+    """Create a folder and its missing parents, and sync each parent folder to disk, so that the new
+    folders survive power loss.
     """
     if not folder.exists():
         make_folder(folder.parent)

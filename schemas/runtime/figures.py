@@ -24,11 +24,11 @@ class Figure:
     """One measured value.
 
     Attributes:
-        name, value, unit: the measurement.
-        bar: target (limit) for the value; if `better` is "within", a pair of limits; None if there
-            is no target.
-        better: "less" or "more": the side of the target on which the value must lie; "within":
-            between both limits.
+        name, value, unit: name of the measured quantity, measured value, and its unit.
+        bar: target for the value: an upper or lower limit, or a pair of limits if `better` is
+            "within"; None if there is no target.
+        better: "less" if the value must not exceed the limit, "more" if it must not be below the
+            limit, "within" if it must lie between both limits.
     """
 
     name: str
@@ -39,7 +39,9 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """Return True if the figure's value meets its target; False for NaN (not measured)."""
+        """Return True if the figure's value meets its target, or has no target; False for NaN (not
+        measured).
+        """
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
@@ -48,8 +50,8 @@ class Figure:
 
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
-    """Return the header of a file of figures, with the conditions of the measurement: commit,
-    machine, versions, seeds, date.
+    """Return the header of a file of figures. It states the conditions of the measurement: commit
+    of the source, machine, versions of packages, seeds of the random numbers, and date.
     """
     return {
         "campaign": campaign,
@@ -89,8 +91,8 @@ def commit(source: Path) -> str:
 
 
 def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:
-    """Write the header and the figures of a campaign (one run of an evaluation) to a file as one
-    JSON list.
+    """Write the figures of a campaign (one run of an evaluation) to a file as one JSON list. Its
+    first item is the header with the conditions of the measurement.
     """
     rows = [{**asdict(figure), "holds": figure.holds} for figure in figures]
     for row in rows:
@@ -108,8 +110,8 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 
 def row(figure: Figure) -> list[str]:
-    """Return four table cells for a figure: name, value with unit, target, and whether it is
-    met.
+    """Return the four cells of a table row for a figure: name, value with unit, target, and "holds"
+    or "DOES NOT HOLD". The last two are empty if the figure has no target.
     """
     signs = {"less": "≤ ", "more": "≥ "}
     bar = figure.bar

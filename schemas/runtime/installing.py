@@ -12,8 +12,8 @@ NAME = "gripmap"
 
 
 def install_command(extra: str) -> str:
-    """Return a shell command that installs an extra (group of optional dependencies) into this
-    environment.
+    """Return a shell command that installs an extra (group of optional dependencies) of this
+    distribution into the Python environment of this process.
     """
     try:
         text = metadata.distribution(NAME).read_text("direct_url.json")

@@ -29,16 +29,17 @@ R = TypeVar("R")
 
 
 class _Native:
-    """Shared library whose kernels (compiled numerical functions) this process uses. If it is None,
-    Numba compiles all kernels.
+    """Shared library from which this process takes its kernels (compiled numerical functions). If
+    `library` is None, Numba compiles all kernels.
     """
 
     library: Library | None = None
 
 
 def use_native_kernels(library: Library) -> None:
-    """Take the kernels (compiled numerical functions) of all modules that are imported from now on
-    from a shared library. If the library lacks a kernel, Numba compiles it at its first call.
+    """From now on, give each newly imported module its kernels (compiled numerical functions) from
+    the shared library `library`. If the library lacks a kernel, Numba compiles that kernel at its
+    first call.
     """
     _Native.library = library
 
@@ -82,8 +83,9 @@ def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile like `refcount_free`, and copy the code into each caller as `inlined` does. An array
-    costs more as an argument than a number, because it is passed as seven machine words.
+    """Compile `function` without counting references to arrays, like `refcount_free`, and copy its
+    code into each caller, as `inlined` does. Pass few arrays: an array argument is passed as seven
+    machine words.
     """
     return _compile(function, nogil=True, forceinline=True, references=False)
 
@@ -103,8 +105,8 @@ def load_intrinsic(module: str, name: str) -> object:
 
 
 def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return a callable that runs the machine code of a compiled function directly. It omits
-    numba's check of the arguments, which costs 0.3 µs per call.
+    """Return a callable that runs the machine code of a compiled function directly. The callable
+    omits numba's check of argument types, which costs 0.3 µs per call.
 
     The function must have been called before. Every argument must have the same type as in that
     call, because types are not checked again.
@@ -137,7 +139,9 @@ def _compile(
 
 
 def _cache_of(package: str) -> str | None:
-    """Return the folder for a package's compiled functions, or None if none can be written."""
+    """Return the folder in which a package's compiled functions are cached, or None if no such
+    folder can be written.
+    """
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return given
     return None if cache_root() is None else kernel_cache(package)
@@ -163,7 +167,9 @@ def _processor_digest() -> str:
 
 
 def list_processor_lines() -> list[str]:
-    """Return the lines of /proc/cpuinfo that tell a processor's model and features, if any."""
+    """Return the lines of /proc/cpuinfo that state the first processor's model and features. The
+    list is empty on systems without this file.
+    """
     try:
         first, _, _ = Path("/proc/cpuinfo").read_text().partition("\n\n")
     except OSError:
@@ -172,8 +178,8 @@ def list_processor_lines() -> list[str]:
 
 
 def kernel_cache(package: str) -> str:
-    """Return the folder for a package's compiled functions, in the user's cache. Old folders may be
-    deleted at any time.
+    """Return the folder in the user's cache for a package's compiled functions. Its name contains a
+    digest of the sources, so folders of older sources may be deleted at any time.
     """
     return str((cache_root() or Path()) / describe_sources(package))
 
@@ -183,8 +189,8 @@ def describe_sources(package: str) -> str:
     """Return a package's name with a digest of all source files on which its kernels depend.
 
     The digest is needed because Numba's own cache checks only the source file of a function. After
-    a change in another file, whose functions or constants the function uses, Numba would use
-    outdated code.
+    a change in another file whose functions or constants it uses, Numba would take outdated code
+    from its cache.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)

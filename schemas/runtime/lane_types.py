@@ -46,8 +46,9 @@ class LanesType(types.Type):
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
     def unify(self, typingctx: Any, other: Any) -> LanesType | None:
-        """Return this vector type for a variable that holds a single number in one branch of the
-        code and a vector in another. Return None if `other` is not the type of a number.
+        """Return the type of a variable that holds a vector in one branch of compiled code and a
+        value of the type `other` in another branch. This is the vector type if `other` is the type
+        of a single number, else None (no common type).
         """
         return self if isinstance(other, types.Float | types.Integer) else None
 
@@ -87,7 +88,7 @@ class MaskModel(models.PrimitiveModel):
 
 def spread_value(builder: Any, value: Any, vector: Any) -> Any:
     """Generate code that copies `value` into all lanes of a new vector of the LLVM type `vector`;
-    return this vector.
+    return the LLVM value of this vector.
     """
     empty = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(empty, value, INDEX(0))
@@ -98,23 +99,23 @@ def spread_value(builder: Any, value: Any, vector: Any) -> Any:
 @lower_cast(types.Float, LanesType)
 @lower_cast(types.Integer, LanesType)
 def cast_number(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Generate code that copies a single number into all lanes of a new vector; return this
-    vector.
+    """Generate code that converts a single number `value` to a vector: the number is copied into
+    all lanes of a new vector. Return the LLVM value of this vector.
     """
     return spread_value(builder, context.cast(builder, value, given, types.float64), VECTOR)
 
 
 @lower_cast(types.Boolean, MaskType)
 def cast_truth(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Generate code that copies a single truth value into all lanes of a new mask; return this
-    mask.
+    """Generate code that converts a single truth value `value` to a mask: the truth value is copied
+    into all lanes of a new mask. Return the LLVM value of this mask.
     """
     return spread_value(builder, cgutils.as_bool_bit(builder, value), BIT_VECTOR)
 
 
 def call_llvm(builder: Any, name: str, *args: Any) -> Any:
-    """Generate a call of the LLVM intrinsic `name`, for example "sqrt", for single numbers or for
-    vectors; return its result.
+    """Generate a call of the LLVM intrinsic `name`, for example "sqrt". The arguments are LLVM
+    values of single numbers or of vectors. Return the LLVM value of the result.
     """
     kind = args[0].type
     function = cgutils.get_or_insert_function(
@@ -126,8 +127,9 @@ def call_llvm(builder: Any, name: str, *args: Any) -> Any:
 
 
 def choose_lanes(builder: Any, sign: str, a: Any, b: Any) -> Any:
-    """Generate code that compares two vectors lane by lane; return a vector with the number of `a`
-    where `a sign b` holds, else that of `b`. NaN in either vector selects `b`.
+    """Generate code that chooses between two vectors lane by lane. A lane of the result has the
+    number of `a` where the comparison `a sign b` holds (`sign` is for example "<"), else the number
+    of `b`. NaN in either vector selects `b`.
     """
     return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
@@ -208,9 +210,10 @@ _register_comparisons()
 
 
 def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
-    """Generate code that returns a pointer to one vector (LANES numbers) in an array. The array and
-    the place are the first two arguments of an intrinsic with the signature `sig`. The place is an
-    index, or a tuple with one index per axis before the last axis (the lanes).
+    """Generate code that computes the address of one vector (LANES numbers) in an array; return
+    this pointer. The array and the place are the first two arguments of an intrinsic with the
+    signature `sig`. The place of the vector is an index, or a tuple with one index for each axis
+    except the last (the lanes).
     """
     kind = sig.args[0]
     held = target.make_array(kind)(target, builder, values[0])
@@ -250,8 +253,8 @@ def type_store(context: Any, array: Any, place: Any, value: Any) -> Any:
 
 
 def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
-    """Return the signature and the code generator of the intrinsic `select`, which takes each
-    number from the first or the second of two vectors, depending on a mask.
+    """Return the signature and the code generator of the intrinsic `select`, which takes each lane
+    from the first of two vectors where a mask is True, else from the second.
     """
     wide = any(isinstance(kind, LanesType | MaskType) for kind in (where, first, other))
     number = LANES_TYPE if wide else types.float64
@@ -265,8 +268,9 @@ def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
 
 
 def _reduce(combine: Callable[[Any, Any, Any], Any]) -> Any:
-    """Return a code generator that reduces a vector to one number: `combine` joins its lower and
-    upper half, until one number is left. Thus the order of the operations is fixed.
+    """Return a code generator that reduces a vector to one number. The generated code halves the
+    vector again and again: `combine` joins its lower and upper half lane by lane, until one number
+    is left. The order of the operations is therefore always the same.
     """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
@@ -317,8 +321,9 @@ def type_any(context: Any, mask: Any) -> Any:
 
 
 def type_gather(context: Any, table: Any, cell: Any) -> Any:
-    """Return the signature and the code generator of the intrinsic `gather`, which reads a table at
-    one index per lane.
+    """Return the signature and the code generator of the intrinsic `gather`, which returns a vector
+    of table values. Each lane of the vector `cell` has the index of the value that is read from
+    `table`.
     """
     number = LANES_TYPE if isinstance(cell, LanesType) else types.float64
 
@@ -346,8 +351,9 @@ def _constant(long: Any, value: int) -> Any:
 
 def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> Any:
     """Return the signature and the code generator of an intrinsic with one argument, a single
-    number or a vector. `build` generates the code from the LLVM builder, the argument, its LLVM
-    type, and the LLVM type of as many integers.
+    number or a vector. `build` generates the code. It receives the LLVM builder, the argument, the
+    LLVM type of the argument, and the LLVM type of an integer or of a vector of integers with as
+    many lanes.
     """
     wide = isinstance(value, LanesType)
     number = LANES_TYPE if wide else types.float64
@@ -368,8 +374,8 @@ def type_floor(context: Any, value: Any) -> Any:
 
 def type_guess(context: Any, value: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `guess_inverse`, a first
-    approximation of 1/x. The bits of the result are a constant minus the bits of x, which changes
-    the sign of the exponent.
+    approximation of 1/x. The bits of the result, read as an integer, are a constant minus the bits
+    of x. This changes the sign of the binary exponent, as 1/x does.
     """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
@@ -381,8 +387,8 @@ def type_guess(context: Any, value: Any) -> Any:
 
 def type_root_guess(context: Any, value: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `guess_inverse_root`, a first
-    approximation of 1/sqrt(x). Like `guess_inverse` it changes the bits of x; it also halves the
-    exponent.
+    approximation of 1/sqrt(x). The bits of the result, read as an integer, are a constant minus
+    half the bits of x. This halves the binary exponent and changes its sign, as 1/sqrt(x) does.
     """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:

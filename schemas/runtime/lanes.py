@@ -126,8 +126,8 @@ def log_lanes(x: float) -> float:
 
 @inlined
 def evaluate_polynomial(terms: tuple[float, ...], x: float) -> float:
-    """Return the value at x of the polynomial whose coefficients are `terms`, the highest first
-    (Horner's rule).
+    """Return the value at x of a polynomial by Horner's rule. `terms` are its coefficients, that of
+    the highest power first.
     """
     total = x * 0.0 + terms[0]
     for term in terms[1:]:

@@ -12,11 +12,12 @@ from typing import Any
 def lazy_exports(
     package: str, names: Mapping[str, str]
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__all__`, `__getattr__` and `__dir__` for a package with lazy public names (PEP 562).
+    """Return `__all__`, `__getattr__` and `__dir__` for a package whose public names are imported
+    at their first use (PEP 562).
 
     Args:
         package: name of the package, for the error message.
-        names: each public name and the module that defines it.
+        names: dictionary from each public name to the name of the module that defines it.
     """
     face = sorted(names)
 

@@ -1,8 +1,8 @@
 """Connections of a Zenoh session: the connected router, the transport, and the number of changes.
 
-Zenoh reports each transport and link that opens or closes. A `LinkWatch` stores the current state
-and the counts. Therefore a program learns of a lost connection at once, and not only from missing
-answers.
+Zenoh reports each transport (session with a router) and each link (network connection) that opens
+or closes. A `LinkWatch` stores the open links and the counts. Thus a program notices a lost
+connection at once, and not only when answers are missing.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ log = logging.getLogger(__name__)
 
 
 class LinkWatch:
-    """Observer of the links (connections to routers) of a Zenoh session.
+    """Observer of the links (network connections to routers) of a Zenoh session.
 
     Attributes:
-        epoch: number of times that the session was connected to a router.
-        lost: number of times that the session lost a router.
+        epoch: number of connections to a router that the session has opened so far.
+        lost: number of connections to a router that the session has lost so far.
 
     Args:
         session: session to watch.
         name: name of the session, for the log.
-        on_change: called after each change, on a thread of Zenoh.
+        on_change: function that a thread of Zenoh calls after each opened or lost connection.
     """
 
     def __init__(

@@ -27,8 +27,8 @@ READ_S: Final = 5.0  # longest time for receiving a request; then the connection
 
 
 class Metric(NamedTuple):
-    """Metric with one or several values. `label` is the name of the OpenMetrics label that
-    distinguishes the values; "" for a single value.
+    """Metric with one or several values. The keys of `values` are values of the OpenMetrics label
+    named `label`; "" for a metric with a single value.
     """
 
     name: str
@@ -56,8 +56,9 @@ def serve_metrics(
 
     Args:
         host, port: address to listen on.
-        read: function that returns all current values.
-        troubles: function that returns one message per problem; an empty list means healthy.
+        read: function that returns all metrics with their current values.
+        troubles: function that returns one message per problem of the program; an empty list means
+            that it is healthy.
 
     Raises:
         InputError: the port is in use, or the package for the format is missing.

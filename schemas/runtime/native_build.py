@@ -57,18 +57,21 @@ class CallRecorder(Library):
         self.calls: dict[str, tuple[NativeKernel, tuple[Any, ...]]] = {}
 
     def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> int:
-        """Record a call of a kernel, and return 0 as its result."""
+        """Record the call of a kernel, with the types of its arguments, instead of running it.
+        Return 0 in place of the kernel's result.
+        """
         symbol = symbol_of(kernel.name, describe_type(arguments, []))
         self.calls.setdefault(symbol, (kernel, arguments))
         return 0
 
 
 def build_library(recorder: CallRecorder, path: Path) -> None:
-    """Compile and link the recorded kernels, and write the shared library `path`. Only a process
-    that ends afterwards may call this function, because Numba can no longer compile in it.
+    """Compile and link the kernels (numerical functions) that `recorder` has recorded, and write
+    the shared library `path`. Only a process that ends afterwards may call this function, because
+    Numba cannot compile in that process any more.
 
     Raises:
-        OSError, subprocess.CalledProcessError: there is no linker, or it fails.
+        OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
     """
     calls: list[tuple[str, Any, tuple[Any, ...], Any]] = []
     for symbol, (native, arguments) in recorder.calls.items():
@@ -87,7 +90,9 @@ def build_library(recorder: CallRecorder, path: Path) -> None:
 
 
 def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
-    """Compile a kernel for arguments of the types of `arguments`; return Numba's result."""
+    """Compile a kernel for arguments with the same types as `arguments`. Return Numba's compilation
+    result, which contains the LLVM code.
+    """
     typeof: Any = numba.typeof
     kinds = tuple(typeof(argument) for argument in arguments)
     kernel.compile(kinds)
@@ -95,9 +100,9 @@ def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 def _stop_before_machine_code() -> None:
-    """Within the context, stop Numba's compilation of a function after its LLVM code. Numba then
-    does not merge it with the functions that it calls, does not optimise it and makes no machine
-    code.
+    """Provide a context in which Numba stops each compilation as soon as it has generated LLVM
+    code. Numba then does not merge this code with the functions that it calls, does not optimise it
+    and makes no machine code.
 
     The kernel itself has been compiled before this context begins. Its code must not be optimised a
     second time: the optimiser may fuse other multiplications and additions, which changes the last
@@ -165,8 +170,9 @@ class _Adapter:
         return name
 
     def _expression(self, value: Any) -> str:
-        """Return the source text that builds one argument of the kernel from the next words; they
-        have the order in which `describe_type` appends them.
+        """Return the source text of an expression that builds one argument of the kernel from the
+        next unused 64-bit words of the row. `value` is an example of the argument. The words have
+        the order in which `describe_type` appends them.
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))
@@ -220,9 +226,9 @@ def _hide_functions(module: Any, visible: set[str], linkage: str) -> None:
 
 
 def _emit_object(whole: Any, symbols: list[str], numba_codegen: Any) -> bytes:
-    """Return the object code of the LLVM module `whole`, in which only the functions `symbols` are
-    visible to other programs. It is made for the same processor and with the same options as
-    Numba's own machine code.
+    """Return the object code (machine code before linking) of the LLVM module `whole`. Only the
+    functions named in `symbols` are visible to other programs. The code is made for the same
+    processor and with the same options as Numba's own machine code.
     """
     for function in [one for one in whole.functions if one.is_declaration]:
         if function.name.startswith(RUNTIME):
@@ -240,7 +246,9 @@ def _emit_object(whole: Any, symbols: list[str], numba_codegen: Any) -> bytes:
 
 
 def _empty_definition(declaration: str) -> str:
-    """Return the definition of a declared function that does nothing and returns zero."""
+    """Return the LLVM text of a function that does nothing and returns zero. It has the name and
+    the types of the function in `declaration`, an LLVM declaration.
+    """
     line = next(one for one in declaration.splitlines() if one.startswith("declare"))
     line = re.sub(r"\s#\d+$", "", line.rstrip())
     result = line.split()[1]
@@ -249,7 +257,9 @@ def _empty_definition(declaration: str) -> str:
 
 
 def _link_object(code: bytes, path: Path) -> None:
-    """Link object code to a shared library; `path` appears only when it is complete."""
+    """Link the object code `code` to a shared library. The file `path` appears only when the
+    library is complete.
+    """
     made = path.with_suffix(f".{os.getpid()}")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "kernels.o"

@@ -31,15 +31,17 @@ class OtherTypesError(TypeError):
 
 
 class Library:
-    """Shared library of kernels (compiled numerical functions); if `path` is None, a library
-    without functions.
+    """Shared library of kernels (compiled numerical functions); if `path` is None, the library
+    contains no functions.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._functions = None if path is None else ctypes.CDLL(os.fspath(path))
 
     def find_function(self, name: str) -> Callable[[Any], None] | None:
-        """Return the function with the symbol `name`, or None."""
+        """Return the library's function with the symbol `name`, or None if the library does not
+        contain it.
+        """
         return None if self._functions is None else getattr(self._functions, name, None)
 
     def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
@@ -106,19 +108,19 @@ class NativeIntrinsic:
 
 
 def symbol_of(name: str, types: str) -> str:
-    """Return the name that the kernel `name`, for arguments of the given types, has in the shared
-    library.
+    """Return the symbol of a kernel in the shared library. The symbol is made from the kernel's
+    name and the types of its arguments, both given as text.
     """
     digest = hashlib.blake2b(f"{name}({types})".encode(), digest_size=16)
     return f"gripmap_{digest.hexdigest()}"
 
 
 def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argument of a kernel
-    """Return the type of a kernel's argument as text, and append the 64-bit words that represent
-    the argument to `words`.
+    """Return the type of `value`, an argument of a kernel, as text. Append the 64-bit words that
+    represent the argument to the list `words`.
 
     An array is represented by its address and its shape, a tuple by the words of its elements, and
-    a number by itself.
+    a number by one word.
 
     Raises:
         OtherTypesError: the argument is neither a number nor a contiguous array that may be

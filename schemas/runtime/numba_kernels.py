@@ -23,8 +23,8 @@ R = TypeVar("R")
 
 
 class _Told(event.Listener):
-    """Listener to events of numba that reports each compilation to the user, because it takes
-    time.
+    """Listener to events of numba. It reports each compilation to the user, because a compilation
+    takes seconds.
     """
 
     def on_start(self, event: event.Event) -> None:
@@ -80,10 +80,13 @@ def make_kernel(
 
 
 class _Cache(FunctionCache):
-    """Numba's cache with two fixes: a full disk does not raise, and closures get stable keys."""
+    """Numba's cache of compiled functions with two changes: a full disk raises no error, and the
+    key of a closure (function that encloses variables) is the same in every process.
+    """
 
     def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 Numba has no types
-        """Return the cache key; for a closure it contains the names of the enclosed objects.
+        """Return the key under which a function's compiled code is cached. For a closure (function
+        that encloses variables), the key contains the names of the enclosed objects, because
         Numba's own key for a closure differs in each process.
         """
         cells = self._py_func.__closure__

@@ -88,8 +88,8 @@ def line_of(estimator: str) -> LineStyle:
 
 
 def shade(value: float, low: float, high: float) -> str:
-    """Return the colour of a value on the scale GRIP, which runs from `low` to `high`. The web
-    pages use the same formula.
+    """Return the colour of `value` on the colour scale GRIP, whose ends are the colours of the
+    values `low` and `high`. The web pages use the same formula.
     """
     at = min(max((value - low) / (high - low), 0.0), 1.0) * (len(GRIP) - 1)
     k = min(int(at), len(GRIP) - 2)

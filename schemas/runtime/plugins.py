@@ -34,7 +34,8 @@ def entry_points_of(group: str) -> dict[str, EntryPoint]:
 
 
 def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 may be any object
-    """Import the object that an entry point refers to.
+    """Import and return the object that the entry point `name` of the plug-in group `group` refers
+    to.
 
     Raises:
         InputError: the object cannot be imported.

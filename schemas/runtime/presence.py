@@ -20,8 +20,9 @@ _ALL: Final = f"{SERVES}/**"
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
     """Return the Zenoh liveliness tokens (signs that a process is alive) of services that are
-    active now and visible to this session. `root` is the first part of the tokens' keys; other
-    roots give other kinds of tokens, such as those of standby services.
+    active now and visible to this session. `root` is the first part of the tokens' Zenoh keys. It
+    selects the kind of tokens: by default those of services that serve a region, with another root
+    for example those of standby services.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -68,11 +69,11 @@ class PresenceTracker:
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
         """Query the liveliness tokens (signs that a service is alive) that are active now. Return
-        them together with the tracked ones.
+        the union of the queried tokens and the tracked tokens.
 
-        Both are needed: a router's answer may lack a token that the router is just sending to the
-        subscription of the same session (1 of 60 answers). The subscription then delivers this
-        token before the answer ends.
+        Both sources are needed. A router's answer may lack a token that the router is just sending
+        to the subscription of the same session (1 of 60 answers). The subscription then delivers
+        that token, which is tracked, before the answer ends.
         """
         return active_tokens(session) | self.active
 

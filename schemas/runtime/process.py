@@ -25,7 +25,9 @@ _LARGE: Final = 4 << 20
 
 
 class LogLine(str):
-    """Log line as text, with its values by name for the JSON form."""
+    """Log line as text for people. It also carries values by name, which the JSON form of the log
+    line contains.
+    """
 
     __slots__ = ("values",)
 
@@ -78,7 +80,7 @@ def force_exit(code: int) -> NoReturn:
     """End the process at once with an exit code, even if a thread hangs. Call this after closing
     files.
 
-    Printed text is flushed. Other threads are stopped without cleanup.
+    Text that was printed before is flushed first. Other threads are stopped without cleanup.
     """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # full disk, closed pipe or closed stream
@@ -120,9 +122,9 @@ def print_line(line: str, stream: TextIO) -> None:
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
-    """Return a function that prints log lines in the given form: as text or as JSON. A JSON line
-    contains the time, the process, the values `who`, and the first word of the text as name of the
-    event.
+    """Return a function that prints log lines on `stream`, as text or as JSON depending on `form`.
+    A JSON line contains the time, the process id, the values `who` (which identify the process),
+    and the first word of the text as name of the event.
     """
 
     def text(line: str) -> None:
@@ -139,8 +141,8 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
-    """Send warnings of the program and its libraries to `stream`, in the given form (text or
-    JSON).
+    """Write warnings that the program and its libraries log to `stream`, as text or as JSON
+    depending on `form`. Each JSON line contains the values `who`, which identify the process.
     """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(

@@ -25,7 +25,9 @@ COMPILING: Final = (
 
 
 class _State:
-    """State of the progress messages; there is one object per process."""
+    """State of the progress messages of this process: whether they are enabled, and the current
+    spinner.
+    """
 
     def __init__(self) -> None:
         self.on = False
@@ -128,5 +130,5 @@ def _show_status() -> None:
 
 
 def _load_drawing() -> None:
-    """Import the library that draws the spinner, before it is needed."""
+    """Import the library that draws the spinner, so that the spinner can appear without delay."""
     importlib.import_module("rich.progress")

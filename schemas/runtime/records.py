@@ -46,8 +46,8 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class EmptyRecord:
-    """Record without content. It is passed to a compiled function that requires a record as
-    argument but does not need its fields.
+    """Record without content. A caller passes it to a compiled function that requires a record as
+    argument, in cases where the function reads no field of it.
     """
 
     unused: bool
@@ -72,11 +72,11 @@ class Records(Protocol[R_co]):
     """
 
     def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
-        """Return a row of the record array as a view."""
+        """Return the row of the record array at `index` as a view (no copy)."""
         ...
 
     def __setitem__(self, index: int | tuple[int, int], row: object, /) -> None:
-        """Copy another row into the row of the record array at `index`."""
+        """Copy the record `row` into the row of the record array at `index`."""
         ...
 
 
@@ -116,8 +116,8 @@ def _number_type(held: Any) -> Any:  # noqa: ANN401 a field's annotation
 
 @cache
 def _alignment(held: Any) -> int:  # noqa: ANN401 a field's annotation
-    """Return the alignment of a record's field: its offset must be a multiple of this number of
-    bytes.
+    """Return the alignment [bytes] of a record's field with the type `held`. The field's offset in
+    the record must be a multiple of this number.
     """
     if held is LaneArray:
         return LINE
@@ -146,7 +146,9 @@ def records(kind: type, *shape: int) -> RecordArray:
 
 
 def put_record(row: np.void, value: tuple[Any, ...]) -> None:
-    """Copy the values of a named tuple into a row; nested tuples fill nested records."""
+    """Copy the values of the named tuple `value` into `row`, a row of a record array. Nested tuples
+    fill nested records.
+    """
     for name, part in zip(row.dtype.names or (), value, strict=True):
         if isinstance(part, tuple):
             put_record(row[name], part)

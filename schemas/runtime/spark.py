@@ -60,10 +60,11 @@ def spread(
     tasks: Sequence[_Task],
     work: Callable[[_Task], _Outcome],
 ) -> list[_Outcome]:
-    """Run all tasks, each as one Spark task; return their outcomes in the same order.
+    """Run `work` for all tasks, each as one Spark task; return the results ("outcomes") in the
+    order of the tasks.
 
-    A failed task is repeated up to `spark.task.maxFailures` times. The output of a failed attempt
-    is ignored, so an outcome counts once.
+    A failed task is repeated up to `spark.task.maxFailures` times. The result of a failed attempt
+    is ignored, so that each task has exactly one outcome.
 
     Args:
         session: Spark session.
@@ -114,7 +115,7 @@ def spread(
 
 
 def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an Arrow array
-    """Yield pairs from a column of pickled bytes: the number of a task, and the unpickled task or
-    outcome of this task.
+    """Unpickle each value of a column of bytes. Yield pairs: the number of a task, and this task or
+    its outcome.
     """
     return (pickle.loads(one) for one in column.to_pylist())

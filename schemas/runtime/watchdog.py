@@ -28,7 +28,7 @@ def notify_alive() -> None:
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
     """Start a thread that notifies systemd, again and again, that the process works, while the
     process waits (a standby service, for example) and cannot call `notify_alive` regularly. The
-    first call of `notify_alive` ends the thread.
+    thread ends at the process's first call of `notify_alive`.
 
     Returns:
         a function that the waiting code must call repeatedly. The thread stops `most_s` seconds

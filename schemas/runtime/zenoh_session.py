@@ -47,8 +47,9 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Return the Zenoh configuration of a session. It consists of this module's defaults, the
-    endpoints of the settings, and their `config` section; a later one overrides the earlier ones.
+    """Return the Zenoh configuration of a session. It combines three sources: this module's
+    defaults, the endpoints in `settings`, and the section `config` in `settings`. A later source
+    overrides the earlier ones.
 
     Args:
         settings: Zenoh section of the configuration file.
@@ -91,7 +92,9 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
 
 
 def quality_of(topic: keys.Topic) -> dict[str, Any]:
-    """Return a topic's quality of service as keyword arguments of `put` and `declare_publisher`."""
+    """Return the quality of service of a topic (kind of Zenoh key) as keyword arguments for Zenoh's
+    methods `put` and `declare_publisher`.
+    """
     congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
     priority = getattr(zenoh.Priority, topic.priority)
     return {"priority": priority, "congestion_control": congestion, "express": topic.express}
@@ -100,11 +103,12 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
 def open_session(
     settings: ZenohSettings, stop: threading.Event | None = None, name: str = ""
 ) -> zenoh.Session | None:
-    """Open a session; wait until a router answers, or return None when `stop` is set.
+    """Open a Zenoh session and return it as soon as a router answers. Return None if the event
+    `stop` is set before.
 
-    A session that loses its router reconnects by itself. Each reason for waiting is logged once. If
-    no router answers in time, the next attempt waits twice as long, so that a slow network is not
-    mistaken for a blocked one.
+    A session that loses its router reconnects by itself. Each reason why no session could be opened
+    is logged once. If no router answers in time, the next attempt waits twice as long, so that a
+    slow network is not mistaken for a blocked one.
     """
     stop = stop or threading.Event()
     logged = set[str]()

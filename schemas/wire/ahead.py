@@ -23,8 +23,8 @@ WarningState = Literal["raised", "updated", "ended"]
 
 @dataclass(frozen=True)
 class GripWarning:
-    """Warning of a slippery stretch of road ahead of the vehicle; fields as in the protobuf message
-    `Warning`.
+    """Warning of a slippery stretch of road ahead of the vehicle; its fields have the meaning of
+    those in the protobuf message `Warning`.
     """
 
     id: str
@@ -56,8 +56,9 @@ class GripWarning:
 
 
 class Runs(NamedTuple):
-    """Horizon (the map's values for the road ahead) as n runs. A run is a segment of the route
-    within one cell and sector. Fields as in the protobuf message `Ahead`.
+    """Horizon (the map's values for the road ahead) as n runs, with one array (n,) per field. A run
+    is a segment of the route within one map cell and heading sector. The fields have the meaning of
+    those in the protobuf message `Ahead`.
     """
 
     start_m: FloatArray
@@ -77,8 +78,8 @@ class Outlook(NamedTuple):
     """The road ahead of one vehicle: the current warnings, and the horizon (the map's values) along
     the most probable route.
 
-    `here` is the friction at the vehicle, from its own measurements and the map: median, 5 % and 95
-    % quantile; NaN if unknown.
+    `here` is the friction at the vehicle's position, computed from its own measurements and the
+    map: median, 5 % and 95 % quantile; NaN if unknown.
     """
 
     vehicle: str

@@ -1,5 +1,6 @@
-"""Decoder of one batch (message with records), and functions that all decoders share. They handle
-heads (fields of a batch other than its records), checks, and columns that a sender may leave out.
+"""Decoder of one batch (message with records), and functions that all decoders share. These
+functions read heads (fields of a batch other than its records), check batches, and fill columns
+that a sender may leave out.
 
 Missing columns are filled: floats with NaN, cell and sector from the pose (position and yaw), the
 leaving time with the entering time. The fleet service has its own decoder, which decodes many
@@ -91,11 +92,11 @@ class Decoded(NamedTuple):
     messages.
 
     Attributes:
-        indices: index of the message of each batch, (k,).
+        indices: for each batch, the index of the message from which it was decoded, (k,).
         heads: heads (fields other than records) of the batches.
         sizes: number of records of each batch, (k,).
-        columns: every column of the kind's table, all records one after the other, (n,);
-            `log_likelihood` is (n, 32).
+        columns: every column of the table for this kind of records, by name, (n,); the n records of
+            all batches follow each other. `log_likelihood` is (n, 32).
         with_likelihood: mask (n,), True if the record came with a log-likelihood of friction.
         errors: index and error of each message that is not a valid batch.
     """
@@ -109,10 +110,10 @@ class Decoded(NamedTuple):
 
 
 class PresentColumns(NamedTuple):
-    """Record of which columns each of k batches contains.
+    """Table that states which columns each of k batches contained when it was received.
 
     Attributes:
-        kind: kind of all batches.
+        kind: kind of the records in all batches, observations or states.
         sizes: number of records of each batch, (k,).
         columns: name of every column → mask (k,), True for each batch that contains it.
     """
@@ -141,8 +142,8 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """Return the head (fields other than records) of a batch whose records are invalid; None if the
-    head cannot be read either.
+    """Return the head (fields other than records) of a batch whose records are invalid, so that the
+    sender can be informed. Return None if the head cannot be read either.
     """
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
@@ -197,7 +198,7 @@ def _read_column(
     n: int,
 ) -> NDArray[Any]:
     """Return a column of a message (n,), integers as int64. A column that was not sent is filled
-    with its default.
+    with its default value.
     """
     values = getattr(message, name)
     if name == LIKELIHOOD:
@@ -233,9 +234,9 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Fill the columns that follow from the pose (position and yaw). Move two kinds of messages
-    from the valid batches to the errors: messages without a position, and messages with a number
-    that does not fit its column.
+    """Fill the columns of decoded batches that follow from the pose (position and yaw), and return
+    the batches. `sent` states which columns were sent. Move two kinds of batches to the errors:
+    those that need a position but have none, and those with a number that does not fit its column.
     """
     kind = sent.kind
     columns = found.columns
@@ -282,7 +283,8 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
 
 
 def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
-    """Fill the columns that a sender of observations may leave out.
+    """Fill, in place, the columns that a sender of observations may leave out: leaving time, cell
+    and heading sector.
 
     `unplaced` is a mask of rows, True where a row has a finite position but no cell.
     """

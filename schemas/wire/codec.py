@@ -99,8 +99,8 @@ def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
 class Batch:
     """One to fifty records of one vehicle in one region.
 
-    `columns` holds every column of the kind's table, shape (n,). The column `log_likelihood` is (n,
-    32), or (n, 0) where absent.
+    `columns` holds, by name, every column of the table for this kind of records, shape (n,). The
+    column `log_likelihood` is (n, 32), or (n, 0) if the batch has no log-likelihoods.
     """
 
     kind: Kind
@@ -122,8 +122,8 @@ def encode(batch: Batch) -> bytes:
     """Return the protobuf bytes of a batch (message with records of one vehicle).
 
     Raises:
-        WireError: columns of unequal length, too many records, or a column that the kind does not
-            have.
+        WireError: the columns have unequal lengths, there are too many records, or records of this
+            kind do not have one of the columns.
     """
     n = batch.rows
     types = column_types(batch.kind)
@@ -158,8 +158,9 @@ def encode(batch: Batch) -> bytes:
 
 # protobuf messages have no types.
 def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401
-    """Parse a message of type `message` from its bytes. They are protobuf if `encoding` is
-    `expected` or names no message type, and JSON if it is the JSON encoding.
+    """Parse a message of type `message` from its bytes. The bytes are read as protobuf if the
+    received `encoding` equals `expected` or names no message type, and as JSON if it is the JSON
+    encoding.
 
     Raises:
         WireError: the payload is too large, has another encoding, or is not the expected message.
@@ -192,10 +193,11 @@ class StreamAck(NamedTuple):
         boot, kind, region: identity of the stream: random number of the agent's start, kind of the
             batches, region.
         durable: ranges of batches that are stored safely, both ends included.
-        rejected: sequence number, row and reason of each refused record.
+        rejected: for each refused record, the sequence number of its batch, its row in the batch,
+            and the reason.
         late: ranges of durable batches that arrived too late for the map to use them in order of
             time.
-        time: clock of the service [ns]; 0 if not sent.
+        time: time of the service's clock [ns UTC] when it sent the acknowledgement; 0 if not sent.
     """
 
     boot: int
@@ -256,8 +258,9 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
 
 @dataclass(frozen=True)
 class Alert:
-    """Alert that a cell became slippery (`raised` is True) or is no longer slippery, with the
-    reason; fields as in the protobuf message `Alert`.
+    """Alert that a map cell, in one heading sector, became slippery (`raised` is True) or is no
+    longer slippery (False), with the reason. The fields have the meaning of those in the protobuf
+    message `Alert`.
     """
 
     cell: int
@@ -280,7 +283,7 @@ def encode_alert(alert: Alert) -> bytes:
 
 
 def decode_alert(payload: bytes) -> Alert:
-    """Decode the bytes of an alert's message; return the alert.
+    """Decode the bytes of a message with one alert; return the alert.
 
     Raises:
         WireError: the payload is not an Alert message.
@@ -296,7 +299,7 @@ def encode_standing(alerts: Sequence[Alert]) -> bytes:
 
 
 def decode_standing(payload: bytes) -> list[Alert]:
-    """Decode the bytes of a tile's message; return the active alerts of the tile.
+    """Decode the bytes of a message with all active alerts of a map tile; return these alerts.
 
     Raises:
         WireError: the payload is not a StandingAlerts message, or too large.

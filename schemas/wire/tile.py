@@ -77,7 +77,9 @@ def _refuse_compressed(payload: bytes) -> None:
 
 
 def _field_offset(data: bytes, table: int, index: int) -> int:
-    """Return the byte offset of a field in a FlatBuffers table; 0 if the field is absent."""
+    """Return the byte offset in `data` of a field of a FlatBuffers table; 0 if the field is absent.
+    `table` is the offset of the table, and `index` the number of the field.
+    """
     layout = table - int(struct.unpack_from("<i", data, table)[0])
     if 4 + 2 * index >= int(struct.unpack_from("<H", data, layout)[0]):
         return 0
