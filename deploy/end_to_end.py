@@ -39,8 +39,8 @@ REPORT_S = 30.0
 
 def drive_fleet(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     """Simulate a drive of the fleet for `duration_s` [s]. Return the columns of all observations
-    that the vehicles would send, and the column `vehicle` (name). Write the true friction of each
-    visit (passage of a map cell) to the file `truth`.
+    that the vehicles would send, with the column `vehicle`. Write the true friction of each visit
+    (passage of a map cell) to the file `truth`.
     """
     vehicles = len(fleet.vehicles)
     config = AgentConfig()

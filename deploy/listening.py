@@ -76,7 +76,7 @@ class Drive:
 
 
 class ListeningTown:
-    """Simulated town: its cars, and the fusion of their reports into a map. One object simulates
+    """Simulated town with its cars and the fusion of their reports into a map. One object simulates
     one drive, second by second.
     """
 
@@ -103,8 +103,8 @@ class ListeningTown:
 
     def run(self, duration_s: float) -> Drive:
         """Simulate a drive of the town's cars for `duration_s` [s], and evaluate the map at the end
-        of the drive. Return the results, among them the laps in which cars lost grip, and the cells
-        whose map interval contains the true friction.
+        of the drive. Return the results, such as how many cars lost grip and how well the map fits
+        the true friction.
         """
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]

@@ -38,8 +38,7 @@ DEFAULT: Final = "aco-fckf"
 
 def main(words: list[str]) -> int:
     """Compile the frequently used functions of service and agent, or those of the papers' filters
-    if `words` is ["papers"]. Use one process per core. Always return 0, because a function that
-    cannot be compiled now is compiled at its first use.
+    if `words` is ["papers"]. Use one process per core. Always return 0.
     """
     began = time.monotonic()
     papers = words == ["papers"]

@@ -263,8 +263,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 def moment(text: str, field: str) -> int:
     """Convert `text`, an ISO 8601 date with or without a time of day, to nanoseconds since 1970.
-    `field` is the name of the option or parameter, for the error message. A time without a zone is
-    UTC.
+    Errors name the parameter `field`. A time without a zone is UTC.
 
     Raises:
         InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.
@@ -312,7 +311,7 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
 
 def explain(error: ValidationError, where: str) -> InputError:
     """Convert the first validation error that pydantic reports to an InputError. It names the wrong
-    field, and asks the user to correct this field in `where`, the file or source of the values.
+    field, and asks for a correction in `where` (source of the values).
     """
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"

@@ -35,11 +35,9 @@ class Topic(NamedTuple):
         name: first chunk of the key after the root.
         zoom: zoom of the grid square in the key; None if the key has no grid square.
         named: True if the last chunk is a name (of a vehicle or a service).
-        message: name of the message type of the payload; None for a liveliness token (sign that a
-            process is alive), which has no payload.
+        message: type of the payload; None for a liveliness token (sign that a process is alive).
         priority: name of the Zenoh priority.
-        block: congestion control of Zenoh: when the link is overloaded, the sender waits (True) or
-            the message is dropped (False).
+        block: on an overloaded link, the sender waits (True) or the message is dropped (False).
         express: True to send at once, False to wait up to a millisecond for other messages in the
             same frame.
     """
@@ -174,8 +172,7 @@ class ServiceToken(NamedTuple):
     def key_under(self, root: str) -> str:
         """Return the key of a token (sign that a service is alive) whose first part is `root`
         instead of `gripmap/v1/serves`. The root CLAIMS means that the service serves or will soon
-        serve the region. The root WAITS means that it is a standby service, which waits to take
-        over the region.
+        serve the region. The root WAITS means that it is a standby service for the region.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
@@ -204,8 +201,8 @@ class Parsed(NamedTuple):
 
 
 def parse(key: str) -> Parsed:
-    """Parse a concrete key (without wildcards) into its topic, the number of its grid square, and
-    the name of its vehicle or service.
+    """Parse a concrete key (without wildcards) into topic, number of the grid square, and name of
+    the vehicle or service.
 
     Raises:
         InputError: the key has a wildcard, an unknown topic, a wrong number of chunks or digits, or

@@ -37,8 +37,7 @@ class Format(StrEnum):
 
     @property
     def encoding(self) -> str:
-        """Return the name of the Zenoh encoding with which an answer in this data format is sent.
-        """
+        """Return the name of the Zenoh encoding of an answer in this data format."""
         return {"arrow": wire.ARROW, "geojson": wire.GEOJSON, "json": wire.JSON}[self.value]
 
 

@@ -95,8 +95,7 @@ class Rank:
 
     def of(self, cell: int, sector: int) -> int:
         """Return the rank of a place (one cell and heading sector): the index of the place in the
-        sequence of places along the route. It is not a distance. A place off the route gets the
-        number of places on the route.
+        sequence of places along the route. Places off the route get the highest rank.
         """
         return self._place.get(cell * grid.SECTORS + sector, len(self._place))
 

@@ -56,8 +56,8 @@ _ARROW: Final = {
 
 
 def _make_field(column: message_columns.MessageColumn) -> Field:
-    """Return the table column in which the values of a message's column are stored: the same name,
-    unit and meaning, with an Arrow type.
+    """Return the table column for a message's column: the same name, unit and meaning, with an
+    Arrow type.
     """
     return Field(**column._asdict() | {"type": _ARROW[column.type]})
 
@@ -261,8 +261,8 @@ CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
 
 
 def stored_columns(*fields: Field) -> tuple[Field, ...]:
-    """Return the given columns with the types in which they are stored on disk. Times are stored in
-    microseconds instead of nanoseconds; other types stay the same.
+    """Return the given columns with the types in which they are stored on disk: times in
+    microseconds instead of nanoseconds, others unchanged.
     """
     return tuple(
         f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields

@@ -1,12 +1,11 @@
 """Vehicle files of common classes, for a car whose own parameters are unknown.
 
 The values are typical of production cars with one or two persons. Cornering stiffness is per wheel,
-at static load, relative to the angle of the rim. It includes the compliance of the steering, the
-compliance of the suspension bushes, and the effect of roll. Therefore the front axle is softer than
-the rear axle and every car understeers, by 20 to 35 mrad per g. Measured stiffnesses of six cars
-(Volvo S90, VW Golf, Ferrari 250LM and others) are 10 to 17 times the load per radian at the front
-axle and 15 to 25 times at the rear axle. Masses and dimensions follow manufacturers' data sheets of
-cars of each class.
+at static load, relative to the angle of the rim. It includes the compliance of steering and
+suspension bushes, and the effect of roll. Therefore the front axle is softer than the rear axle and
+every car understeers, by 20 to 35 mrad per g. For comparison, six measured cars (such as Volvo S90
+and VW Golf) have 10 to 17 times the load per radian at the front axle, and 15 to 25 times at the
+rear axle. Masses and dimensions follow manufacturers' data sheets of cars of each class.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ INERTIA_SHARE: Final = 0.97
 
 class Size(NamedTuple):
     """Dimensions of a vehicle class: mass [kg], distances of the axles from the centre of gravity
-    [m], track [m], height of the centre of gravity [m], wheel radius [m], and steering ratio (angle
-    of the steering wheel over that of the road wheels).
+    [m], track [m], height of the centre of gravity [m], wheel radius [m] and steering ratio.
 
     `drive_front` is the share of the driving torque at the front axle; None if the class has front,
     rear and all-wheel drive.

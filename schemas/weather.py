@@ -66,9 +66,9 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
 
 
 def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
-    """Return an error that names the first validation rule that a weather report violates; None if
-    the report is valid. `values` are the report's numbers by name, and `prior` is its friction
-    distribution (32,) or None.
+    """Return an error for the first rule that a weather report violates; None if the report is
+    valid. `values` are the report's numbers by name, `prior` its friction distribution (32,) or
+    None.
     """
     for name, (least, most) in RANGES.items():
         if not (np.isnan(values[name]) or least <= values[name] <= most):

@@ -1,9 +1,9 @@
 """Figures of the demo: the map compared with the true friction.
 
-The true values come from the simulator. For each visit (passage of a vehicle through a map cell)
-the simulator records the mean friction under the wheels, and the largest share of that friction
-that the vehicle used. A visit with a share of at least 0.6 is called *excited*, because only then
-can the friction be measured.
+The true values come from the simulator. For each visit (passage of a map cell) the simulator
+records the mean friction under the wheels, and the largest share of this friction that the vehicle
+used. A visit with a share of at least 0.6 is called *excited*, because only then can the friction
+be measured.
 """
 
 from __future__ import annotations
@@ -45,9 +45,8 @@ LOST: Final = 0.98  # share of the available grip at which a wheel counts as sli
 def demo_works(found: Sequence[Figure]) -> bool:
     """Return True if every figure of the demo with a mandatory target meets its target.
 
-    Some targets are not mandatory: those for the delay of alerts, the number of passes and the run
-    time, and a coverage above its target because intervals are too wide. Missing them is reported
-    but is no failure.
+    Targets for the delay of alerts, the number of passes and the run time are not mandatory. Too
+    wide intervals are no failure either.
     """
 
     def breaks_promise(figure: Figure) -> bool:
@@ -60,9 +59,9 @@ def demo_works(found: Sequence[Figure]) -> bool:
 
 @dataclass(frozen=True)
 class MapComparison:
-    """Table of the map's cells for which the true friction is known, one row per cell and heading
-    sector. `cells` is the table of the map's values, and `truth` (n,) the true friction of each row
-    at the end of the demo.
+    """Map cells for which the true friction is known, one row per cell and heading sector. `cells`
+    is the table of the map's values. `truth` (n,) is the true friction of each row at the end of
+    the demo.
     """
 
     cells: pa.Table
@@ -70,30 +69,30 @@ class MapComparison:
 
     @property
     def is_covered(self) -> BoolArray:
-        """Return a mask of the rows (map cells with a heading sector), (n,): True if the true
-        friction lies in the map's 90 % interval.
+        """Return a mask of the table's rows, (n,): True if the true friction lies in the map's 90 %
+        interval.
         """
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
     def has_several_vehicles(self) -> BoolArray:
-        """Return a mask of the rows (map cells with a heading sector), (n,): True if two or more
-        vehicles visited the cell in that direction.
+        """Return a mask of the table's rows, (n,): True if two or more vehicles visited the row's
+        cell.
         """
         return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
 
     @property
     def is_measured(self) -> BoolArray:
-        """Return a mask of the rows (map cells with a heading sector), (n,). It is True if the
-        map's value was measured, and False if vehicles reported only lower bounds.
+        """Return a mask of the table's rows, (n,): True if a vehicle measured the friction in the
+        row's cell, False if vehicles reported only lower bounds.
         """
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
     @property
     def values(self) -> FloatArray:
-        """Return the median friction according to the map, one value per row (map cell with a
-        heading sector), (n,). It is NaN where no vehicle measured the friction.
+        """Return the median friction according to the map, (n,), one value per row; NaN where no
+        vehicle measured the friction.
         """
         mu = self.cells["mu"].to_numpy()
         return np.where(self.is_measured, mu, np.nan)
@@ -101,8 +100,8 @@ class MapComparison:
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Return the true friction of each visited (cell, sector) at the end of the demo. It is the
-    mean over the visits (passages of a cell) after the road changed at `changed_ns` [ns], or over
-    all visits if no vehicle visited the cell after the change.
+    mean over the visits (passages of a cell) after the road changed at `changed_ns` [ns]. Without
+    such visits it is the mean over all visits.
     """
     keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
@@ -135,8 +134,8 @@ def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
 
 
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
-    """Join the map's cells with the true friction in `visits` by (cell, sector), and return the
-    joined table. It has one row per cell and heading sector for which the true friction is known.
+    """Join the map's cells with the true friction in `visits`; return one row per cell and heading
+    sector for which the true friction is known.
     """
     truth = final_truth(visits, changed_ns)
     found = np.array([truth.get(key, np.nan) for key in _cell_keys(cells)])
@@ -174,8 +173,8 @@ def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
     """Return a pair for each patch of ice: the grid numbers of the patch's cells, and the time [ns]
-    of the first alert for the patch. That time is NEVER if there was no alert. The mask `patch`
-    selects the visits to patches.
+    of the first alert for the patch. That time is NEVER without an alert. The mask `patch` selects
+    visits to patches.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
@@ -189,9 +188,8 @@ def known_patches(
 
 
 def count_passes(rows: pa.Table) -> int:
-    """Return the number of passes in `rows`, a table of visits. A visit is the passage of one
-    vehicle through one map cell. Successive visits of one vehicle, with little time between them,
-    are one pass.
+    """Return the number of passes in `rows`, a table of visits. A visit is a passage of one map
+    cell; successive visits of one vehicle shortly after each other are one pass.
     """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
@@ -267,8 +265,8 @@ class LostGrip:
     cell: IntArray
 
     def figures(self) -> list[Figure]:
-        """Return two figures for warned and two for unwarned drivers: the share of passes over new
-        ice in which grip was lost, and the number of passes.
+        """Return two figures each for warned and for unwarned drivers: the share of passes over new
+        ice that lost grip, and the number of passes.
         """
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         # Without passes there is no share.
@@ -284,8 +282,8 @@ class LostGrip:
         ]
 
     def line(self) -> str:
-        """Return one line of text with two statements, for warned and for unwarned drivers: in how
-        many passes over new ice grip was lost, and how many passes there were.
+        """Return one line of text that states, for warned and for unwarned drivers, how many of
+        their passes over new ice lost grip.
         """
         counts = [
             f"{int(self.lost[rows].sum())} of {int(rows.sum())}"
@@ -298,8 +296,8 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return a table of the passes of cars over new ice, in which each pass follows the first alert
-    for its patch of ice. `share` is the share of drivers that receive warnings.
+    """Return the passes of cars over new ice that took place after the first alert for the patch of
+    ice. Warnings reach the share `share` of the drivers.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)
@@ -335,8 +333,7 @@ def _vehicle_number(vehicle: str) -> int:
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
     """Return a mask of the visits (passages of a map cell), (visits,). It is True for visits after
-    the road changed at `changed_ns` [ns], if the true friction was clearly lower than in all visits
-    to the same cell before the change.
+    the time `changed_ns` [ns] with clearly less friction than all earlier visits to the same cell.
 
     Visits to cells that were slippery before the change, such as old snow, do not count.
     """
@@ -369,8 +366,8 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
 
 
 def archive_counts(archive: Path) -> tuple[int, int, int]:
-    """Return three numbers about the observations in the archive: rows, distinct rows (fewer if a
-    record was stored twice), and distinct vehicles.
+    """Return three counts of the observations in the archive: rows, distinct rows, and distinct
+    vehicles.
     """
     identity = ["vehicle", "boot", "region", "seq", "row"]
     tables = list(reading.read_tables(archive, Kind.OBSERVATION, identity))

@@ -72,8 +72,7 @@ class ManagedProcess:
                 tick()
 
     def stop(self) -> None:
-        """Send SIGTERM to this process of the demo; if the process does not end in time, kill it.
-        """
+        """Send SIGTERM to this process of the demo; kill it if it does not end in time."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -136,7 +135,7 @@ def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
 @contextmanager
 def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
     """Run the live page with the streets of the simulated town until the `with` block ends; yield
-    the page's address. A user of the page can draw the true friction over the map.
+    the page's address. The page can draw the true friction over the map.
     """
     metrics = service.line_with("ready").rpartition(", ")[2]
     tiles, roads = town.write_files(scenario_named(SCENARIO), folder)

@@ -83,8 +83,8 @@ def _centre_line(scenario: Scenario, road: Road) -> FloatArray:
 
 
 def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatArray:
-    """Return a smooth, irregular, closed outline, points (48, 2) [m]. `shape` is x and y of its
-    centre and its two radii [m]; `seed` determines its form.
+    """Return a smooth closed outline, points (48, 2) [m]. `shape` is x and y of its centre and its
+    two radii [m].
     """
     x, y, a, b = shape
     rng = np.random.default_rng(seed)
@@ -251,7 +251,7 @@ def _touches_tile(points: Sequence[tuple[int, int]]) -> bool:
 
 def _clip_line(points: list[tuple[int, int]]) -> Iterable[list[tuple[int, int]]]:
     """Yield those parts of a line (street of the town) that lie within a map tile or the margin
-    around it. Points are in coordinates of the tile.
+    around it.
     """
     part: list[tuple[int, int]] = []
     for first, second in itertools.pairwise(points):

@@ -85,8 +85,7 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
 
 
 def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
-    """Return the alert in a message that a fleet service published under the Zenoh key `key`; `now`
-    is the car's time [ns UTC].
+    """Return the alert in a message with the Zenoh key `key`; `now` is the car's time [ns UTC].
 
     Raises:
         WireError: the message is invalid.

@@ -51,8 +51,8 @@ class Horizon(NamedTuple):
         age_s: time since a vehicle last observed the place [s].
         basis: origin of the values, a constant of `local_map`: UNKNOWN, BOUND (only a lower bound),
             MEASURED or BORROWED (from neighbouring places).
-        slippery: True if the metre is slippery with enough certainty for a warning.
-        alerted: True if a fleet service's alert is active at that metre.
+        slippery: True if the metre justifies a warning of slipperiness.
+        alerted: True if an alert of the fleet service is active there.
         safe_speed: speed from which the car can take the bends and stop in time [m/s]; NaN where
             unknown.
     """
@@ -123,8 +123,7 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
 
 def justifies_warning(found: PlaceBelief) -> BoolArray:
     """Return a mask (n,) of the n places (one per map cell and heading sector) in `found`. It is
-    True if an alert is active, or if enough vehicles measured the place and it is probably
-    slippery.
+    True if an alert is active, or enough vehicles measured the place as slippery.
     """
     firm = (
         (found.basis == MEASURED)
@@ -135,14 +134,13 @@ def justifies_warning(found: PlaceBelief) -> BoolArray:
 
 
 def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
-    """Return the safe speed [m/s] at each metre (M,). At this speed a car can take the bends of the
-    given `curvature` [1/m] and stop within SIGHT_M metres, if the friction is `mu_lower`, the lower
-    end of its interval.
+    """Return the safe speed [m/s] at each metre (M,). At this speed a car can take bends of
+    `curvature` [1/m] and stop within SIGHT_M metres, if the friction is `mu_lower`, the lower end
+    of its interval.
 
-    Before a place with a lower safe speed, the result falls along the road with a comfortable
-    deceleration, or with a smaller deceleration if cornering leaves less grip for braking. Where
-    `mu_lower` is NaN (not measured), the result is NaN, except on the braking distance before a
-    slower place. There the assumed deceleration is at most that possible on an unknown road.
+    Before a slower place, the result falls with a comfortable deceleration, or with a smaller one
+    if cornering leaves less grip for braking. Where `mu_lower` is NaN (not measured), the result is
+    NaN, except on the braking distance before a slower place.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))
@@ -167,7 +165,7 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 def braking_from(horizon: Horizon) -> FloatArray:
     """Return, for each metre ahead, the energy per mass (M,) [m^2/s^2] that braking can remove
     between the car and that metre. It is half the square of the highest speed from which the car
-    can stop before that metre.
+    can stop there.
 
     The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road.
     The deceleration is limited to a comfortable one.

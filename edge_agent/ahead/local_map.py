@@ -2,9 +2,9 @@
 module is pure: no I/O, and time is an argument.
 
 A map tile contains four values per cell: lower end, median and upper end of μ, and P(slippery).
-From these four values this module reconstructs the belief, a probability distribution of the
-friction. The belief then fades towards the distribution of an unknown road, as in the fleet's map,
-because the probability that the road has changed grows with time.
+From these values this module reconstructs the belief, a probability distribution of the friction.
+With time, the road has more probably changed, so the belief fades to that of an unknown road, as in
+the fleet's map.
 """
 
 from __future__ import annotations
@@ -128,9 +128,8 @@ class LocalMap:
         return [alert for alert, _ in self._alerts.values()]
 
     def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
-        """Store the received cells of a map tile in the local map. Of each map cell and heading
-        sector, the values received last are kept. Values received more than HELD_S seconds before
-        `now` [ns UTC] are removed.
+        """Store the received cells of a map tile in the local map. Of each place, the map keeps the
+        values received last, unless they are HELD_S seconds old at `now` [ns UTC].
         """
         before = self._tiles.pop(tile, NOTHING)
         both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
@@ -142,8 +141,8 @@ class LocalMap:
             self._tiles.popitem(last=False)
 
     def store_alert(self, alert: Alert, now: int) -> bool:
-        """Store a received alert that a place became slippery, or remove the stored alert if the
-        received one reports its end. Return True if this changes the set of active alerts.
+        """Store a received alert, or remove the stored alert if the received one reports its end.
+        Return True if this changes the set of active alerts.
         """
         key = alert.cell * grid.SECTORS + alert.sector
         before = self._alerts.get(key)
@@ -188,8 +187,8 @@ class LocalMap:
         """Return the current values of n places, given by their keys (cell·4 + sector), `key` (n,).
 
         Ice and water usually cover the lanes of both directions. Therefore an alert for the
-        opposite driving direction in the same cell also counts, unless a vehicle has later measured
-        better friction in the place's own direction.
+        opposite driving direction also counts, unless a vehicle has later measured better friction
+        at the place itself.
         """
         belief, basis, last, at, vehicles = self._look_up(key)
         alerted = np.zeros(len(key), np.bool_)
@@ -264,9 +263,9 @@ class LocalMap:
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
         """Return arrays for n places (one per map cell and heading sector), given by their keys
-        `key` (n,). The arrays are the belief (probabilities of friction, (n, 32)) and four arrays
-        (n,): basis (origin of the values), time of the last observation [ns], time of receipt [ns],
-        and number of observing vehicles.
+        `key` (n,). They are the belief (probabilities of friction, (n, 32)) and, (n,) each: basis
+        (origin of the values), times of the last observation and of receipt [ns], and number of
+        vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

@@ -53,9 +53,8 @@ class _Watcher:
 
 @dataclass
 class LookoutCounts:
-    """Counters of the lookout (thread that looks up the map ahead): number of look-ups, warnings
-    and failed look-ups, and processor time [s]. `subscribers` are the map receivers of the
-    vehicles, by name.
+    """Counters of the lookout (thread that looks up the map ahead): look-ups, warnings, failed
+    look-ups and processor time [s]. `subscribers` are the vehicles' map receivers by name.
     """
 
     looks: int = 0
@@ -65,8 +64,7 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum, over all vehicles, of the map receiver's counter with the name `what`,
-        such as "bytes".
+        """Return the sum over all vehicles of their map receivers' counter `what`, such as "bytes".
         """
         return sum(one.counts[what] for one in self.subscribers.values())
 
@@ -93,14 +91,13 @@ class Lookout:
 
     Args:
         names: names of the vehicles; vehicle k below has the name with index k.
-        hear: function that the lookout's thread calls for each warning, with the vehicle's name and
-            the warning.
+        hear: function that the thread calls with the vehicle's name and each warning.
         route_of: function that returns the route that the user gave for vehicle k, or None to
             follow the roads visible in the map.
-        listening: function that returns True for vehicle k if the lookout must serve this vehicle;
-            by default it serves all vehicles.
-        on_horizons: function that is called after each look-up, with the vehicle's name, its
-            horizons (map values along each possible path) and its pose.
+        listening: function that returns True if the lookout must serve vehicle k; by default it
+            serves all.
+        on_horizons: function called after each look-up with the vehicle's name, its horizons (map
+            values along each possible path) and its pose.
     """
 
     def __init__(
@@ -152,9 +149,8 @@ class Lookout:
 
         Args:
             places: (N,) current place (cell·4 + sector) of each vehicle, -1 where unknown.
-            beliefs: result of `EstimatorBank.beliefs`: the filters' own beliefs, and the
-                likelihoods of the measurements in the current visits (passages of a place). None
-                for an estimator without beliefs.
+            beliefs: result of `EstimatorBank.beliefs`: beliefs of the filters, and likelihoods of
+                their measurements in the current place; None for an estimator without beliefs.
         """
         if beliefs is None:
             return

@@ -96,8 +96,8 @@ class MapSubscriber:
         """Subscribe to alerts and send map queries along the possible paths, the most likely path
         first. The call does not wait for an answer.
 
-        The subscriptions cover the first `within` metres of the paths. When these metres contain an
-        area that was not requested recently, the queries cover the paths to their ends.
+        The subscriptions cover the first `within` metres of the paths. If a part of these metres
+        was not requested recently, the queries cover the paths to their ends.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

@@ -95,8 +95,7 @@ def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
     """Return east and north coordinates [m], relative to the car, of points given by latitude and
-    longitude [deg]. Both results have the shape of `latitude`. Within a kilometre of the car the
-    error is below a centimetre.
+    longitude [deg], in their shape. Within a kilometre the error is below a centimetre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (
@@ -115,8 +114,8 @@ def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, Fl
 def path_along(
     kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None
 ) -> Path:
-    """Return the path of the given kind along a line that begins at the car; it is at most `length`
-    [m] long. The line has n points (n, 2) [m], east and north of the car.
+    """Return the path, at most `length` [m] long, along a line that begins at the car. The line has
+    n points (n, 2) [m], east and north of the car.
 
     `first` (n,) are the keys of map places (cell·4 + sector) at the line's points, if the caller
     knows them. The path then lists them before the keys computed from the positions.
@@ -179,8 +178,8 @@ class GivenRoute:
         """Return the distance [m] from the start of the route to the route point that best fits the
         car's position and heading. Points shortly after the previously matched point are preferred.
 
-        `line` (n, 2) are the route's points [m] relative to the car, and `run` (n,) their distances
-        along the route [m]. Return None if no point fits.
+        `line` (n, 2) are the route's points relative to the car, `run` (n,) their distances along
+        it [m]. Return None if no point fits.
         """
         step = np.diff(line, axis=0)
         start = line[:-1]

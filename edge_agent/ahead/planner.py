@@ -93,9 +93,8 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Speed limit with hysteresis, which is sent to the motion planner. It decreases as soon as the
-    computed limit falls, and increases only after the computed limit has been higher for HOLD_S
-    seconds.
+    """Speed limit for the motion planner, with hysteresis. It follows a fall of the computed limit
+    at once, but rises only after the computed limit has been higher for HOLD_S seconds.
     """
 
     def __init__(self) -> None:

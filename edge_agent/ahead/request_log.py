@@ -2,9 +2,9 @@
 needs megabytes and not gigabytes. The module is pure (no I/O).
 
 Each second, the fleet service publishes every changed map tile completely: about 50 kB in a busy
-town. A car needs only the part of a tile along its path, and not every second. It needs news of ice
+town. A car needs only the part along its path, and not every second, but it needs alerts
 immediately. Therefore the car requests narrow boxes along its path, and subscribes to the alerts of
-the tiles on it.
+the tiles there.
 """
 
 from __future__ import annotations
@@ -140,9 +140,8 @@ def _in_order(tiles: IntArray) -> list[int]:
 
 
 def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
-    """Split a path ahead into parts, so that a narrow box can be requested around each part. Return
-    a pair (first metre, last metre) per part. Together the parts contain all points where the mask
-    `wanted` is True.
+    """Split a path ahead into parts with small bounding boxes. Return a pair (first metre, last
+    metre) per part. Together the parts contain all points where the mask `wanted` is True.
     """
     found: list[tuple[int, int]] = []
     first = last = -1

@@ -85,7 +85,7 @@ class _Neighbours:
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
         """Return the keys (cell·4 + sector) of the places that may follow the position `here` [m]
         on a road, for a vehicle with the `heading` [rad]. They lie at most `cells` cell widths
-        away. The most likely place is first; each road that forks off gives at most one place.
+        away, the most likely first, at most one per road of a fork.
         """
         reach = cells * self.side
         found = []
@@ -137,9 +137,8 @@ def _follow_way(
 
 
 def _heading_of_way(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Return the mean heading [rad] over the last three steps from place to place on a road. The
-    mean is used because the cell centres along an oblique road zigzag, so that a single step has a
-    wrong heading.
+    """Return the mean heading [rad] over the last three steps from place to place on a road. A
+    single step would mislead, because the cell centres along an oblique road zigzag.
     """
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx = last[-1][0] - last[0][0]

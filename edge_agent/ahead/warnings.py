@@ -39,9 +39,8 @@ SLOWEST: Final = 0.5  # [m/s] at lower speeds a warning contains no time to the 
 
 @dataclass(frozen=True)
 class Active:
-    """Current warning about a slippery stretch: the warning as last reported to the driver, the
-    keys (cell·4 + sector) of the stretch's places, and the time [ns UTC] and distance [m] at which
-    the stretch was last seen ahead.
+    """Current warning about a slippery stretch of road: the warning as last reported, the stretch's
+    places (cell·4 + sector), time [ns UTC] and distance [m] when it was last ahead.
     """
 
     warning: GripWarning
@@ -65,8 +64,7 @@ def update_warnings(
     active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
     """Update the active warnings from new horizons (values of the map for each metre ahead). Return
-    the active warnings after the update, and the messages to report now about warnings that were
-    raised, updated or ended.
+    the active warnings after the update, and the warnings to report now (raised, updated or ended).
 
     Args:
         active: active warnings before the update.

@@ -127,8 +127,7 @@ class Agent:
         """Process blocks of samples in real time until the source ends, the duration has passed or
         a signal (SIGTERM, Ctrl-C) arrives; then shut down.
 
-        Before returning 0, print one line with the numbers of processed blocks and published
-        records.
+        Print one line with the counts of blocks and records, and return 0.
         """
         config = self.options.config
         log_as(config.log, sys.stderr)

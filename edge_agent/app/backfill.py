@@ -1,8 +1,8 @@
 """Estimation of many recorded drives in parallel, in processes of this machine or on Spark.
 
 On one machine the main process loads the compiled code, and the worker processes forked from it
-share this memory. Whether run by local processes or by Spark, each drive is estimated by the same
-function, so the written files are equal byte by byte.
+share this memory. Local processes and Spark run the same function for each drive and write the same
+bytes.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def vehicle_file_of(log: Path) -> Path:
 def estimate_drives(
     tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
 ) -> Iterator[Outcome]:
-    """Estimate all recorded drives in `jobs` parallel processes. Yield the outcome of each drive
-    (number of samples, or error) as soon as it is available.
+    """Estimate all recorded drives in `jobs` parallel processes. Yield each drive's outcome as soon
+    as it is available.
 
     A drive that fails does not stop the others. After Ctrl-C no further drive begins.
 
@@ -124,7 +124,7 @@ def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
     """Let an estimator process one sample that has no readings. This compiles or loads the
     estimator's kernels (compiled functions), so that processes forked afterwards share them. Do
     nothing for an estimator of another installed package, because each process loads such an
-    estimator itself. Ignore errors here: the later estimation of each drive reports them.
+    estimator itself. Ignore errors, because the later estimation of each drive reports them.
     """
     if estimator not in ESTIMATORS:
         return
@@ -134,9 +134,9 @@ def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
 
 
 def _fork_processes(count: int) -> ProcessPoolExecutor:
-    """Return a pool for `count` worker processes; no worker is started yet. On Linux, workers are
-    forked from this process. Elsewhere they start as new processes, because system libraries of
-    other operating systems do not support a fork.
+    """Return a pool for `count` worker processes; no worker is started yet. Only on Linux are
+    workers forked from this process, because system libraries of other operating systems do not
+    support a fork.
     """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -155,9 +155,9 @@ def _submit_drives(
     Submitting starts the processes. SIGINT (Ctrl-C) is blocked until each process has installed its
     own handler.
 
-    Python warns if a process with several threads is forked, because a lock that another thread
-    holds stays locked in the new process. This warning is suppressed: the libraries whose threads
-    run here (OpenBLAS, Arrow) handle a fork correctly.
+    Python warns if a process with several threads is forked, because a lock of another thread stays
+    locked in the new process. This warning is suppressed, because the libraries with threads
+    (OpenBLAS, Arrow) handle a fork correctly.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -237,9 +237,8 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write its estimates to a temporary file, which then gets its final
-    name. The final file is therefore complete even if another process estimates the same drive at
-    the same time. Return the outcome.
+    """Estimate one drive and write its estimates to a temporary file, which gets its final name
+    when it is complete, even if another process estimates the same drive.
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:

@@ -101,9 +101,8 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
 def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the curve of one estimated quantity as four arrays (n,): times [s], values, and lower
-    and upper ends of the 90 % interval. Values and ends are in the plot's unit. The ends are NaN
-    for a quantity without interval.
+    """Return the curve of one estimated quantity as four arrays (n,): times [s], values, lower and
+    upper ends of the interval, in the plot's unit. The ends are NaN without interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:
@@ -120,8 +119,7 @@ def curve_of(
 
 def thin_parts(count: int) -> list[slice]:
     """Divide the `count` samples of a curve into consecutive slices, at most MOST_POINTS, and
-    return the slices. The plot shows one point per slice, so a long drive does not make a large
-    file.
+    return the slices. The plot shows one point per slice.
     """
     step = max(1, math.ceil(count / MOST_POINTS))
     return [slice(k, min(k + step, count)) for k in range(0, count, step)]
@@ -173,8 +171,8 @@ def _plot_of(drive: RecordedDrive, panel: Panel) -> dict[str, Any]:
 
 
 def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
-    """Return a dictionary per health flag that the first estimator reported: the flag's name, and
-    the time spans [s] in which the flag was set.
+    """Return, for each health flag that the first estimator reported, a dictionary with the flag's
+    name and the time spans [s].
     """
     table = next(iter(drive.estimates.values()))
     t = table["t"].to_numpy()
@@ -190,9 +188,9 @@ def _health_spans(drive: RecordedDrive) -> list[dict[str, Any]]:
 
 
 def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
-    """Return the track of a recorded drive: x and y [m from the mean position], time [s], and a
-    colour that shows the friction estimated by the first estimator. The colour is None where the
-    estimate is too uncertain.
+    """Return the track of a recorded drive: x and y [m from the mean position], time [s], and the
+    colour of the first estimator's friction. The colour is None where the estimate is too
+    uncertain.
 
     Return None if the log has fewer than two positions.
     """

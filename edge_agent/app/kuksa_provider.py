@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 
 def surface_condition(signals: Mapping[str, float]) -> str:
-    """Return the word for the signal RoadSurfaceCondition. It is "ICE" if the upper friction bound
-    in `signals` is low, "DRY" if the lower bound is high, and "UNKNOWN" otherwise.
+    """Return the value of RoadSurfaceCondition: "ICE" if the upper friction bound in `signals` is
+    low, "DRY" if the lower bound is high, else "UNKNOWN".
     """
     if signals.get(f"{BRANCH}.UpperBound", 100.0) < ICE_BELOW:
         return "ICE"
@@ -119,8 +119,8 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write one value to the databroker at the VSS path `path`. Return False if the broker is
-        unavailable, and True even if the broker rejects the value.
+        """Write one value to the databroker at the VSS path `path`. Return False only if the broker
+        is unavailable.
         """
         messages = self._connection.messages
         point = messages.Datapoint(value=value)

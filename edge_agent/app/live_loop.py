@@ -54,7 +54,7 @@ class LoopOptions(NamedTuple):
     Attributes:
         on_status: function that receives the progress every STATUS_EVERY_S seconds.
         duration_s: time after which the loop ends [s].
-        clock: function that returns the time of a monotonic clock [s].
+        clock: returns the time of a monotonic clock [s].
         is_admitted: function that returns True if the records of a block may be published; records
             that may not be published are only counted.
         after: function that the loop calls after each block of samples.
@@ -137,9 +137,9 @@ def _offer_if_admitted(
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
-    """Return the numbers that the agent prints at its end, by name. They are the counts of all
-    records by result, the counts of observations (one kind of record) by result, the counts of
-    blocks of samples, and the largest delay of the loop [s].
+    """Return the numbers that the agent prints at its end, by name. They are counts of records and
+    of observations (one kind of record) by result, counts of blocks of samples, and the largest
+    delay of the loop [s].
     """
     counts = publisher.counts
     seen = Kind.OBSERVATION

@@ -64,8 +64,8 @@ def _load_library(path: Path) -> bool:
 
 def build_agent_library(path: Path) -> None:
     """Build the agent's shared library `path`. The library contains the kernels (compiled
-    functions) that a pipeline with one vehicle calls in two situations: when it processes a sample,
-    and when its friction beliefs (probabilities) are read.
+    functions) that a pipeline with one vehicle calls to process a sample and to return its friction
+    beliefs.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.

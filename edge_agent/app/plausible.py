@@ -32,9 +32,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the grip in use, (T,) [1]: the horizontal acceleration divided by g, smoothed over
     SMOOTHED_S seconds. A missing reading counts as 0.
 
-    The plausibility check does not use the estimate `mu_utilised`, which is the largest grip used
-    in the last second. Just after the road has become slippery, that maximum may exceed the
-    available grip.
+    The estimate `mu_utilised` is not suitable here. It is the maximum of the last second, and just
+    after the road has become slippery it may exceed the available grip.
     """
     used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
     step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
@@ -44,8 +43,8 @@ def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 
 @dataclass
 class Plausibility:
-    """Counts and errors summed over the samples of one recorded drive, from which this class judges
-    the plausibility of the drive's estimates.
+    """Counts and errors of the samples of one recorded drive, from which this class judges the
+    plausibility of the estimates.
     """
 
     radius: float
@@ -87,8 +86,8 @@ class Plausibility:
 
     @property
     def median_speed_error(self) -> float:
-        """Return the median relative difference [1] between the estimated forward speed v_x and the
-        speed of the wheels; 0 if the car never moved fast enough for a comparison.
+        """Return the median relative difference [1] between the estimated forward speed and the
+        wheels' speed; 0 if the car never drove fast enough.
         """
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0

@@ -37,8 +37,8 @@ def open_publisher(
     `on_open(name, session)` is called with each vehicle's name and its opened Zenoh session.
 
     Raises:
-        InputError: Zenoh rejects its settings, or the outbox is used by another process or cannot
-            be written.
+        InputError: Zenoh rejects its settings, or the outbox is in use by another process or
+            unusable.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.publish.outbox import Outbox

@@ -53,7 +53,7 @@ class SignalWatch:
     wheel speed, and a wheel speed above standstill.
 
     Args:
-        clock: function that returns the time of a monotonic clock [s].
+        clock: returns the time of a monotonic clock [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -94,8 +94,8 @@ class SignalWatch:
 def reasons_not_publishing(
     watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
 ) -> list[str]:
-    """Return the reasons why nothing is published, as sentences for the user: first problems of the
-    signals, then of the network. The list is empty if records can be published.
+    """Return the reasons why nothing is published, as sentences for the user. The list is empty if
+    records can be published.
 
     Args:
         watch: observer of the blocks of samples that the source has delivered.
@@ -137,13 +137,13 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Printer of the reasons why an agent publishes nothing. It determines the reasons first after
-    FIRST_S seconds and then every EVERY_S seconds, and prints them only if they have changed.
+    """Printer of the reasons why an agent publishes nothing. It checks them first after FIRST_S
+    seconds and then every EVERY_S seconds, and prints them only if they have changed.
 
     Args:
-        find: function that returns the present reasons.
-        say: function that prints a line.
-        clock: function that returns the time of a monotonic clock [s].
+        find: returns the present reasons.
+        say: prints a line.
+        clock: returns the time of a monotonic clock [s].
     """
 
     def __init__(

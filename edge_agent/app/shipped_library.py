@@ -37,9 +37,9 @@ def read_processor_features() -> set[str]:
 
 
 def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
-    """Return the path of the fastest library in `folder` that was built from the present source
-    files and runs on a processor with these `features`. If the folder has only unsuitable
-    libraries, print the reason. Return None if no library is suitable.
+    """Return the path of the fastest library in `folder` for the present source files and a
+    processor with these `features`; None if none is suitable. Report the reason if the folder
+    contains only unsuitable libraries.
     """
     libraries = set(folder.glob("*.so"))
     sources = describe_sources("edge_agent")

@@ -1,6 +1,6 @@
 """Live trip of a car: the signal doctor (automatic check of the signals) verifies the signals, and
-a calibration is learned from them. The doctor's verdict and the learned calibration are stored in a
-file next to the outbox (file of unsent records).
+a calibration is learned from them. Both results are stored next to the outbox (file of unsent
+records).
 
 Nothing is published until the doctor has found the signals free of faults, in this trip or in an
 earlier trip with the same vehicle file and profile. A trip is examined in sections of PART_S
@@ -109,8 +109,8 @@ class Trip:
         """Yield the blocks of samples of a source after correction of the known sensor errors. The
         uncorrected blocks are stored for the signal doctor (automatic check of the signals).
 
-        The function `ground` returns the speed over ground (T,) [m/s], for example from a satellite
-        receiver, at the samples of the last block.
+        The function `ground` returns the speed over ground (T,) [m/s] at the samples of the last
+        block.
         """
         if not self.is_admitted():
             log.info(
@@ -131,9 +131,7 @@ class Trip:
         self._start_examination(final=True)
 
     def close(self) -> None:
-        """Wait at most LEAVE_S seconds for the running examination of the signals (search for
-        sensor faults) to end.
-        """
+        """Wait at most LEAVE_S seconds for the running examination of the signals to end."""
         if self._looking is not None:
             try:
                 self._looking.result(LEAVE_S)
@@ -153,9 +151,8 @@ class Trip:
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
-        """Start, on another thread, an examination of the signals (search for sensor faults) in the
-        current section of the trip. If `final` is True, the current section ends and the next
-        section begins.
+        """Start, on another thread, an examination of the current section of the trip for faulty
+        signals. If `final` is True, the current section ends and the next section begins.
         """
         if not self._blocks:
             return

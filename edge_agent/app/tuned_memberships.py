@@ -70,8 +70,8 @@ class SplitScores(Record):
 
 
 class Budget(Record):
-    """Effort of the searches for fuzzy sets: number of ants (candidates per iteration) and of
-    iterations, and, by search, the number of evaluated parameter vectors.
+    """Limits of the searches for fuzzy sets: ants, iterations, and the number of parameter vectors
+    that each search evaluated.
     """
 
     ants: Count
@@ -121,8 +121,7 @@ class Tuned:
 
 
 def parse_tuned(text: str | bytes, where: str) -> Tuned:
-    """Return the tuned memberships (fuzzy sets) in the JSON text of a document. `where` names the
-    document in error messages.
+    """Return the tuned memberships (fuzzy sets) in a document. Errors name its origin `where`.
 
     Raises:
         InputError: a field is missing, unknown, not a finite number, or a vertex (corner of a fuzzy

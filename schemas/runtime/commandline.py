@@ -107,9 +107,7 @@ def add_command(
 
 
 def wants_quiet(arguments: Sequence[str]) -> bool:
-    """Return True if an unparsed command line contains `-q` or `--quiet`, by which the user
-    suppresses all messages except errors.
-    """
+    """Return True if an unparsed command line contains `-q` or `--quiet` (print only errors)."""
     return not {"-q", "--quiet"}.isdisjoint(arguments)
 
 
@@ -170,8 +168,8 @@ def run_guarded(run: Callable[[], int]) -> int:
 
 
 def out_folder(field: str, path: Path) -> Path:
-    """Check that `path` can be the path of an output file, and return the path. A command calls
-    this before it computes anything. `field` is the name of the option, for the error message.
+    """Check that a file can be written at `path`, and return the path. A command calls this before
+    it computes anything. Errors name the option `field`.
 
     Raises:
         InputError: the path is a folder, or its parent folder does not exist.
@@ -203,9 +201,8 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
-    """Return the ending of a file name, which selects the file format. If the name ends with
-    several of the `known` endings, return the longest. `field` is the name of the option, for the
-    error message.
+    """Return the ending of a file name, which selects the file format. If several of the `known`
+    endings match, return the longest. Errors name the option `field`.
 
     Raises:
         InputError: the ending is unknown.

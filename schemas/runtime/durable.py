@@ -64,8 +64,8 @@ def own_drafts(folder: Path) -> Iterator[Path]:
     """Provide a temporary folder within `folder` for drafts (unfinished files) that the caller
     renames when they are complete.
 
-    Two concurrent attempts to write one file, on one or two machines, write different drafts.
-    `sweep_drafts` removes the drafts of a killed attempt.
+    Two concurrent attempts to write one file thus write different drafts. `sweep_drafts` removes
+    the drafts of a killed attempt.
     """
     with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
         yield Path(drafts)

@@ -25,10 +25,10 @@ class Figure:
 
     Attributes:
         name, value, unit: name of the measured quantity, measured value, and its unit.
-        bar: target for the value: an upper or lower limit, or a pair of limits if `better` is
-            "within"; None if there is no target.
-        better: "less" if the value must not exceed the limit, "more" if it must not be below the
-            limit, "within" if it must lie between both limits.
+        bar: target: a limit for the value, or two limits if `better` is "within"; None without
+            target.
+        better: "less" if the value must not exceed the limit, "more" if it must reach the limit,
+            "within" if it must lie between two limits.
     """
 
     name: str
@@ -50,8 +50,8 @@ class Figure:
 
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
-    """Return the header of a file of figures. It states the conditions of the measurement: commit
-    of the source, machine, versions of packages, seeds of the random numbers, and date.
+    """Return the header of a file of figures, with the conditions of the measurement: commit,
+    machine, versions of packages, random seeds and date.
     """
     return {
         "campaign": campaign,
@@ -110,8 +110,8 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 
 def row(figure: Figure) -> list[str]:
-    """Return the four cells of a table row for a figure: name, value with unit, target, and "holds"
-    or "DOES NOT HOLD". The last two are empty if the figure has no target.
+    """Return the four table cells of a figure: name, value with unit, target, and "holds" or "DOES
+    NOT HOLD".
     """
     signs = {"less": "≤ ", "more": "≥ "}
     bar = figure.bar

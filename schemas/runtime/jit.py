@@ -178,8 +178,8 @@ def list_processor_lines() -> list[str]:
 
 
 def kernel_cache(package: str) -> str:
-    """Return the folder in the user's cache for a package's compiled functions. Its name contains a
-    digest of the sources, so folders of older sources may be deleted at any time.
+    """Return the folder in the user's cache for a package's compiled functions. Folders of older
+    sources may be deleted at any time.
     """
     return str((cache_root() or Path()) / describe_sources(package))
 

@@ -46,9 +46,9 @@ class LanesType(types.Type):
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
     def unify(self, typingctx: Any, other: Any) -> LanesType | None:
-        """Return the type of a variable that holds a vector in one branch of compiled code and a
-        value of the type `other` in another branch. This is the vector type if `other` is the type
-        of a single number, else None (no common type).
+        """Return the type of a variable that holds a vector in one branch of the code and a value
+        of type `other` in another. This is the vector type if `other` is a number's type, else
+        None.
         """
         return self if isinstance(other, types.Float | types.Integer) else None
 
@@ -99,16 +99,16 @@ def spread_value(builder: Any, value: Any, vector: Any) -> Any:
 @lower_cast(types.Float, LanesType)
 @lower_cast(types.Integer, LanesType)
 def cast_number(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Generate code that converts a single number `value` to a vector: the number is copied into
-    all lanes of a new vector. Return the LLVM value of this vector.
+    """Generate code that copies the number `value` into all lanes of a new vector; return the LLVM
+    value of this vector.
     """
     return spread_value(builder, context.cast(builder, value, given, types.float64), VECTOR)
 
 
 @lower_cast(types.Boolean, MaskType)
 def cast_truth(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
-    """Generate code that converts a single truth value `value` to a mask: the truth value is copied
-    into all lanes of a new mask. Return the LLVM value of this mask.
+    """Generate code that copies the truth value `value` into all lanes of a new mask; return the
+    LLVM value of this mask.
     """
     return spread_value(builder, cgutils.as_bool_bit(builder, value), BIT_VECTOR)
 
@@ -127,9 +127,9 @@ def call_llvm(builder: Any, name: str, *args: Any) -> Any:
 
 
 def choose_lanes(builder: Any, sign: str, a: Any, b: Any) -> Any:
-    """Generate code that chooses between two vectors lane by lane. A lane of the result has the
-    number of `a` where the comparison `a sign b` holds (`sign` is for example "<"), else the number
-    of `b`. NaN in either vector selects `b`.
+    """Generate code that chooses between two vectors lane by lane. The result has the number of `a`
+    where `a sign b` holds (`sign` is for example "<"), else that of `b`. NaN in either vector
+    selects `b`.
     """
     return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
@@ -212,8 +212,8 @@ _register_comparisons()
 def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
     """Generate code that computes the address of one vector (LANES numbers) in an array; return
     this pointer. The array and the place are the first two arguments of an intrinsic with the
-    signature `sig`. The place of the vector is an index, or a tuple with one index for each axis
-    except the last (the lanes).
+    signature `sig`. The place is an index, or a tuple with one index for each axis except the last
+    (the lanes).
     """
     kind = sig.args[0]
     held = target.make_array(kind)(target, builder, values[0])
@@ -268,9 +268,9 @@ def type_select(context: Any, where: Any, first: Any, other: Any) -> Any:
 
 
 def _reduce(combine: Callable[[Any, Any, Any], Any]) -> Any:
-    """Return a code generator that reduces a vector to one number. The generated code halves the
-    vector again and again: `combine` joins its lower and upper half lane by lane, until one number
-    is left. The order of the operations is therefore always the same.
+    """Return a code generator that reduces a vector to one number. In the generated code, `combine`
+    joins the lower and upper half of the vector lane by lane, again and again, until one number is
+    left. The order of the operations is therefore fixed.
     """
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
@@ -322,8 +322,7 @@ def type_any(context: Any, mask: Any) -> Any:
 
 def type_gather(context: Any, table: Any, cell: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `gather`, which returns a vector
-    of table values. Each lane of the vector `cell` has the index of the value that is read from
-    `table`.
+    of values read from `table`. Each lane of the vector `cell` is the index of one value.
     """
     number = LANES_TYPE if isinstance(cell, LanesType) else types.float64
 
@@ -351,9 +350,8 @@ def _constant(long: Any, value: int) -> Any:
 
 def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> Any:
     """Return the signature and the code generator of an intrinsic with one argument, a single
-    number or a vector. `build` generates the code. It receives the LLVM builder, the argument, the
-    LLVM type of the argument, and the LLVM type of an integer or of a vector of integers with as
-    many lanes.
+    number or a vector. `build` generates the code from the LLVM builder, the argument, its LLVM
+    type, and the LLVM type of an integer or of a vector of integers.
     """
     wide = isinstance(value, LanesType)
     number = LANES_TYPE if wide else types.float64
@@ -374,8 +372,8 @@ def type_floor(context: Any, value: Any) -> Any:
 
 def type_guess(context: Any, value: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `guess_inverse`, a first
-    approximation of 1/x. The bits of the result, read as an integer, are a constant minus the bits
-    of x. This changes the sign of the binary exponent, as 1/x does.
+    approximation of 1/x. The bits of the result are a constant minus the bits of x, which changes
+    the sign of the binary exponent.
     """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:
@@ -387,8 +385,8 @@ def type_guess(context: Any, value: Any) -> Any:
 
 def type_root_guess(context: Any, value: Any) -> Any:
     """Return the signature and the code generator of the intrinsic `guess_inverse_root`, a first
-    approximation of 1/sqrt(x). The bits of the result, read as an integer, are a constant minus
-    half the bits of x. This halves the binary exponent and changes its sign, as 1/sqrt(x) does.
+    approximation of 1/sqrt(x). The bits of the result are a constant minus half the bits of x,
+    which halves the binary exponent and changes its sign.
     """
 
     def build_code(builder: Any, x: Any, double: Any, long: Any) -> Any:

@@ -1,11 +1,10 @@
 """Vectors of numbers in one processor register ("lanes") for compiled functions.
 
-A filter bank runs the same arithmetic for many hypotheses. In a vector of LANES numbers, one per
-hypothesis, one machine instruction serves all of them (structure of arrays). In compiled code such
-a vector comes from `lanes_at` and behaves like a float. Operators, `abs`, `min`, `max` and
-`math.sqrt` work on each lane separately, and a float is copied into all lanes. Therefore the same
-source code works for single numbers and for vectors, and type checkers treat vectors as floats. A
-comparison gives a mask; `select` replaces a branch.
+A filter bank runs the same arithmetic for many hypotheses. With a vector of LANES numbers, one per
+hypothesis, one machine instruction serves all of them. In compiled code such a vector comes from
+`lanes_at` and behaves like a float. Operators, `abs`, `min`, `max` and `math.sqrt` work on each
+lane separately, and a float is copied into all lanes. Therefore the same source code works for
+single numbers and for vectors. A comparison gives a mask; `select` replaces a branch.
 
 Multiplication and addition of vectors are fused where the processor can do so. No other part of
 fast-math is allowed: NaN and infinity keep their meaning, and sums keep their order

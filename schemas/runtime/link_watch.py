@@ -1,8 +1,8 @@
 """Connections of a Zenoh session: the connected router, the transport, and the number of changes.
 
-Zenoh reports each transport (session with a router) and each link (network connection) that opens
-or closes. A `LinkWatch` stores the open links and the counts. Thus a program notices a lost
-connection at once, and not only when answers are missing.
+Zenoh reports each transport (session with a router) and link (network connection) that opens or
+closes. A `LinkWatch` stores the open ones and counts them, so that a program notices a lost
+connection at once.
 """
 
 from __future__ import annotations

@@ -57,9 +57,7 @@ class CallRecorder(Library):
         self.calls: dict[str, tuple[NativeKernel, tuple[Any, ...]]] = {}
 
     def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> int:
-        """Record the call of a kernel, with the types of its arguments, instead of running it.
-        Return 0 in place of the kernel's result.
-        """
+        """Record a call of a kernel instead of running it, and return 0 in place of its result."""
         symbol = symbol_of(kernel.name, describe_type(arguments, []))
         self.calls.setdefault(symbol, (kernel, arguments))
         return 0
@@ -170,9 +168,9 @@ class _Adapter:
         return name
 
     def _expression(self, value: Any) -> str:
-        """Return the source text of an expression that builds one argument of the kernel from the
-        next unused 64-bit words of the row. `value` is an example of the argument. The words have
-        the order in which `describe_type` appends them.
+        """Return the source text of an expression that builds one argument of the kernel, of the
+        type of `value`, from the next unused words. The words have the order in which
+        `describe_type` appends them.
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))
@@ -246,8 +244,8 @@ def _emit_object(whole: Any, symbols: list[str], numba_codegen: Any) -> bytes:
 
 
 def _empty_definition(declaration: str) -> str:
-    """Return the LLVM text of a function that does nothing and returns zero. It has the name and
-    the types of the function in `declaration`, an LLVM declaration.
+    """Return the LLVM text of a function that does nothing and returns zero. `declaration` is the
+    function's LLVM declaration.
     """
     line = next(one for one in declaration.splitlines() if one.startswith("declare"))
     line = re.sub(r"\s#\d+$", "", line.rstrip())

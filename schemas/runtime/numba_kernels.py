@@ -81,13 +81,12 @@ def make_kernel(
 
 class _Cache(FunctionCache):
     """Numba's cache of compiled functions with two changes: a full disk raises no error, and the
-    key of a closure (function that encloses variables) is the same in every process.
+    key of a closure is the same in each process.
     """
 
     def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 Numba has no types
-        """Return the key under which a function's compiled code is cached. For a closure (function
-        that encloses variables), the key contains the names of the enclosed objects, because
-        Numba's own key for a closure differs in each process.
+        """Return the key under which a function's compiled code is cached. For a closure the key
+        contains the names of the enclosed objects, because Numba's own key differs in each process.
         """
         cells = self._py_func.__closure__
         if cells is None:

@@ -1,15 +1,15 @@
 """Colours of all plots and pages, distinguishable with three kinds of colour blindness and in
 greyscale.
 
-The live page, HTML reports, images and QGIS use the same colours. `FOUR` are the colours of the
-four classes where friction is well known. `TWO` are the classes where it is roughly known. `LITTLE`
-is the colour where too little is known for a class.
+The live page, HTML reports, images and QGIS use them. `FOUR` are the colours of four classes of
+well-known friction, and `TWO` those of two classes of roughly known friction. `LITTLE` is the
+colour where too little is known for a class.
 
 The classes have an order: ice, snow, rather slippery, wet, rather not slippery, good grip. From ice
-to good grip, lightness rises on a light background and falls on a dark one, for every kind of
-colour vision and in greyscale. Therefore ice, the most dangerous class, stands out most. `GRIP` is
-a colour scale through `FOUR` at the values of `SURFACES`, in steps of equal lightness. No colour is
-green, because green would promise safety. `tests/test_palette.py` checks order and distances.
+to good grip, lightness rises on a light background and falls on a dark one. Therefore ice, the most
+dangerous class, stands out most. `GRIP` is a colour scale through `FOUR` at the values of
+`SURFACES`, in steps of equal lightness. No colour is green, because green would promise safety.
+`tests/test_palette.py` checks order and distances.
 """
 
 from __future__ import annotations

@@ -20,9 +20,8 @@ _ALL: Final = f"{SERVES}/**"
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
     """Return the Zenoh liveliness tokens (signs that a process is alive) of services that are
-    active now and visible to this session. `root` is the first part of the tokens' Zenoh keys. It
-    selects the kind of tokens: by default those of services that serve a region, with another root
-    for example those of standby services.
+    active now and visible to this session. `root` is the first part of the tokens' Zenoh keys.
+    Another root selects another kind of tokens, such as those of standby services.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):

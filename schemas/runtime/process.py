@@ -47,11 +47,10 @@ def limit_memory(*without: str) -> None:
     Args:
         without: modules that the libraries can do without; importing them is blocked.
 
-    Four causes of such use are removed. Arrow imports pandas, if installed, to recognise data
-    frames: half a second and 30 MB. The linear algebra library of numpy starts one thread per core,
-    and these threads busy-wait; with our small matrices this doubles the processor time. The memory
-    allocator keeps large freed arrays with small objects between them: about 0.1 GB. Arrow's own
-    allocator keeps memory for each thread that ever used it.
+    Four causes of such use are removed. Arrow imports pandas, if installed: half a second and 30
+    MB. The linear algebra library of numpy starts one thread per core, and these threads busy-wait,
+    which doubles the processor time. The memory allocator keeps about 0.1 GB of freed arrays.
+    Arrow's own allocator keeps memory for each thread that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
@@ -92,8 +91,8 @@ def exit_fast(code: int) -> NoReturn:
     """Exit without interpreter teardown.
 
     Unloading hundreds of LLVM modules takes about five seconds, and a Zenoh callback during
-    teardown aborts the process. As at a normal exit, non-daemon threads are joined and exit
-    handlers run.
+    teardown aborts the process. As at a normal exit, the process waits for non-daemon threads, and
+    exit handlers run.
     """
     threading._shutdown()  # type: ignore[attr-defined] # no public way
     atexit._run_exitfuncs()
@@ -142,7 +141,7 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
     """Write warnings that the program and its libraries log to `stream`, as text or as JSON
-    depending on `form`. Each JSON line contains the values `who`, which identify the process.
+    depending on `form`. JSON lines contain the values `who`, which identify the process.
     """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(

@@ -1,8 +1,7 @@
 """Spark session, and distribution of tasks over a cluster.
 
 Tasks run independently, and a task is repeated if its machine fails. Therefore a task writes each
-file under a name that depends on the task alone. It writes the file under a temporary name first,
-and then renames it.
+file under a temporary name first, and renames it to a name that depends on the task alone.
 """
 
 from __future__ import annotations

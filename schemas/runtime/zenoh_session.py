@@ -47,9 +47,9 @@ log = logging.getLogger(__name__)
 
 
 def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
-    """Return the Zenoh configuration of a session. It combines three sources: this module's
-    defaults, the endpoints in `settings`, and the section `config` in `settings`. A later source
-    overrides the earlier ones.
+    """Return the Zenoh configuration of a session. It combines this module's defaults, the
+    endpoints in `settings`, and the section `config` in `settings`. A later source overrides the
+    earlier ones.
 
     Args:
         settings: Zenoh section of the configuration file.

@@ -193,11 +193,10 @@ class StreamAck(NamedTuple):
         boot, kind, region: identity of the stream: random number of the agent's start, kind of the
             batches, region.
         durable: ranges of batches that are stored safely, both ends included.
-        rejected: for each refused record, the sequence number of its batch, its row in the batch,
-            and the reason.
+        rejected: for each refused record, its batch's sequence number, its row, and the reason.
         late: ranges of durable batches that arrived too late for the map to use them in order of
             time.
-        time: time of the service's clock [ns UTC] when it sent the acknowledgement; 0 if not sent.
+        time: time of sending by the service's clock [ns]; 0 if unknown.
     """
 
     boot: int

@@ -77,8 +77,8 @@ def _refuse_compressed(payload: bytes) -> None:
 
 
 def _field_offset(data: bytes, table: int, index: int) -> int:
-    """Return the byte offset in `data` of a field of a FlatBuffers table; 0 if the field is absent.
-    `table` is the offset of the table, and `index` the number of the field.
+    """Return the byte offset of field number `index` in the FlatBuffers table at the offset
+    `table`; 0 if the field is absent.
     """
     layout = table - int(struct.unpack_from("<i", data, table)[0])
     if 4 + 2 * index >= int(struct.unpack_from("<H", data, layout)[0]):
