@@ -64,7 +64,8 @@ class LookoutCounts:
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def total_of(self, what: str) -> int:
-        """Return the sum over all vehicles of their map receivers' counter `what`, such as "bytes".
+        """Return the sum of the counter `what`, such as "bytes", over the map receivers of all
+        vehicles.
         """
         return sum(one.counts[what] for one in self.subscribers.values())
 

@@ -41,8 +41,7 @@ class MapSubscriber:
     Args:
         vehicle: name of the vehicle.
         session: open session of the vehicle; the caller closes it.
-        urgent: function that is called, when alerts change, with the keys (cell·4 + sector) of
-            their places.
+        urgent: function called with the places (cell·4 + sector) whose alerts have changed.
         clock: function that returns the time [ns UTC].
     """
 

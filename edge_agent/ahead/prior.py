@@ -51,7 +51,7 @@ NOWHERE: Final = -1
 
 class MapPrior:
     """Combination of the map's beliefs (probabilities of friction) with the beliefs of the filters
-    of N vehicles. It keeps the state of each vehicle's current visit (passage of one place).
+    of N vehicles.
     """
 
     def __init__(self, vehicles: int) -> None:

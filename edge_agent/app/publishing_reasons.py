@@ -101,8 +101,8 @@ def reasons_not_publishing(
         watch: observer of the blocks of samples that the source has delivered.
         publisher: status of the publisher.
         endpoints: routers that the publisher tries to reach.
-        troubles: messages about problems, reported by the signal sources and by the signal doctor
-            (automatic check).
+        troubles: problems reported by the signal sources and by the signal doctor (automatic
+            check).
     """
     found = list(troubles)
     if watch.is_missing("wheels"):
