@@ -69,8 +69,9 @@ def ingest() -> list[Figure]:
 
 def measure_rates(records: int) -> tuple[tuple[float, float], float, float]:
     """Measure the ingest of messages with `records` observations each. Return medians after a
-    warm-up: observations per wall second and per CPU second of the whole ingest; observations per
-    CPU second of decoding alone with protobuf's generated module; and the same with our decoder.
+    warm-up: observations per wall second and per CPU second of the whole ingest. The last two
+    values are observations per CPU second of decoding alone, with protobuf's generated module and
+    with our decoder.
     """
     sent = make_messages(COUNTS[records], records, time.time_ns())
     taken = [_time_ingest(sent, records) for _ in range(ROUNDS + 1)][1:]

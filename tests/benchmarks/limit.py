@@ -160,7 +160,8 @@ class VectorLimit:
 
         Args:
             parameters: vehicle parameters (N, 12).
-            first: first readings (N, 11), as for `Limit`.
+            first: first readings (N, 11): ax, ay, yaw rate, steering angles delta and wheel speeds
+                omega.
             speed: initial speed [m/s].
             memberships: parameters of the fuzzy sets.
         """

@@ -54,8 +54,8 @@ def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
 
 def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
     """Join the positions of vehicles to road links by map place (cell and heading sector). Return
-    figures by name: the shares of positions with the right link and with the right street, the best
-    share that one link per map place could reach, and numbers of positions and links.
+    by name the shares of positions with the right link and with the right street, and the best
+    share that one link per map place could reach. Return also the numbers of positions and links.
     """
     rng = np.random.default_rng(seed)
     east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))

@@ -2,9 +2,9 @@
 and restart from this checkpoint and the rows ingested after it.
 
 The checkpoint is requested by a background thread, as in the service, while another thread
-processes messages. The restart runs in a separate process; its time includes imports, the reading
-of the checkpoint and the later rows, the loading of compiled code, and the opening of the Zenoh
-session, until the service is ready.
+processes messages. The restart runs in a separate process, and its time is counted until the
+service is ready. This includes imports, reading the checkpoint and the later rows, loading compiled
+code, and opening the Zenoh session.
 """
 
 from __future__ import annotations

@@ -41,9 +41,9 @@ def run(site: Site) -> list[Figure]:
     """Restart the watcher's router eight times, and raise twenty more alerts during each outage (in
     a quick run: one outage, ten alerts).
 
-    Return three figures (named numbers) over all outages: the number of active alerts that the
-    watcher did not receive within SOON_S after it was connected again, the number that it should
-    have received, and the longest time [s] until it received one.
+    Return three figures (named numbers) over all outages. The first two are the number of active
+    alerts that the watcher did not receive within SOON_S after it was connected again, and the
+    number that it should have received. The third is the longest time [s] until it received one.
     """
     each = site.choose_amount(20, 10)
     missing = 0

@@ -87,8 +87,9 @@ class Found:
 
 
 def run(site: Site) -> list[Figure]:
-    """Run a service with a wrong clock in all cases: a year ahead, a year behind, and thirty years
-    behind (as after an empty battery), each while the service runs and at its start.
+    """Run a service with a wrong clock, and return the figures. The clock is a year ahead, a year
+    behind, or thirty years behind (as after an empty battery). Each of these errors occurs once
+    while the service runs and once at its start.
     """
     cases = [
         Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)

@@ -7,7 +7,7 @@ receives batches and weather, and its maintenance jobs run in any order. Between
 operator may erase one vehicle's month or the whole month. The power fails at a random operation.
 The next life must find every acknowledged row exactly once, and all weather that was used. It must
 recognise a repeated batch if and only if the archive contains it. The map restored from a
-checkpoint and later rows must equal the map restored from all rows without a checkpoint, no
+checkpoint and later rows must equal the map restored from all rows without a checkpoint. No
 compacted file may be damaged, and erased rows must not come back.
 """
 

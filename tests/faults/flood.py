@@ -242,9 +242,9 @@ def _read_map(running: Network) -> pa.Table:
 def _simulate_unflooded(
     folder: Path, honest: Sequence[Honest], seconds: float, now: int
 ) -> pa.Table:
-    """Return the reference map. It contains the same visits of the honest vehicles, but the
-    flooding vehicle sends only one visit (pass through a cell) a second, and at least one for every
-    cell of the road.
+    """Return the reference map. It contains the same visits of the honest vehicles as the tested
+    map. The flooding vehicle sends only one visit (pass through a cell) a second, and at least one
+    for every cell of the road.
     """
     sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
     began = min(int(one.columns["leave_time"][0]) for one in sent)

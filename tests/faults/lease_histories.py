@@ -53,9 +53,9 @@ class Event(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Result of the check of a simulated history: number of acknowledgements by an earlier holder
-    of the lease (ownership of the archive) after its successor began to serve, and violations of
-    the promises to agents.
+    """Result of the check of a simulated history. It has the number of acknowledgements by an
+    earlier holder of the lease (ownership of the archive) after its successor began to serve, and
+    the violations of the promises to agents.
     """
 
     acknowledged_by_two: int

@@ -2,8 +2,8 @@
 vehicles that report ice on roads where nobody else drives.
 
 Teleports: each car drives honestly, but also reports one distant place. The report of this place is
-in the same batch or in another batch, under another boot (start of the agent) or region, before or
-after the car's other reports, or at the end of many short leaps. Whether a report is impossible
+in the same batch or in another one, before or after the car's other reports. It can have another
+boot (start of the agent) or region, or follow many short leaps. Whether a report is impossible
 follows from its distance to the car's own path. Two cars: both report ice at 210 places along 400
 km. They report either in leaps, or all at once afterwards, or live at a plausible 65 m/s.
 """

@@ -34,9 +34,9 @@ HEAVY: Final = 2
 
 
 def run(site: Site) -> list[Figure]:
-    """Query a map of twenty thousand cells for half a minute (in a quick run, five thousand cells
-    for four seconds), and return as figures how long another reader waits for the answer to a small
-    query.
+    """Let two readers query a map of twenty thousand cells for half a minute (in a quick run, five
+    thousand cells for four seconds). Return as figures how long another reader waits for the answer
+    to a small query.
     """
     seconds = site.choose_amount(30, 4)
     with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:

@@ -62,8 +62,9 @@ def fit_slope(times: FloatArray, megabytes: FloatArray) -> float:
 
 
 def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
-    """Run the system under steady load, and return two figures: the steepest growth of memory [MB
-    per 10 min], and the largest growth in the number of open files and sockets, of any process.
+    """Run the system under steady load, and return the figures: the steepest growth of memory [MB
+    per 10 min] and the largest growth in the number of open files and sockets, of any process. Lost
+    and doubled rows are counted too.
     """
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}

@@ -39,7 +39,7 @@ WHOLE_WAY: Final = 200
 
 def run(site: Site) -> list[Figure]:
     """Cut the newest segment (file of new rows) at every byte, and change every fifth byte (in a
-    quick run, some hundred bytes); return as figures how many rows were lost or wrongly counted as
+    quick run, some hundred bytes). Return as figures how many rows were lost or wrongly counted as
     received.
     """
     # Thousands of files are set aside, each with a log line.

@@ -182,8 +182,9 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Return the number of outputs of the map that give a value of friction, which could be shown
-    as a colour, to a cell for which only a lower bound of the friction is known.
+    """Return the number of outputs of the map with the following error: for a cell of which only a
+    lower bound of the friction is known, the output gives a value of friction that could be shown
+    as a colour.
     """
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,5 +1,5 @@
 """Run the commands of the README and of the tutorials as written and in order, in a separate
-network namespace and an empty folder, and look at the maps that they leave in a browser.
+network namespace and an empty folder. Look in a browser at the maps that they make.
 
 Commands that keep running (router, service, agent, watch, page) are started and must still run at
 the end. `pip install` is not run.

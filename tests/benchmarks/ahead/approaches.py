@@ -99,9 +99,9 @@ class _Track:
 
 
 def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Return figures over random towns: the share of approaches to slippery stretches that were
-    warned in time, and the rate of false warnings, for cars that know their route and for cars that
-    do not.
+    """Return figures over random towns, for cars that know their route and for cars that do not.
+    The figures are the share of approaches to slippery stretches that were warned in time, and the
+    rate of false warnings.
     """
     found = {routed: Approaches() for routed in (True, False)}
     for seed in seeds:

@@ -64,10 +64,10 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Simulate a drive through one town per seed. Return figures over all towns: the error of the
-    friction estimate when a vehicle enters a cell, and the delay that a wrong map causes, each
-    divided by the value without a map; and the largest change of a published likelihood that the
-    map causes.
+    """Simulate a drive through one town per seed, and return figures over all towns. Two quantities
+    are divided by their value without a map: the error of the friction estimate when a vehicle
+    enters a cell, and the delay that a wrong map causes. The last figure is the largest change of a
+    published likelihood that the map causes.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
@@ -161,7 +161,7 @@ def arrival_times(
     without a map.
 
     A time is counted from the entry of the stretch until the estimate differs by at most ARRIVED
-    from the true friction; if it never does, the time spent on the stretch counts.
+    from the true friction. If it never does, the time spent on the stretch counts.
     """
     differ = _maps_differ(trace.place, wrong, right, now)
     with_prior = with_map(trace, wrong, now)
