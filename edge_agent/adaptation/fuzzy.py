@@ -8,7 +8,7 @@ Legend
     factor      R over its nominal value [1], within [LEAST_FACTOR, LARGEST_FACTOR]
 
 If the actual variance exceeds the theoretical one, R increases: paper 004, equations 29 to 31, with
-the direction corrected (errata), and with bounds that the paper does not have.
+the direction of the change corrected (errata), and with bounds that the paper does not have.
 """
 
 from __future__ import annotations

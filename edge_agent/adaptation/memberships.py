@@ -153,8 +153,9 @@ class Memberships:
         """Convert the vector (30,) of an optimiser to memberships (fuzzy sets). The vector must lie
         within `bounds`.
 
-        Inputs and outputs are sorted, so every vector within the bounds is valid. A vector (12,)
-        contains only the fields up to `ln_scales`; the other fields keep their untuned values.
+        The function sorts the peaks `inputs` and the levels `outputs`, so every vector within the
+        bounds is valid. A vector (12,) contains only the fields up to `ln_scales`; the other fields
+        keep their untuned values.
         """
         v = np.asarray(vector, float)
         if v.shape == (NOISE,):

@@ -41,7 +41,7 @@ class Prediction(NamedTuple):
     """
 
     log_likelihood: float  # log-likelihood of the innovations [nat/s]
-    contradicted: float  # share of the time in contradiction
+    contradicted: float  # share of the time with the health flag CONTRADICTION
 
 
 class HeldOut(NamedTuple):

@@ -1,9 +1,9 @@
 """Cholesky factor of a covariance.
 
 Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n). A pivot
-(squared diagonal element of L) is the variance of a state given the states before it, so it is at
-least the variance of the state's own noise. If rounding makes it smaller, the noise variance
-replaces it.
+(squared diagonal element of L) is the variance of a state given the states before it. With process
+noise added to P, a pivot is at least the variance of the state's own noise. If rounding makes the
+pivot smaller, the noise variance replaces it.
 """
 
 from __future__ import annotations

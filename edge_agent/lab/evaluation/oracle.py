@@ -11,8 +11,8 @@ estimate is least squares with a Gaussian prior.
     a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)      over stretches of STRETCH_S
     a_l, a_p   part of the acceleration that the body's roll and pitch have followed
-    unknown    ρ error of the radius, c ln of cornering stiffness, κ and τ roll and pitch of the
-               body, b offsets
+    unknown    ρ error of the radius, c ln of cornering stiffness, κ shares of gravity that roll and
+               pitch add, τ lag of roll, b offsets
 
 `friction`: μ under .6 g, at the end of the drive. The oracle gets the mean of four wheels, and
 knows the force of every tyre, and the speed except for offset and gravity leak of a_x.

@@ -51,7 +51,7 @@ def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]
 
     Args:
         t: (T, N) [s].
-        signals: (T, N, channels); NaN is a missing reading.
+        signals: sensor readings (T, N, channels); NaN is a missing reading.
         vehicles: the N vehicle files that the cars' controllers know.
     """
     out = np.empty(t.shape)
@@ -79,7 +79,7 @@ def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
     where no flag is set.
 
     Args:
-        signals: (T, channels).
+        signals: sensor readings (T, channels).
         car: wheel radius, wheelbase and half of the track [m], and the driven axle's share of the
             load.
         period: sampling interval [s].

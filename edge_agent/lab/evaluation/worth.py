@@ -15,8 +15,8 @@ Legend of the filter variants (for all scores, less is better)
 
 Each seed gives a town with inaccurate cars and a set of manoeuvres on hills, with its own friction
 and vehicles. A ratio compares two variants: the mean score of one over all seeds, divided by that
-of the other. Its `.difference` is the mean over seeds of the difference of both scores, and
-`.difference.se` the standard error of that mean.
+of the other. The figure `.difference` of a ratio is the mean over seeds of the difference of both
+scores, and `.difference.se` the standard error of that mean.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Simulation of a fleet of vehicles that drive endlessly on a road network, in one compiled
-function.
+"""Simulation of a fleet of vehicles that drive endlessly on a road network, computed by one
+compiled function.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Pmsm(NamedTuple):
     pole_pairs: float = 8.0  # p
     gear: float = 4.0  # G
     voltage: float = 600.0  # [V] largest voltage of the inverter
-    bandwidth: float = 600.0  # [rad/s] of the current control
+    bandwidth: float = 600.0  # [rad/s] bandwidth of the current control
     proportional: float = 1.5  # [1/s] gain of the speed control for the error of speed
     integral: float = 0.3  # [1/s^2] gain of the speed control for the integral of the error
     derivative: float = 0.05  # [1] gain of the speed control for the acceleration

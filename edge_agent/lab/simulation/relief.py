@@ -42,7 +42,7 @@ class Wave:
     peak: float
     length: float = math.inf  # [m] wavelength; infinite for a constant slope
     towards: float = 0.0
-    phase: float = 0.0  # [rad]
+    phase: float = 0.0  # [rad] phase of the wave at the origin
     stepped: bool = False  # True: the slope jumps between the two values
 
     def __post_init__(self) -> None:

@@ -47,18 +47,18 @@ class Sensors:
     offsets and gain errors that are drawn once per drive, and further errors.
     """
 
-    acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white, offset
-    yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s] white, offset
-    steering: tuple[float, float] = (0.0, 0.0)  # [rad] white, offset
-    wheel_speed: float = 0.0  # [rad/s] white
-    # [N·m] white; relative error of the gain, which is common to all wheels
+    acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white noise, offset
+    yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s] white noise, offset
+    steering: tuple[float, float] = (0.0, 0.0)  # [rad] white noise, offset
+    wheel_speed: float = 0.0  # [rad/s] white noise
+    # [N·m] white noise; relative error of the gain, which is common to all wheels
     torque: tuple[float, float] = (
         0.0,
         0.0,
     )
-    # [m] white and slowly varying error, each to the north and to the east
+    # [m] white noise and slowly varying error, each to the north and to the east
     position: tuple[float, float] = (0.0, 0.0)
-    yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white and slowly varying error
+    yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white noise and slowly varying error
     # True for accelerometers fixed to the rolling body, which measure a part of gravity
     leak: bool = False
     # Probability that a group of channels is silent in a given half second.

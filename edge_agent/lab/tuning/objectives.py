@@ -3,7 +3,8 @@
 Legend
     l, u, mu    stated 5 % and 95 % quantiles of friction, and the true mean of the four wheels [1]
     IS          (u - l) + 20*max(l - mu, 0) + 20*max(mu - u, 0), mean over samples and drives [1]
-    v, S        innovation of an update and its covariance as stated before it, with the adapted R
+    v, S        innovation of an update, and its covariance as the filter predicts it, with the
+                adapted R
     l_v         -1/2 (v' S^-1 v + ln det 2 pi S), summed over updates, per second of driving [nat/s]
     NIS         v' S^-1 v over its expectation [1]
 
@@ -129,8 +130,8 @@ class TuningScores:
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
-    log_likelihood: float  # more is better [nat/s]
-    nis_ratio: float  # near 1 where the stated covariance is right [1]
+    log_likelihood: float  # log-likelihood of the innovations; more is better [nat/s]
+    nis_ratio: float  # NIS over its expectation; near 1 where the stated covariance is right [1]
     # interval score, mean over the kinds of surface; less is better [1]
     surface_score: float = math.nan
     # share of the samples on wet and dry road whose interval lies below SLIPPERY_MU [1]

@@ -163,7 +163,9 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """Return the setting of paper 004's filter for a condition of the measurement noise R."""
+    """Return the setting of paper 004's filter for a condition: its noise R is the true variance
+    times the condition's `scale`.
+    """
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
