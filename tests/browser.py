@@ -1,8 +1,8 @@
 """Helpers for tests of pages in a real browser: headless Chromium of the system, driven by
 Playwright.
 
-On Debian and Ubuntu install it with `apt install chromium`, as CI does. Without Chromium or
-Playwright the tests of pages are skipped, and the reason is reported.
+On Debian and Ubuntu install it with `apt install chromium`. Without Chromium or Playwright the
+tests of pages are skipped, and the reason is reported.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def open_page(
         path: file of this machine, or address.
         phone: True for the screen of a phone.
         ratio: device pixels per CSS pixel.
-        unbound: True to paint as many frames per second as possible, without the screen's limit.
+        unbound: True to paint frames without the screen's rate limit.
     """
     program = find_chromium()
     if program is None:

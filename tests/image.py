@@ -2,9 +2,8 @@
 
 Folders of the image become folders below another root. Nothing is installed by apt-get: the tools
 are those of this machine. The Python version that FROM names is taken from this machine, in a fresh
-environment. Then a router and a service of the image are started; the service must be ready without
-compiling anything. The user cannot be changed here, so the user of the USER instruction is only
-checked.
+environment. The user of the USER instruction is only checked. Then a router and a service of the
+image are started; the service must be ready without compiling anything.
 """
 
 from __future__ import annotations

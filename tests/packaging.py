@@ -2,7 +2,7 @@
 outside the source tree.
 
 The wheel is tried with each Python version of VERSIONS that this machine has, on the PATH or in
-pyenv. For a missing version a line is printed. `--python` adds interpreters.
+pyenv. Missing versions are printed. `--python` adds interpreters.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def _never_fails(parts: list[Part], start: int) -> bool:
 
 def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 tuples of the parser
     """Return True if a repeated group ends with a repeat of characters with which the group can
-    begin again, so that the matcher can divide a text in many ways.
+    also begin. The matcher can then divide a text in many ways.
     """
     parts = [_describe_part(one) for one in _open_groups(item[1][2])]
     if not any(part.is_unbounded for part in parts):

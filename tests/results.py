@@ -128,7 +128,7 @@ class Table(NamedTuple):
         campaign: key in CAMPAIGNS.
         title: heading on the page.
         names: pattern of the names of the table's figures.
-        render: function from values by name to Markdown.
+        render: function that makes Markdown from the figures' values by name.
     """
 
     campaign: str

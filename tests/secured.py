@@ -86,10 +86,10 @@ class Network:
     """Two routers, each in a separate process; the second one connects to the first.
 
     `protocol` is the transport of sessions; the routers connect to each other over TLS. If `capped`
-    is False, the routers do not limit message rates, so that the traffic of an earlier attack in a
-    test does not affect a later one. If `guarded` is False, they check no certificates, for control
-    measurements. The routers run in processes of their own because Zenoh may abort a process that
-    closes one of two connected routers.
+    is False, the routers do not limit message rates, so that an earlier attack in a test does not
+    hide a later one. If `guarded` is False, they check no certificates, as a control. The routers
+    run in processes of their own because Zenoh may abort a process that closes one of two connected
+    routers.
     """
 
     folder: Path

@@ -30,7 +30,7 @@ HEAVY: Final = ("numba", "llvmlite", "scipy", "zenoh")
 
 
 def list_sources(root: Path, *folders: str) -> list[Path]:
-    """Return the paths of all handwritten Python files below the folders."""
+    """Return the paths of all handwritten Python files in the given folders below `root`."""
     found = (path for folder in folders for path in sorted((root / folder).rglob("*.py")))
     return [path for path in found if not path.name.endswith("_pb2.py")]
 
@@ -337,9 +337,8 @@ def only_tests_use(root: Path) -> Places:
     product does not need them.
 
     A name counts as used if any other line of product, deployment, Makefile, pages or examples
-    contains it. Functions with a decorator other than `property` are left out, because the
-    decorator may register them. Methods that a library calls by their name (`LIBRARY_CALLS`) are
-    left out, too.
+    contains it. Left out are functions with a decorator other than `property`, which may register
+    them, and methods that a library calls by their name (`LIBRARY_CALLS`).
     """
     texts = {path: path.read_text(encoding="utf-8") for path in list_sources(root, *PACKAGES)}
     others = [

@@ -18,7 +18,9 @@ from tests.waiting import until
 
 @pytest.fixture
 def there(tmp_path: Path) -> Iterator[Stage]:
-    """Yield a router, a service and two vehicles, after a first report was acknowledged."""
+    """Yield a router, a service and two vehicles, after the service has acknowledged a first
+    report.
+    """
     with open_stage(tmp_path, segment_s=0.2) as there:
         there.make_load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
         until(lambda: read_journals(there.journals).settled)

@@ -17,7 +17,7 @@ from tests import results
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return an empty folder that replaces deploy/figures."""
+    """Return an empty folder that replaces deploy/figures during the test."""
     monkeypatch.setattr(results, "FOLDER", tmp_path / "figures")
     return tmp_path
 

@@ -1,6 +1,6 @@
 """Tests that every public option has a visible effect: if it is changed, some output changes.
 
-There is one table per module that declares options. A test fails if an option is in no table.
+One table per module lists the module's options. A test fails if an option is in no table.
 """
 
 from __future__ import annotations

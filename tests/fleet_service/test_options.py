@@ -1,8 +1,8 @@
 """Tests that every option of the commands has an effect: a test changes the option, runs the
 command, and requires another result than before.
 
-A command runs on copies of the reference archive. Its result is its output, its exit code and every
-file below its folder. Each command gives the same result twice, so that a difference comes from the
+A command runs on copies of the reference archive. Its result is its output, its exit code and the
+files below its folder. Each command gives the same result twice, so a difference comes from the
 option.
 """
 
@@ -419,8 +419,8 @@ FAR: Final = (LATITUDE, LONGITUDE + 0.05)
 
 
 def there(name: str, mu: float) -> wire.Batch:
-    """Return a batch of the vehicle `name` that reports the friction `mu`. Its cell lies in another
-    tile of the same region than the usual cell.
+    """Return a batch of the vehicle `name` that reports the friction `mu` in the usual region, but
+    in another tile.
     """
     cell = int(grid.cell_of(*FAR))
     return batch(

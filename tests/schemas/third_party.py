@@ -4,7 +4,7 @@ import any other part of GripMap.
 `python -m tests.schemas.third_party ENDPOINT` reports ice by two vehicles, one in protobuf and one
 in JSON. It reads acknowledgements, reports, the tile, alerts and the map's answers, and prints the
 results as one line of JSON. Run it only as a program: importing it would also block GripMap's
-modules in the importing process.
+modules there.
 """
 
 from __future__ import annotations

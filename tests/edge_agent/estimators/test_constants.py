@@ -1,5 +1,5 @@
-"""Tests of every constant of the default estimator: if a constant changes, a figure of a drive (for
-example the mean interval width) must change as the constant's stated reason implies.
+"""Tests of every constant of the default estimator. If a constant changes, a figure of a drive
+(such as the mean interval width) must change as the reason stated for the constant implies.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the lists of the papers' equations, tables and figures: each deviation has a reason, and
-each named place in the code exists.
+"""Tests of the lists of the papers' equations, tables and figures. Each listed deviation of the
+code from a paper must have a reason, and each listed place in the code must exist.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ def test_without_position_there_is_no_state() -> None:
 def test_observation_contains_controller_flags_and_context_of_its_visit() -> None:
     """A car drives east through cells at 10 m/s. The observation of each visit (pass through a
     cell) must contain the ABS flag and the context (controllers, temperature, wipers) read during
-    the visit, and "unknown" where there was hardly any reading.
+    the visit. A value with hardly any reading must be "unknown".
     """
     samples = 40
     east = np.arange(samples)[:, None] * 1.0

@@ -150,7 +150,7 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
     """Store messages that no service answers, until the outbox (store of unacknowledged messages)
-    regards the route as silent and only probes it. Return the simulated time [s] at that moment.
+    regards the route as silent. Return the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

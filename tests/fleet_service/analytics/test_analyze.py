@@ -1,5 +1,5 @@
-"""Tests of the command `analyze` as a user types it: every question (predefined query) prints a
-table, files are written completely or not at all, and a mistake gives one line.
+"""Tests of the command `analyze` as a user types it. Every question (predefined query) must print a
+table, files must be written completely or not at all, and a mistake must give one line.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ MAP = {field.name for field in tables.MAP_CELL}
 
 
 def list_explained(question: str) -> set[str]:
-    """Return the columns of the answer to a question (predefined query) that the documentation
+    """Return the answer columns of a question (predefined query) that its documentation
     explains.
     """
     page = (ROOT / "deploy" / "docs" / "reference" / "questions.md").read_text(encoding="utf-8")

@@ -1,7 +1,6 @@
-"""Tests of the question (predefined query) `change-rates`, which fits how often and how fast the
-friction of roads changes: the fit finds the rates of a simulated process, its 90 % interval
-contains the true rate as often as stated, and pairs of successive values of a cell are counted
-correctly.
+"""Tests of the question (predefined query) `change-rates`, which estimates how often and how fast
+road friction changes. It must find the rates of a simulated process. Its 90 % interval must contain
+the true rate as often as stated. It must count pairs of successive values of a cell correctly.
 """
 
 from __future__ import annotations

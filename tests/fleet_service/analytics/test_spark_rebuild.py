@@ -1,5 +1,5 @@
-"""`make spark-test`: tests that a rebuild on Spark equals a local one byte for byte, also if tasks
-are killed meanwhile.
+"""`make spark-test`: tests that a rebuild of the map on Spark equals a local one byte for byte,
+also if tasks are killed meanwhile.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ YEAR = 365 * 86_400 * SECOND
 
 @dataclass
 class System:
-    """Simulated clocks of a machine: wall clock and elapsed time."""
+    """Simulated clocks of a machine, which the test advances: wall clock and elapsed time [ns]."""
 
     wall: int
     steady: int = 0

@@ -81,8 +81,9 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity of every row that the service acknowledged, as tuples of three numbers:
-    pseudonym of the boot (start of the agent), seq (number of the batch), and row in the batch.
+    """Return the identity (boot, seq, row) of every row that the service acknowledged. `boot` is
+    the pseudonym of the agent's start, `seq` the number of the batch, and `row` the place in the
+    batch.
     """
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
@@ -98,8 +99,8 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity of every row in the archive, as tuples of three numbers: pseudonym of the
-    boot (start of the agent), seq (number of the batch), and row in the batch.
+    """Return the identity (boot, seq, row) of every row in the archive. `boot` is the pseudonym of
+    the agent's start, `seq` the number of the batch, and `row` the place in the batch.
     """
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])

@@ -1,5 +1,5 @@
-"""Tests that the service compiles no function after it has reported that it is ready, because
-vehicles would have to wait.
+"""Tests that the service compiles no function after it has reported that it is ready. Vehicles
+would have to wait for the compilation.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of a running service over real Zenoh sessions, as vehicles, clients and operators use it:
-acknowledged reports are on the map, ice raises an alert, and bad input is refused.
+"""Tests of a running service over real Zenoh sessions, used as vehicles, clients and operators do.
+Acknowledged reports must be on the map, ice must raise an alert, and bad input must be refused.
 """
 
 from __future__ import annotations

@@ -4,13 +4,13 @@ that it gave when it was written.
     python -m tests.fleet_service.archive.kept FOLDER      write a new archive and its map with
                                                            the present code
 
-Commit 1f90692 wrote `data/v1.0` in this way, before files had a version. A stored archive is never
-written again, because later code must still be able to read it.
+Commit 1f90692 wrote `data/v1.0`, before files had a version. A stored archive is never written
+again, because later code must still be able to read it.
 
 The archive has eight vehicles in two zones (map squares of zoom 7), around midnight. It contains
 compacted (sorted) rows with hourly statistics and a map snapshot, a checkpoint (saved state), and
-later segments (files of new rows). The rows are of dry road and ice: measurements, lower bounds,
-and rows that came too late. There are also states and a weather report.
+later segments (files of new rows). The rows report dry road, ice and lower bounds; some came too
+late. There are also states and a weather report.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def make(root: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Create a reference archive in a folder."""
+    """Create the reference archive in the folder named on the command line."""
     folder = Path(sys.argv[1])
     found = make(folder / "archive")
     (folder / "lock").unlink(missing_ok=True)

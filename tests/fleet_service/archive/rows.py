@@ -56,7 +56,7 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
 
 def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
     """Write segments (files of new rows) of both kinds, observations and states, with `count` rows
-    each; return the writer.
+    each. Return the writer of the segments.
     """
     writer = Writer(root, "shard-0")
     for k in range(segments):

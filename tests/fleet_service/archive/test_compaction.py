@@ -37,7 +37,7 @@ ROWS = 50
 
 
 class DiedError(BaseException):
-    """Simulated death of the process, which no handler catches."""
+    """Exception that simulates the death of the process; no handler of the service catches it."""
 
 
 def public(root: Path, kind: Kind) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ from tests.fleet_service.examples import CELL, START, observations, value
 
 
 def a_map(cells: int = 300) -> pa.Table:
-    """Return a map table with neighbouring cells."""
+    """Return a map table with `cells` neighbouring cells."""
     rng = np.random.default_rng(2)
     cell = CELL + rng.permutation(cells)
     fusion = Fusion(120.0)

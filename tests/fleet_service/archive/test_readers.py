@@ -17,8 +17,8 @@ from tests.fleet_service.archive.rows import fill
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
-    """Return an archive whose rows are in compacted (sorted) files, and the expected result of
-    every tool.
+    """Return an archive whose rows are in compacted (sorted) files, and the results that every tool
+    must read from it.
     """
     root = tmp_path_factory.mktemp("archive")
     fill(root, 3, 100)

@@ -163,8 +163,8 @@ ERASED = "time: the data of this month or vehicle were erased; delete the batch"
 
 
 def acknowledge_batch(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """Let the engine process the batch `sent`, and write a segment (file of new rows). Return the
-    kinds of acknowledgement that the batch received.
+    """Let the engine (service without network) process the batch `sent`, and write a segment (file
+    of new rows). Return the kinds of acknowledgement of the batch.
     """
     engine.intake.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [

@@ -1,4 +1,6 @@
-"""Tests of `fleet-service certs`: it must work whatever certificates its folder contains."""
+"""Tests that `fleet-service certs`, which issues certificates, works whatever certificates its
+folder already contains.
+"""
 
 from __future__ import annotations
 

@@ -40,8 +40,8 @@ def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.n
 
 def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
     """Return the width [1] of a cell's 90 % interval of friction after thirty reports. Each reports
-    the friction `mu` from a vehicle that used the grip `used`; `manoeuvres` are the kinds of
-    manoeuvre.
+    the friction `mu` and the used grip `used`; `manoeuvres` are the manoeuvres in which the
+    vehicles measured.
     """
     fusion = Fusion(120.0)
     n = len(manoeuvres)

@@ -1,5 +1,5 @@
-"""Tests of two properties of vehicles that the service learns: the weight of each vehicle's
-reports, and the amount by which a friction value is too low if the vehicle used little of the grip.
+"""Tests of two learned properties of vehicles: the weight of a vehicle's reports, and the amount by
+which a friction value is too low if the vehicle used little grip.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
 
 
 def is_agreed(kind: Kind, payload: bytes) -> bool:
-    """Return True if the service's compiled decoder accepts the bytes of a message. Fail if it then
-    decodes anything else than the protobuf library.
+    """Return True if the service's compiled decoder accepts the bytes of a message. Fail if its
+    result then differs from that of the protobuf library.
     """
     data = np.frombuffer(payload, np.uint8)
     found = walk_fields(kind, data, np.array([len(payload)]))

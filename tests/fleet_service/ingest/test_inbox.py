@@ -1,5 +1,5 @@
-"""Tests of the queue behind the subscribers: its content is bounded, and it is emptied in steps of
-limited size.
+"""Tests of the queue of messages that the Zenoh subscribers received. It must stay bounded, and be
+emptied in steps of limited size.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ def class_contrasts(theme: str, sight: str) -> dict[str, float]:
 
 
 def worst_contrasts() -> tuple[float, float]:
-    """Return the smallest contrast of a text, and of a map class, over all themes and kinds of
-    colour vision.
+    """Return the smallest contrast of any text and that of any map class, over all themes and kinds
+    of colour vision.
     """
     both = [(theme, sight) for theme in THEMES for sight in SIGHTS]
     return (

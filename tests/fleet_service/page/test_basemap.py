@@ -128,9 +128,9 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 def test_a_person_sees_the_file_below_the_map_without_any_network(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
-    """The picture in the operator's map file must be visible below the map. It must be enlarged
-    beyond the file's deepest zoom level. At low zoom levels the page must request no tile of the
-    file, and it must never request anything from another host.
+    """The picture in the operator's map file must be visible below the map, enlarged beyond the
+    file's deepest zoom level. At low zoom levels the page must request no tile of the file, and at
+    no level anything from another host.
     """
     with (
         page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,

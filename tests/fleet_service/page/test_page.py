@@ -1,5 +1,5 @@
-"""Tests of the page in a real browser, with a real service: it draws every cell in its class,
-reports alerts and missing services, and can be used by keyboard and on a phone.
+"""Tests of the page in a real browser, with a real service. It must draw every cell in its class,
+report alerts and missing services, and be usable by keyboard and on a phone.
 """
 
 from __future__ import annotations

@@ -216,7 +216,7 @@ def test_map_of_two_continents_opens_on_one_of_them(
     page: RunningPage, drive: Drive, session: zenoh.Session
 ) -> None:
     """A map with cells on two continents must open on one of them, so that cells are visible at
-    once. The page must list the other area. A view of the whole world would show only two dots.
+    once. The page must list the other area.
     """
     drive("ice", "dry")
     cell = grid.cell_of(np.array([37.77]), np.array([-122.42]))

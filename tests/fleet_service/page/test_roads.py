@@ -1,5 +1,5 @@
-"""Tests of the road lines on the page: they are read from a file or derived from cells, streets
-that cross stay separate, and a few scattered cells make no road.
+"""Tests of the road lines on the page, which are read from a file or derived from cells. Streets
+that cross must stay separate, and a few scattered cells must make no road.
 """
 
 from __future__ import annotations

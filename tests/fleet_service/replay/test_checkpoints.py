@@ -171,8 +171,8 @@ def test_a_batch_too_old_to_be_repeated_is_not_fused_by_a_restart(
 
 def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
     """The states restored with and without a checkpoint (saved state) must both equal the state of
-    the running service. Without it, the state comes from all archived rows. Some reports before the
-    checkpoint are late and out of order.
+    the running service. Without a checkpoint, all archived rows are replayed. Some reports before
+    the checkpoint are late and out of order.
     """
     rng = np.random.default_rng(3)
     now = time.time_ns()

@@ -81,8 +81,8 @@ def later() -> int:
 
 
 def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
-    """Return the cells with which the engine (service without network) answers a map query with
-    these parameters, at the time `now`.
+    """Return the cells with which the engine (service without network) answers a map query with the
+    given parameters at the time `now`.
     """
     tiles = engine.queries.answer(
         query.parse(parameters), lambda _: True, time.time_ns() if now is None else now

@@ -22,9 +22,9 @@ from schemas.thresholds import GRAVITY, SLIPPERY_MU, SURFACES
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[DriveSet, FloatArray]:
-    """Return simulated drives of six cars with realistic sensor errors, forty seconds in a town.
-    Return also, (T, 6), the largest share of the available grip that any wheel used, for each
-    sample and car.
+    """Return simulated drives of six cars, forty seconds in a town, with realistic sensor errors.
+    Return also an array (T, 6): for each sample and car the largest share of the available grip
+    that any wheel used.
     """
     return real_world.town(FIGURES, 6, 40.0)
 

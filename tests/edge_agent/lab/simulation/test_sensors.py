@@ -1,4 +1,6 @@
-"""Tests of simulated sensors: their errors have the statistics that their table states."""
+"""Tests of simulated sensors: their errors must have the statistics that the table of sensor errors
+states.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Tests of the assignment of map cells (counted once per heading sector) to road links: a cell
-belongs to the nearest link with the same direction, or to both links where one ends and the next
-begins.
+"""Tests of the assignment of map cells to road links. A cell (counted once per heading sector) must
+belong to the nearest link with the same direction. Where one link ends and the next begins, it must
+belong to both.
 """
 
 from __future__ import annotations
