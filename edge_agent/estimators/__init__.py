@@ -1,5 +1,6 @@
-"""Estimators of vehicle motion and tyre-road friction. They are selected by name and have one
-interface: `create(name, vehicles)` and `EstimatorBank.advance`.
+"""Estimators of vehicle motion and tyre-road friction. `create(name, vehicles)` makes a bank, the
+estimators of several vehicles, by the estimator's name. All banks have one interface,
+`EstimatorBank.advance`.
 """
 
 from edge_agent.estimators.bank import EstimatorBank

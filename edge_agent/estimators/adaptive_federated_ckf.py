@@ -1,5 +1,6 @@
-"""`adaptive-federated-ckf`: the filter of paper 001, a federated cubature filter with fuzzy
-measurement noise R and adaptive information shares. Numbers in brackets are the paper's equations.
+"""Estimator `adaptive-federated-ckf`: the filter of paper 001, a federated cubature filter. Fuzzy
+rules adapt its measurement noise R, and its information shares are adaptive. Numbers in brackets
+are the paper's equations.
 
 "Driving state estimation of distributed drive electric vehicles by an adaptive fuzzy federated
 Kalman filter", Sustainability 2023, 15, 13446 (paper 001). Motion and sub-filters: see
@@ -9,8 +10,8 @@ expected innovation variance over a window, and the rate of that mismatch. The s
 sub-filter i in the master's information follows from the size gamma_i of its predicted residuals,
 (30) to (33): beta_i = min(1, c/gamma_i) with a constant c, normalised.
 
-Friction is not a state of the filter. It is set by hand (section 4.1), here to DRY (a dry road).
-The estimator's output for friction is the prior distribution.
+Friction is not a state of the filter. It is a constant set by hand (section 4.1), here to DRY (a
+dry road). The friction that the estimator reports is the prior distribution.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """
@@ -62,8 +63,9 @@ class AdaptiveMemory(FederatedMemory):
 
 
 class AdaptiveDesign:
-    """Parameters that are set by hand: friction of the four wheels [1], True if R and shares are
-    adapted, and output values (levels) of the fuzzy rules.
+    """Parameters of paper 001's filter that are set by hand: the friction of the four wheels [1]
+    (`friction`), True if noise R and information shares are adapted (`adaptive`), and the outputs
+    of the fuzzy rules (`levels`).
     """
 
     friction: Annotated[FloatArray, 4]
@@ -72,7 +74,9 @@ class AdaptiveDesign:
 
 
 class AdaptiveSetting(NamedTuple):
-    """Options of paper 001's filter: motion filter and fuzzy rules."""
+    """Options of paper 001's filter: adaptation of noise and shares, tyre model, and motion
+    filter.
+    """
 
     adaptive: bool = True  # False: R and shares are constant (comparator FKF)
     tyre: TyreOption = TyreOption()
@@ -101,7 +105,7 @@ def make_bank(
     vehicles: Sequence[Vehicle], friction: float = DRY, setting: AdaptiveSetting | None = None
 ) -> EstimatorBank:
     """Return a bank of paper 001's filters, one per vehicle, which assume a road with the friction
-    coefficient `friction`.
+    coefficient `friction`. `setting` replaces the default options of the filter.
     """
     chosen = AdaptiveSetting() if setting is None else setting
     design = records(AdaptiveDesign, 1)
@@ -134,9 +138,9 @@ def _step_filter(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> b
 
 @compiled
 def _adapt_noise_and_shares(memory: AdaptiveMemory, design: AdaptiveDesign, dt: float) -> None:
-    """Adapt the federated filter after a sample, for use at the next sample: compute the factors on
-    the measurement noise R of both sub-filters, and the shares of the master's information that
-    they get.
+    """Adapt the federated filter after a sample, for use at the next sample. Compute the factors on
+    the measurement noise R of both sub-filters, and the share of the master filter's information
+    that each sub-filter gets.
 
     `dt` [s] is the time since the last sample.
     """

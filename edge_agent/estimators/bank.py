@@ -1,4 +1,4 @@
-"""The estimator bank: a compiled function steps the filters of N vehicles in one call.
+"""The estimator bank: a compiled function advances the filters of N vehicles in one call.
 
 The filter state of each vehicle is stored in a record of its own. Therefore results are bit-equal
 whatever N is and however the samples are split into calls.
@@ -36,8 +36,8 @@ them.
 
 
 class EstimatorBank:
-    """Filters of N vehicles that are advanced together, all of one estimator; `create` makes the
-    bank.
+    """Filters of N vehicles that are advanced together, all of one estimator. The function `create`
+    of `registry` makes a bank.
     """
 
     def __init__(
@@ -73,15 +73,15 @@ class EstimatorBank:
 
         Args:
             t: (T, N) measurement time [s]; a sample whose time does not increase is skipped, and
-                its health flags say so.
+                its health flags show this.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
-            closes: (T, N), True at the first sample of a new visit (the passage of one map cell);
-                None: the bank does not separate visits.
+            closes: (T, N), True at the first sample of a new visit (the passage of one map cell).
+                With None, the bank does not separate visits.
             threads: number of threads that share the vehicles; the result does not depend on it.
 
         Returns:
-            Estimates at the same samples. Only the column `evidence` contains NaN: at all samples
-            at which neither a visit ends nor friction jumps.
+            Estimates at the same samples. Only the column `evidence` contains NaN. It is NaN at all
+            samples at which neither a visit ends nor friction jumps.
 
         Raises:
             InputError: an array has the wrong shape for the bank, or threads is below 1.

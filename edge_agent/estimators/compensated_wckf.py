@@ -1,5 +1,5 @@
-"""`compensated-wckf`: the filters of paper 002, weighted square-root cubature filters on the
-electric drive wheel, with compensation of the tyre force. Numbers in brackets are the paper's
+"""Estimator `compensated-wckf`: the filters of paper 002, weighted square-root cubature filters on
+the electric drive wheel, with compensation of the tyre force. Numbers in brackets are the paper's
 equations.
 
 Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using
@@ -12,8 +12,8 @@ Tyre forces: Magic Formula (12), compensated by (33). Filter WCKF-B: states [v_x
 measurement [r, a_x, a_y] (35), (36). Both filters compute R from a weighted moving window (25), see
 `adaptation.windows`.
 
-Friction is not a state of the filters. It is set by hand, here to DRY (a dry road). The estimator's
-output for friction is the prior distribution.
+Friction is not a state of the filters. It is a constant set by hand, here to DRY (a dry road). The
+friction that the estimator reports is the prior distribution.
 
 `EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
 compensated forces, because the paper's figures compare A with B. ELEMENTS lists each element of the
@@ -104,8 +104,8 @@ class CompensatedMemory(PaperMemory):
 
 
 class FrictionSet:
-    """Friction that is set by hand, and scratch arrays. A step of the filter writes each scratch
-    array before it reads it.
+    """Friction of the four wheels, a constant that is set by hand (`friction`), and scratch arrays.
+    A step of the filter writes each scratch array before it reads it.
     """
 
     friction: Annotated[FloatArray, 4]
@@ -176,7 +176,8 @@ def _compensated_forces(
     observed: FloatArray,
     forces: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Compute the compensated longitudinal forces (4,) [N] at the motion x (3,) (equation 33).
+    """Compute the compensated longitudinal forces (4,) [N] of the wheels at the motion x (3,), by
+    equation (33) of paper 002.
 
     The result is a blend of the forces of the tyre model and of the forces `observed` by WCKF-A. It
     is written into the first array of `forces`; the lateral forces of the tyre model are written

@@ -1,7 +1,7 @@
-"""Record type `Element`, which states how the code implements one equation, table or figure of a
-paper.
+"""Record type `Element`: one equation, table or figure of a paper, and how the code implements it.
 
-The module of each paper has its own list. Documentation and reports are generated from these lists.
+The module of each paper has a list of such records. Documentation and reports are generated from
+these lists.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Element(NamedTuple):
         what: content of the element.
         verdict: "as printed"; "option" (implemented as printed, but not the default); "corrected";
             "left out".
-        why: the reason, required for every verdict except "as printed".
+        why: reason of the verdict, required except for "as printed".
         where: module, function or option that implements the element.
     """
 
@@ -32,8 +32,8 @@ class Element(NamedTuple):
 
 
 def elements_without_reason(elements: tuple[Element, ...]) -> list[str]:
-    """Return the `place` (number in the paper) of each element, such as an equation or figure,
-    whose entry lacks a required reason or a required code location.
+    """Return the `place` (number in the paper) of each element (equation, figure, …) whose record
+    lacks a required reason or a required code location.
     """
     found = []
     for element in elements:

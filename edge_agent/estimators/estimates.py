@@ -1,5 +1,5 @@
-"""Output of an estimator bank: the array that compiled functions write, with a named column per
-estimated quantity.
+"""Output of an estimator bank (estimators of several vehicles): an array with a named column per
+estimated quantity. Compiled functions write this array.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ FlagArray: TypeAlias = NDArray[np.int64]
 
 
 class Column(IntEnum):
-    """Index of an estimated quantity in the output of a sample; no column is ever NaN."""
+    """Index of the column of an estimated quantity in the output of a sample. No column is ever
+    NaN.
+    """
 
     VX = 0  # [m/s]
     VY = 1  # [m/s]

@@ -1,5 +1,5 @@
-"""`federated-ckf`: the filters of paper 000, joint federated cubature filters for motion and for
-the friction of four wheels. Numbers in brackets are the paper's equations.
+"""Estimator `federated-ckf`: the filters of paper 000, joint federated cubature filters for motion
+and for the friction of four wheels. Numbers in brackets are the paper's equations.
 
 Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive
 electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion filter: see
@@ -12,9 +12,9 @@ follow from (54).
 The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
 friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
 stiffness does not depend on friction. Therefore R here is sensor noise plus model error. The
-estimate returns to the prior with the distance driven, because a friction that is not observed must
-become as uncertain as the prior. ELEMENTS lists each element of the paper and every departure with
-its reason.
+estimate returns to the prior with the distance driven, because the road may change: a friction that
+is not observed must become as uncertain as the prior. ELEMENTS lists each element of the paper and
+every departure with its reason.
 """
 
 from __future__ import annotations
@@ -123,8 +123,8 @@ def _step_filter(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool: 
 
 @compiled
 def share_by_information(first: float, second: float) -> float:
-    """Return the information share of sub-filter 1 [1] from the traces of the covariances of both
-    sub-filters.
+    """Return the information share of sub-filter 1 [1]. `first` and `second` are the traces of the
+    covariances of sub-filters 1 and 2.
 
     The sub-filter with the smaller trace gets the larger share. This is equation (54) of paper 000
     with its ratio inverted.

@@ -1,4 +1,4 @@
-"""`paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004 as printed, with errata
+"""Estimator `paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004 as printed, with errata
 corrected. Numbers in brackets are the paper's equations.
 
 Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for
@@ -110,7 +110,7 @@ class FuzzyMemory(PaperMemory):
 
 
 class FuzzyContext:
-    """Setting and scratch arrays that the filters of a thread share. A step writes each scratch
+    """Settings, and scratch arrays that the filters of a thread share. A step writes each scratch
     array before it reads it.
     """
 
@@ -132,8 +132,8 @@ def make_bank(
     memberships: Memberships | LowerVertices,
     setting: Setting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of filters, one per vehicle. `setting` replaces the default, which describes
-    ordinary sensors and an unknown road.
+    """Return a bank of paper 004's filters, one per vehicle, whose fuzzy sets are `memberships`.
+    `setting` replaces the default setting, which describes ordinary sensors and an unknown road.
     """
     chosen = Setting() if setting is None else setting
     context = records(FuzzyContext, 1)
@@ -154,7 +154,9 @@ def make_bank(
 
 @compiled
 def _begin_filter(memory: FuzzyMemory, context: FuzzyContext) -> None:
-    """Begin the filter with a straight motion at the speed of the wheels."""
+    """Begin the filter of a vehicle at its first sample, with a straight motion at the speed of the
+    wheels.
+    """
     mean = memory.mean
     root = memory.root
     use = memory.track.inputs
@@ -207,7 +209,8 @@ def _step_filter(memory: FuzzyMemory, context: FuzzyContext, dt: float) -> bool:
 @compiled
 def _adapt_noise(memory: FuzzyMemory, context: FuzzyContext, pace: float, keep: float) -> None:
     """Compute the measurement noise R of this sample (context.adapted). Then compute the fuzzy
-    factors on R for the next sample from the innovations (measurement minus prediction).
+    factors on R for the next sample from the innovations (measurement minus prediction). `keep` is
+    the weight of the earlier innovations, and `pace` multiplies each change of ln(factor).
     """
     for r in range(ROWS):
         context.adapted[r] = memory.factor[r] * context.noise[r]

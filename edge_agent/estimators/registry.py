@@ -1,12 +1,12 @@
 """The estimators by name, and `create`, which makes a bank of them.
 
 `aco-fckf`, `fckf` and `ckf` are one filter, a Rao-Blackwellised mixture: a grid of friction values
-(nodes), each with a cubature filter. They differ in the fuzzy adaptation of the measurement noise:
-it is tuned by ant colony optimisation, untuned, or absent. The filter is based on paper 004. It
-departs from the paper in its prediction (kinematic), its measurements (wheel speed, force from
-torque) and its residuals (total least squares). Friction is a mixture instead of a state;
-stiffness, leaks (gravity in tilted accelerometers) and offsets are states. The adaptation of R is
-bounded, and its direction is corrected (errata).
+(nodes), each with a cubature filter. They differ in the fuzzy adaptation of the measurement noise
+R. In `aco-fckf` it is tuned by ant colony optimisation, in `fckf` it is not tuned, and `ckf` has
+none. The filter is based on paper 004. It departs from the paper in its prediction (kinematic), its
+measurements (wheel speed, force from torque) and its residuals (total least squares). Friction is a
+mixture instead of a state; stiffness, leaks (gravity in tilted accelerometers) and offsets are
+states. The adaptation of R is bounded, and its direction is corrected (errata).
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def create(
     memberships: Memberships | None = None,
     curve: Curve | None = None,
 ) -> EstimatorBank:
-    """Return a bank (estimators that are advanced together) of the estimator `name`, with one per
-    vehicle.
+    """Return a bank (filters that are advanced together) of the estimator `name`, with one filter
+    per vehicle.
 
     Args:
         name: a key of ESTIMATORS.

@@ -1,4 +1,5 @@
-"""`sr-ukf`: the square-root unscented filter of paper 003 for the friction of four wheels.
+"""Estimator `sr-ukf`: the square-root unscented filter of paper 003 for the friction of four
+wheels.
 
 "Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for
 distributed drive vehicles (paper 003; the equations are lost in the text copy, so its sections are
@@ -148,7 +149,8 @@ def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noq
 
 @compiled
 def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
-    """Compute the friction mu (4,) of a point x (7,), limited to the range of friction.
+    """Compute the friction `mu` (4,) of the wheels at an unscented point x (7,) of the state,
+    limited to the possible range of friction.
 
     The deviation of the point's friction from that of `mean` (7,) is first multiplied by `share`.
     """

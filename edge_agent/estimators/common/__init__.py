@@ -1,3 +1,3 @@
-"""Parts that all estimators share: plausibility check of readings, grip in use (force over load),
-array helpers, and the sample loop of the papers' filters.
+"""Parts that several estimators share: plausibility check of readings, grip in use (force over
+load), array helpers, and the sample loop of the filters from papers.
 """

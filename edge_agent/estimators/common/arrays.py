@@ -11,14 +11,14 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def copy_vector(target: FloatArray, source: FloatArray) -> None:
-    """Copy source (n,) to target (n,)."""
+    """Copy the vector `source` (n,) to `target` (n,)."""
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @compiled
 def put_square(target: FloatArray, source: FloatArray) -> None:
-    """Copy source (n, n) to target (n, n)."""
+    """Copy the square matrix `source` (n, n) to `target` (n, n)."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
@@ -26,14 +26,14 @@ def put_square(target: FloatArray, source: FloatArray) -> None:
 
 @compiled
 def clear_vector(target: FloatArray) -> None:
-    """Set all elements of target (n,) to zero."""
+    """Set all elements of the vector `target` (n,) to zero."""
     for i in range(target.shape[0]):
         target[i] = 0.0
 
 
 @compiled
 def clear_rows(target: FloatArray) -> None:
-    """Set all elements of target (m, n) to zero."""
+    """Set all elements of the matrix `target` (m, n) to zero."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = 0.0

@@ -30,8 +30,8 @@ class Excitation:
 
 @compiled
 def begin_excitation(ring: Excitation) -> None:
-    """Reset the record of the grip used, a ring of time slots (short intervals): no grip has been
-    used so far.
+    """Reset the ring of time slots (short intervals) that records the grip used. Afterwards it
+    contains no grip.
     """
     ring.largest_time = -math.inf
     for k in range(SLOTS):
@@ -40,8 +40,8 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Store the grip used at `time` [s] in a ring of time slots (short intervals), and update
-    `ring.largest`, the largest value of the last second.
+    """Store `used`, the grip used (force over load) at `time` [s], in the ring of time slots (short
+    intervals). Update `ring.largest`, the largest value of the last second.
     """
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:

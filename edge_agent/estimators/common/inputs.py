@@ -1,11 +1,11 @@
 """Readings of one vehicle, prepared for a filter that steps once per sample.
 
 This module refuses implausible readings, detects gaps in time, replaces missing inputs and computes
-the grip in use. A reading that is missing, infinite or implausible is NaN in `now`; the filter then
-leaves out the measurement equation that needs it. Where the filter needs a reading as an input,
-`inputs` holds a replacement. For the accelerations it is zero (a_x) and r*v_x (a_y), for yaw rate
-and steering the last value, and for torque the wheel's share of the force m*a_x. A missing wheel
-speed stays NaN, and that wheel is assumed to roll freely.
+the grip in use. A reading that is missing, infinite or implausible is NaN in `InputTrack.now`. The
+filter then leaves out the measurement equation that needs the reading. Where the filter needs a
+reading as an input, `InputTrack.inputs` has a replacement. For the accelerations it is zero (a_x)
+and r*v_x (a_y), for yaw rate and steering the last value, and for torque the wheel's share of the
+force m*a_x. A missing wheel speed stays NaN, and that wheel is assumed to roll freely.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from schemas.thresholds import GRAVITY
 
 
 class SampleUse(IntEnum):
-    """Result of `take_sample_in`: the filter skips a sample, starts at it or advances to it."""
+    """Use that a filter makes of a sample: it skips the sample, begins at it or advances to it."""
 
     REFUSED = 0
     BEGUN = 1
@@ -41,7 +41,7 @@ class SampleUse(IntEnum):
 
 
 class InputTrack:
-    """Values of one vehicle's input signals that are kept from one sample to the next."""
+    """Input signals of one vehicle that are kept from one sample to the next, with their times."""
 
     started: bool
     time: float  # [s] time of the last sample
@@ -58,9 +58,10 @@ class InputTrack:
 def take_sample_in(
     track: InputTrack, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, int, float]:
-    """Process sample (18,) of a vehicle at `time` [s].
+    """Check a sample (18,) of a vehicle at `time` [s], and store its readings in `track`. `row` are
+    the vehicle's parameters.
 
-    Return three items: health flags; the use of the sample (`SampleUse`); seconds
+    Return three items: the health flags, the use of the sample (`SampleUse`), and the time [s]
     since the previous sample.
     """
     begins = not track.started
@@ -97,7 +98,7 @@ def _reset_track(track: InputTrack) -> None:
 
 @compiled
 def _store_inputs(track: InputTrack) -> None:
-    """Keep the input signals of this sample as the previous inputs for the next sample."""
+    """Store the input signals of this sample as the previous inputs for the next sample."""
     for k in range(INPUTS):
         track.inputs_before[k] = track.inputs[k]
     for wheel in range(4):
@@ -108,8 +109,8 @@ def _store_inputs(track: InputTrack) -> None:
 @compiled
 def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
     """Fill the inputs of the vehicle model, `track.inputs`, from the readings, and replace missing
-    values. If the last argument is True, the filter begins at this sample, and values of earlier
-    samples are not used as replacements.
+    values. If the last argument is True, the filter begins at this sample. Values of earlier
+    samples are then not used as replacements.
     """
     now = track.now
     use = track.inputs
@@ -134,10 +135,11 @@ def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
 
 @compiled
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
-    """Return the largest grip used now by any wheel, as force over load [1].
+    """Return the largest grip (force over load) [1] that any wheel uses at this sample.
 
-    It is the root of the sum of two squares: the longitudinal force over load (torque over radius
-    and load, largest of the four wheels), and the lateral acceleration in g.
+    It is the root of the sum of two squares. The first is that of the longitudinal force over load,
+    which is torque over radius and load, for the wheel with the largest value. The second is that
+    of the lateral acceleration in g.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
@@ -152,8 +154,8 @@ def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> 
     """Return the longitudinal force F_x = (T - J*omega')/R [N] of a wheel (paper 000, equation 10),
     from torque T, inertia J and radius R.
 
-    omega' is the difference of the wheel speeds of two samples, which are `step` [s] apart, over
-    that time.
+    omega' is the change of the wheel speed between two samples, divided by `step`, the time [s]
+    between them.
     """
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step

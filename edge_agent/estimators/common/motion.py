@@ -26,8 +26,8 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
     """Return True if a filter has diverged, that is, if its motion is not finite or physically
     impossible.
 
-    States 0 and 1 of `mean` (n,) are v_x and v_y; `yaw_rate` is the index of the yaw rate. `root`
-    (n, n) is the covariance root.
+    `mean` (n,) is the state of the filter: elements 0 and 1 are v_x and v_y, and `yaw_rate` is the
+    index of the yaw rate. `root` (n, n) is the root of its covariance.
     """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
     bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN

@@ -47,8 +47,9 @@ def write_motion(
 
 @compiled
 def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rate: int) -> None:
-    """Write the motion estimated by a filter with its standard deviations to `output`. States 0 and
-    1 of `mean` are v_x and v_y; `yaw_rate` is the index of the yaw rate.
+    """Write the motion estimated by a filter with its standard deviations to `output`. `mean` is
+    the state of the filter (elements 0 and 1 are v_x and v_y), and `root` the root of its
+    covariance. `yaw_rate` is the index of the yaw rate.
     """
     write_motion(
         output,
@@ -61,9 +62,9 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
 def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
-    """Write four quality figures to `output`: grip in use `utilised`, normalised squared innovation
-    (measurement minus prediction) `nis`, largest factor on the measurement noise R, and
-    log-likelihood.
+    """Write four quality figures of a sample to `output`: grip in use `utilised`, normalised
+    squared innovation `nis` (of measurement minus prediction), `adaptation` (largest factor on the
+    measurement noise R), and log-likelihood of the measurements.
     """
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
@@ -75,8 +76,8 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
     these are the columns of the whole vehicle (`first` is Column.MU), also write P(mu <
     SLIPPERY_MU).
 
-    `mu` and `std` are mean and standard deviation; each quantile is clipped to the range of the
-    grid.
+    `mu` and `std` are mean and standard deviation of the friction. Each quantile is clipped to the
+    range of the friction grid.
     """
     if first == Column.MU:
         output[Column.P_SLIPPERY] = 0.5 * math.erfc((mu - SLIPPERY_MU) / (std * math.sqrt(2.0)))
@@ -90,9 +91,9 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
 
 @compiled
 def write_prior(output: FloatArray, first: int) -> None:
-    """Write the median, 5 % and 95 % quantiles of the uniform prior, for an unknown road, into
-    columns `first` to `first` + 2. If these are the columns of the whole vehicle, also write P(mu <
-    SLIPPERY_MU).
+    """Write the median, 5 % and 95 % quantiles of the uniform prior of friction (unknown road) into
+    the columns `first` to `first` + 2 of `output`. If these are the columns of the whole vehicle,
+    also write P(mu < SLIPPERY_MU).
     """
     if first == Column.MU:
         output[Column.P_SLIPPERY] = (SLIPPERY_MU - LOWER) / (UPPER - LOWER)
@@ -102,8 +103,8 @@ def write_prior(output: FloatArray, first: int) -> None:
 
 @compiled
 def write_unknown(output: FloatArray) -> None:
-    """Write the estimates that are valid before the first usable sample: the friction prior, and
-    zero motion with a large standard deviation.
+    """Write to `output` the estimates before the first usable sample: the friction prior, and zero
+    motion with a large standard deviation.
     """
     write_motion(output, (0.0, 0.0, 0.0), (UNKNOWN_V_STD**2, 1.0, 1.0))
     output[Column.SIDESLIP_STD] = 1.0

@@ -71,8 +71,8 @@ def position_time(sample: FloatArray, time: float, last: float) -> float:
 
 @compiled
 def position_health(time: float, last: float) -> int:
-    """Return the health flag NO_POSITION if the last position (time `last` [s]) is more than
-    POSITION_S seconds old, else 0.
+    """Return the health flag NO_POSITION if, at `time` [s], the last position (time `last` [s]) is
+    more than POSITION_S seconds old; else return 0.
     """
     return 0 if time - last <= POSITION_S else flags.NO_POSITION
 
@@ -82,8 +82,8 @@ def rolling_speed(row: FloatArray, now: FloatArray) -> float:
     """Return the second largest rolling speed (radius times wheel speed) of the wheels [m/s].
 
     Two wheels may be locked and one may spin, so the second largest is the best guess of the
-    vehicle's speed. If only one wheel has a reading, return its speed; if no wheel has one, return
-    NaN.
+    vehicle's speed. If only one wheel has a reading, return the speed of this wheel. If no wheel
+    has a reading, return NaN.
     """
     first = second = math.nan
     for wheel in range(4):

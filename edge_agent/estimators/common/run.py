@@ -26,8 +26,8 @@ from schemas.vehicle import Vehicle
 
 
 class PaperMemory:
-    """Fields that the filter records of all papers share. Each vehicle has one record, which keeps
-    the state of its filter between samples.
+    """Fields common to the filter records of all papers. A record keeps the state of one vehicle's
+    filter between samples.
     """
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
@@ -50,10 +50,11 @@ def kernel_of(
     filter.
 
     Args:
-        begin: starts the filter at the sample in memory.track.
-        step: predicts by the given seconds and updates; returns False if the filter has diverged.
-        report: writes motion and friction into the output; returns the friction [1] above which a
-            wheel counts as sliding.
+        begin: starts the filter at the current sample, which is in memory.track.
+        step: advances the filter by the given seconds to the current sample; returns False if the
+            filter has diverged.
+        report: writes motion and friction into the output; returns the friction [1] with which the
+            loop decides whether a wheel slides.
     """
 
     @nogil
@@ -103,10 +104,10 @@ def kernel_of(
 def new_filters(
     kind: type[PaperMemory], vehicles: Sequence[Vehicle], tyre: TyreOption | None = None
 ) -> RecordArray:
-    """Return an array of records of type `kind`, one per vehicle, with the vehicle's parameters in
-    its field `row`.
+    """Return an array of records of type `kind`, one per vehicle. The field `row` has the vehicle's
+    parameters with the tyre model `tyre`.
 
-    All other fields are zero, by which the compiled function recognises that no sample has been
+    All other fields are zero. From this, the compiled function recognises that no sample has been
     processed.
     """
     filters = records(kind, len(vehicles))

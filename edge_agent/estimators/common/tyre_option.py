@@ -23,8 +23,9 @@ STIFFNESSES: Final = {"similarity": 0.0, "proportional-to-friction": 1.0}
 
 
 class TyreOption(NamedTuple):
-    """Tyre model that a paper's filter assumes: kind of stiffness, its decrease per load, and a
-    factor for the rear axle.
+    """Tyre model that a paper's filter assumes: how slip stiffness depends on friction
+    (`stiffness`), its decrease with the load (`quadratic`), and a factor for the rear axle
+    (`rear_slope`).
     """
 
     stiffness: str = "similarity"  # a key of STIFFNESSES
@@ -36,8 +37,8 @@ PROPORTIONAL: Final = TyreOption("proportional-to-friction")
 
 
 def fit_tyres(filters: RecordArray, tyre: TyreOption) -> None:
-    """Write the tyre model that the user has chosen (tyre option) into the vehicle parameters of
-    each filter record.
+    """Write the tyre model `tyre` that the user has chosen into the vehicle parameters of each
+    filter record.
 
     Raises:
         InputError: the name of the stiffness is unknown, or a number is out of range.

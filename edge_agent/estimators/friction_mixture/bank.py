@@ -1,5 +1,5 @@
-"""Friction mixture (grid of friction hypotheses) for many vehicles: the estimator bank with its
-compiled function, and the functions that write the estimates to its output.
+"""The friction mixture (filter with a grid of friction hypotheses) for many vehicles: the bank of
+estimators with its compiled function, and the functions that write its output.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def mixture_bank(
     spreads: FloatArray | None = None,
     means: FloatArray | None = None,
 ) -> EstimatorBank:
-    """Return a bank of friction mixtures, one per vehicle; `rows` (N, 15) are the vehicles'
-    parameters.
+    """Return a bank of friction mixtures (filters with a grid of friction hypotheses), one per
+    vehicle. `rows` (N, 15) are the vehicles' parameters.
 
     `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the
     filter's states. By default they are the priors in the tables of `design`.
@@ -147,8 +147,8 @@ def _report_friction(friction: Quantiles, upper: float, output: FloatArray, firs
 
 @compiled
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
-    """Write the output before the first usable sample: the friction prior, and zero motion with a
-    large standard deviation.
+    """Write to `output` the estimates before the first usable sample: the friction prior, and zero
+    motion with a large standard deviation.
     """
     write_unknown(output)
     for k, level in enumerate((0.5, LOWER_END, UPPER_END)):

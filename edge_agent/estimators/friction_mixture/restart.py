@@ -48,7 +48,7 @@ def start_vehicle(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
     """Start the filter of a vehicle at its first sample with a finite time; return the health
-    flags. All fields of the memory must be zero before the call.
+    flags. All fields of `memory`, the state of the filter, must be zero before the call.
     """
     if not math.isfinite(time):
         return flags.TIME_GAP

@@ -77,8 +77,8 @@ from schemas.runtime.jit import compiled
 def step(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray
 ) -> int:
-    """Process one sample (18,) of a vehicle at `time` [s] with the default estimator's filter;
-    return the health flags of this sample only.
+    """Process one sample (18,) of a vehicle at `time` [s] with the default estimator's filter.
+    Return the health flags that belong to this sample only.
     """
     if not memory.started:
         return start_vehicle(memory, design, scratch, time, sample) | flags.RESET
@@ -150,7 +150,7 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
 @compiled
 def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Compute the friction interval, the grip used in the last second, and the health flag for
-    sliding wheels.
+    sliding wheels, and store them in `memory`.
     """
     _find_friction(memory, design, scratch)
     note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))
@@ -211,11 +211,11 @@ def mean_velocity(memory: MixtureMemory) -> tuple[float, float]:
 def turned_velocity(
     memory: MixtureMemory, gain: VelocityGain, cos: float, sin: float
 ) -> tuple[float, float]:
-    """Return the mixture's velocity (v_x, v_y) [m/s] at the current time, in the current vehicle
-    axes.
+    """Return the mean velocity (v_x, v_y) [m/s] of the mixture of filters at the current time, in
+    the current vehicle axes.
 
-    Since the block (0.05 s) began, the vehicle has turned by an angle with this cosine and sine,
-    and has gained the velocity `gain`.
+    Since the block (0.05 s) began, the vehicle has turned by the angle with cosine `cos` and sine
+    `sin`, and has gained the velocity `gain`.
     """
     x = memory.overall_mean
     gained_x, gained_y = gained_velocity(

@@ -154,7 +154,7 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
     """Run one step of the motion filter: share the information between both sub-filters, predict by
     `dt` [s], update and fuse them.
 
-    The friction (4,) of the wheels is given.
+    `friction` (4,) is the friction of the wheels, which the filter does not estimate.
     """
     motion = memory.motion
     track = memory.track
@@ -236,10 +236,11 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
 
 @compiled
 def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_rate: int) -> float:
-    """Return the mean speed [m/s] in the rolling direction of the wheels whose speed is measured.
+    """Return the mean velocity [m/s] of the wheel centres in their rolling direction, over the
+    wheels whose speed is measured.
 
-    The motion is given by the state `x`: x[0] and x[1] are v_x and v_y, x[yaw_rate] is the yaw
-    rate.
+    The velocity follows from the vehicle's motion in the state `x`: x[0] and x[1] are v_x and v_y,
+    x[yaw_rate] is the yaw rate.
     """
     total = 0.0
     count = 0
@@ -253,8 +254,8 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 
 @compiled
 def widened_speed_std(std: float, innovation: float) -> float:
-    """Return the standard deviation [m/s] of the measured wheel speed, increased for a large
-    innovation (measurement minus prediction).
+    """Return the standard deviation `std` [m/s] of the measured wheel speed, increased if the
+    innovation (measurement minus prediction) is large.
 
     The increase limits the innovation to FARTHEST standard deviations, so that spinning or locked
     wheels have little effect.

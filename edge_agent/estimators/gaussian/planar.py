@@ -58,8 +58,8 @@ class HeunInputs(NamedTuple):
 
 
 class PlanarStep(NamedTuple):
-    """Step of the process model: its length `dt` [s], and the source of the longitudinal tyre
-    forces.
+    """Length `dt` [s] of a step of the process model, and the source of the longitudinal tyre
+    forces. `by_torque`: the wheels' torques; `by_motor`: one motor per axle; neither: the slip.
     """
 
     dt: float
@@ -84,15 +84,16 @@ def propagate_points(
     track: InputTrack,
     step: PlanarStep,
 ) -> None:
-    """Advance the states in the columns (6, POINTS), one per cubature point, by one step, in place.
+    """Advance the vehicle states by one step. Each of the `columns` (6, POINTS) is the state of one
+    cubature point, and is changed in place.
 
     Inputs change linearly from the previous sample to the current sample. `step` selects the source
     of the longitudinal forces. With `by_torque`, longitudinal forces come from the wheels' torque,
-    z is the yaw acceleration, and friction (4,) is given. The velocity is then integrated from the
-    states a_x and a_y alone; the measurements correct these states for drag and slopes. Without
-    `by_torque`, forces come from slip and z is the friction of all wheels. With `by_motor`,
-    longitudinal forces come from the torque of each axle's motor, half to each wheel; z is still
-    friction.
+    the last state z is the yaw acceleration, and friction (4,) is given. The velocity is then
+    integrated from the states a_x and a_y alone; the measurements correct these states for drag and
+    slopes. Without `by_torque`, forces come from slip and z is the friction of all wheels. With
+    `by_motor`, longitudinal forces come from the torque of each axle's motor, half to each wheel; z
+    is still friction.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):
@@ -125,8 +126,8 @@ def propagate_points(
 def _apply_heun_step(
     vehicle: Body, columns: FloatArray, first: int, last: int, drive: HeunInputs
 ) -> None:
-    """Advance the vehicle states in the columns first to last - 1 by one step of Heun's rule, in
-    place.
+    """Advance the vehicle states in the columns `first` to `last` - 1 of `columns` by one step of
+    Heun's rule, in place. `drive` are the inputs at both ends of the step.
 
     The function is pure arithmetic, so that the compiler can process several points in parallel.
     """

@@ -51,9 +51,11 @@ PRIOR_ROOT = prior_root()
 
 @compiled
 def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: FloatArray) -> None:
-    """Move the friction of four wheels towards the prior over `metres`, in place.
+    """Move the estimated friction of four wheels towards the prior for a distance of `metres` [m],
+    in place.
 
-    Shapes: mean (4,), root (4, 4), scratch array `work` (4, 8) or larger.
+    `mean` (4,) and `root` (4, 4) are the friction and the root of its covariance; `work` is a
+    scratch array (4, 8) or larger.
     """
     keep = math.exp(-metres / FORGET_M)
     fresh = math.sqrt(max(1.0 - keep * keep, 0.0))
@@ -92,8 +94,8 @@ def visible_share(demand: float) -> float:
 
 @compiled
 def mean_friction(mean: FloatArray, root: FloatArray, first: int) -> tuple[float, float]:
-    """Return (mean, standard deviation) of the average of the four frictions in states `first` to
-    `first` + 3.
+    """Return (mean, standard deviation) of the average friction of the four wheels. The frictions
+    are the states `first` to `first` + 3 of a filter with mean `mean` and covariance root `root`.
     """
     total = 0.0
     square = 0.0

@@ -43,8 +43,8 @@ AS_PRINTED: Final = FederatedSetting()
 
 
 def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
-    """Run the friction filter of paper 000 as printed over a drive; return the friction of the four
-    wheels at each sample, (T, 4).
+    """Run the friction filter of paper 000 as printed over a drive. Return the friction of the four
+    wheels at each sample, (T, 4), in a `FrictionRun`.
     """
     forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
     given_x = given.wheel_forces()
@@ -82,8 +82,8 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
 
 
 def _cubature_points(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return cubature points (8, 4) for a mean (4,) and covariance (4, 4), with the square root by
-    singular values.
+    """Return the cubature points (8, 4) of a state with mean (4,) and covariance (4, 4). The square
+    root of the covariance is computed by singular values.
     """
     axes, sizes, _ = np.linalg.svd(covariance)
     spread = np.sqrt(STATES) * (axes * np.sqrt(sizes)).T

@@ -2,10 +2,10 @@
 it.
 
 The filter has four states, given motion and unscented points. State mu_fl, mu_fr, mu_rl, mu_rr, a
-random walk. Measurement [a_x, a_y, r] (section 3.1). The filter measures the yaw rate r over one
-sample, so this row is the yaw acceleration r' [rad/s^2]. With `torque_rows`, the measurement also
-has the longitudinal force F_x of each wheel from its torque balance. Without these rows, only two
-of the four frictions are observable on a straight road.
+random walk. Measurement [a_x, a_y, r] (section 3.1). The code uses the change of the yaw rate r
+over one sample. Therefore the third measurement is the yaw acceleration r' [rad/s^2]. With
+`torque_rows`, the measurement also has the longitudinal force F_x of each wheel from its torque
+balance. Without these rows, only two of the four frictions are observable on a straight road.
 
 Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0,
 d = sum of w*e_i.
@@ -141,8 +141,8 @@ class _Model:
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a square root of the covariance columns*columns' as the singular vectors U and values
-    s of `columns`: columns*columns' = U*s^2*U'. The values are never negative.
+    """Return a square root of the covariance columns*columns', as the singular vectors U and the
+    singular values s of `columns`: columns*columns' = U*s^2*U'. The values s are never negative.
     """
     axes, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return axes, sizes
@@ -154,8 +154,8 @@ def _square_root_step(
     """Run one step of the friction filter in square-root form. This form does not use `covariance`
     and returns it unchanged.
 
-    Return (mean, covariance, root, False). The last item tells whether a Cholesky factor was
-    missing; in this form it never is.
+    Return (mean, covariance, root, False). The last item is True if a Cholesky factor was missing,
+    which never happens in this form.
     """
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
     points = model.sigma_points(mean, axes * sizes)

@@ -143,11 +143,11 @@ def bus_of(channel: Any) -> int:  # noqa: ANN401 a number, a name or None
 
 
 def _find_messages(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
-    """Return, by message name, the key (bus, identifier, extended) under which the log has the
-    message.
+    """Return, for each of the `messages` that the log contains, the key (bus, identifier, extended)
+    of its frames in the log, by message name.
 
-    If the bus of a message is not given, the buses are searched in order of their number of frames
-    of all these messages, largest first.
+    `buses` states the bus of some messages. For any other message the buses are searched, first the
+    bus with the most frames of the `messages`.
     """
     counts: dict[int, int] = defaultdict(int)
     for message in messages:

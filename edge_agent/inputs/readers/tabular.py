@@ -1,5 +1,5 @@
 """Reader of tables (CSV and Parquet) with one row per sample; every numeric column becomes a
-series.
+recorded signal.
 
 The time column is `t` [s], `timestamp`, or a column with a name such as `time`. The name of a
 column may contain its unit: `speed [km/h]`.

@@ -4,9 +4,9 @@ block (the samples within 0.05 s).
 Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
 force m*a_x is divided among the axles, with a larger standard deviation, because this division is
 uncertain (`drive_split.py`). On a slope or bank (lateral slope) an accelerometer also measures
-gravity, and the tyres must carry exactly this force. Therefore the forces here include slope and
-bank; offsets of the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper
-004, equation 2; errata 000 on signs and arms).
+gravity. The tyres carry exactly this force. Therefore the forces here include slope and bank, but
+offsets of the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper 004,
+equation 2; errata 000 on signs and arms).
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ LIKELY = 2.0  # of the estimated difference of the wheel radii
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on the measurement noise R of the axle forces. It grows with the strain
-    (deviation of the vehicle and sensor states from their prior), because a car that deviates in
-    its known errors also has larger unknown ones.
+    """Return the factor by which the measurement noise R of the axle forces is multiplied. It grows
+    with the strain, the deviation of the vehicle and sensor states from their prior. A car that
+    deviates much in these known errors probably also has large unknown errors.
     """
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
@@ -60,7 +60,7 @@ def strained_noise(trust: Trust, constants: Constants) -> float:
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
     """Compute the inputs of the measurement equations from the sums of the block (the samples
     within 0.05 s), and write them to `features`; return the health flags. The caller has already
-    set duration and speed.
+    set `duration` and `speed` of `features`.
     """
     row = memory.row
     last = memory.last
@@ -94,7 +94,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
 @compiled
 def _turn_wheel(row: FloatArray, features: BlockFeatures, wheel: int) -> None:
     """Compute the part of the velocity of a wheel's centre that the car's yaw rate causes, along
-    and across the wheel [m/s].
+    and across the wheel [m/s], and write it to `features`.
     """
     x, y = wheel_position(row, wheel)
     ahead = -y * features.yaw_rate
@@ -138,9 +138,9 @@ def _steer_rate(memory: MixtureMemory, duration: float) -> float:
 def _compute_wheel_forces(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> int:
-    """Compute the longitudinal force over load of the four wheels; return the health flags. The
-    noise of these forces is written to `features.noise_std`, to which `_compute_noise` later adds
-    the other noise.
+    """Compute the longitudinal force over load of the four wheels, and return the health flags. The
+    standard deviations of these forces are written to `features.noise_std`; `_compute_noise` later
+    adds the other noise.
     """
     health = 0
     loads = features.loads
@@ -202,10 +202,10 @@ def lone_axle(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> bool:
-    """Return True if the torque signal of an axle does not include its brakes.
+    """Return True if the torque signal of an axle apparently does not include the brakes.
 
     This is the case while the car brakes but the known torque is less than half of the usual brake
-    torque of that axle. A signal of powertrain torque does not include the brakes.
+    torque of that axle. For example, a signal of powertrain torque does not include the brakes.
     """
     usual = BRAKES_FRONT if axle == 0 else 1.0 - BRAKES_FRONT
     least = 0.5 * usual * memory.row[Parameter.MASS] * features.change
@@ -214,7 +214,9 @@ def brakes_untold(memory: MixtureMemory, features: BlockFeatures, axle: int) -> 
 
 @compiled
 def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> float:
-    """Return the longitudinal force [N] of an axle whose torque is known."""
+    """Return the longitudinal force [N] of the axle with index `axle`, computed from the torques of
+    its two wheels.
+    """
     row = memory.row
     total = 0.0
     for wheel in range(2 * axle, 2 * axle + 2):
@@ -261,8 +263,8 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
-    """Set the lateral force of an axle to NaN if it cannot be used: the slip is unknown without the
-    steering angle, and the force is unknown without the yaw rate. Return the health flags.
+    """Set the lateral force of an axle to NaN if it cannot be used, and return the health flags.
+    Without the steering angle the slip of the axle is unknown, and without the yaw rate its force.
     """
     health = 0
     counts = memory.block.counts
@@ -280,10 +282,10 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
-    """Write the standard deviation of each measurement residual to `features.noise_std`, and the
-    noise of the slips. A residual is the total-least-squares distance of the measured point (slip,
-    force) from the tyre curve. Therefore the noise of slip and the noise of force each enter with
-    half of their variance.
+    """Write the standard deviation of each measurement residual, and the variance of the slip
+    noise, to `features`. A residual is the distance of the measured point (slip, force) from the
+    tyre curve. Slip and force count equally in this distance, so half of the variance of the slip
+    noise enters.
     """
     row = memory.row
     constants = design.constants
@@ -370,8 +372,8 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute features.informs_x and features.informs_y of both axles: factors, 0 to 1, on the
-    effect that the filter's stiffness states have on the computed slips of the axle.
+    """Compute features.informs_x and features.informs_y of both axles. These are factors, 0 to 1,
+    by which the effect of the filter's stiffness states on the axle's computed slips is multiplied.
 
     The factors are near 0 at small forces. There the slip is mostly noise, and without the factors
     the filter would learn a wrong stiffness from it.
@@ -389,8 +391,8 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Compare the slip of the left and right wheel of each axle. Return the largest difference over
-    both axles, minus the part that the wheels' forces explain.
+    """Return the largest difference in slip between the left and right wheel of an axle, over both
+    axles, minus the part that the forces of these wheels explain.
 
     Slip is expressed as the force over load of a linear tyre [1]. Wheels of unequal radius always
     differ in slip. Therefore the estimated difference of the radii is subtracted, with an allowance
@@ -425,11 +427,11 @@ def unexplained_slip_difference(
 
 @compiled
 def grip_demand(features: BlockFeatures) -> float:
-    """Return the force over load [1] of the axle that uses more, from longitudinal and lateral
-    force together. A missing lateral force counts as zero.
+    """Return the force over load [1], longitudinal and lateral together, of the axle for which it
+    is larger. A missing lateral force counts as zero.
 
-    The forces of the two wheels of an axle are added, because force over load of an almost unloaded
-    inner wheel would be unreliable.
+    The forces of the two wheels of an axle are added, because the force over load of an almost
+    unloaded inner wheel would be unreliable.
     """
     most = 0.0
     for axle in range(2):

@@ -1,10 +1,11 @@
 """Split of the longitudinal force between front and rear axle where torque is missing.
 
-The filter learns from the slip of the axles which of them are driven. When a car accelerates, its
+The filter learns from the slip of the axles which axles are driven. When a car accelerates, its
 driven axle turns faster than the other one, by the slip that its force needs. Brisk driving
 distinguishes front, rear and all-wheel drive within a second. When a car brakes, the front axle
-takes the larger share on all cars. On low friction a wheel slips more than its force requires.
-Therefore more slip than a kind of drive predicts is no evidence against this kind; less slip is.
+takes the larger share on all cars. A kind of drive (front, rear, all-wheel) predicts the slip of
+each axle. On low friction a wheel slips more than its force requires. Therefore less slip than
+predicted is evidence against a kind of drive, but more slip is not.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ LEAST_ODDS = 1e-4  # smallest probability of a kind, so that an error is correct
 @compiled
 def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
     """Return the front axle's share of the longitudinal force at acceleration `ax` [m/s^2], and the
-    standard deviation of the share. `odds` are the probabilities of rear, all-wheel and front
-    drive.
+    standard deviation of the share. `odds` (3,) are the probabilities that the car has rear,
+    all-wheel and front drive.
     """
     front = row[Parameter.DRIVE_FRONT]
     spread = SHARE_STD

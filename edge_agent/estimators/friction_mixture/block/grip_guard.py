@@ -1,6 +1,6 @@
 """The grip in use (force over load) as a lower limit of friction: a tyre cannot transmit more than
-its friction. Friction hypotheses below it get a penalty, and the upper end of the reported interval
-is never below it.
+its friction. Friction hypotheses below the grip in use get a penalty, and the upper end of the
+reported friction interval is never below it.
 """
 
 from __future__ import annotations
@@ -43,19 +43,21 @@ def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
 
 @compiled
 def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
-    """Return the penalty [nat] of a friction hypothesis (node): side_mu (2,) is its friction on the
-    left and right. The penalty is 0 unless this friction lies below the grip in use."""
+    """Return the penalty [nat] of a friction hypothesis that lies below the grip in use. `side_mu`
+    (2,) is the hypothetical friction on the left and right side; their mean counts. The penalty is
+    0 if this mean is not below the grip in use.
+    """
     lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
     return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, constants.largest_loss))
 
 
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
-    """Return the upper end of the friction interval: the larger of `friction.upper` and the recent
-    grip in use plus ABOVE.
+    """Return the upper end of the reported friction interval. It is the larger of `friction.upper`
+    and the recent grip in use plus ABOVE.
 
-    The result may exceed 1.2, the end of the friction grid, because the friction of racing tyres
-    does.
+    The result may exceed 1.2, the end of the friction grid, because racing tyres have a larger
+    friction.
     """
     return max(friction.upper, grip.held + ABOVE)
 
@@ -66,12 +68,12 @@ def lower_while_sliding(slides: float, used: float, lower: float) -> float:
 
     A sliding tyre may be at its peak: its force lies between the peak and the smaller force of full
     sliding. Only slip distinguishes these two cases, and slip is uncertain because in a slide no
-    wheel rolls freely and shows the speed. Therefore the lower end is at most AT_PEAK times the
-    grip in use.
+    wheel rolls freely and shows the speed. Therefore, if `slides` is 1, the lower end is at most
+    AT_PEAK times the grip in use.
 
     Args:
         slides: fuzzy degree to which a wheel slides, 0 to 1.
-        used: grip used within the last second, of the axle that uses more [1].
+        used: grip (force over load) used within the last second, of the axle that uses more [1].
         lower: lower end according to the probabilities of the assumed friction values [1].
     """
     return lower - slides * max(lower - AT_PEAK * used, 0.0)

@@ -1,10 +1,10 @@
 """Intake of a sample: it rejects impossible readings, filters the yaw rate, and adds the sample to
 the sums of the block (the samples within 0.05 s).
 
-Missing accelerations are replaced: a_x by zero and a_y by r*v_x (yaw rate times speed), both with
-the process noise of a random walk. A missing yaw rate is replaced by that from the speed difference
-of the rear wheels, and missing steering by its last value. All other missing readings are left out
-of the sums.
+Missing accelerations are replaced: a_x by zero and a_y by r*v_x (yaw rate times speed). In both
+cases the velocity gets the process noise of a random walk. A missing yaw rate is replaced by that
+from the speed difference of the rear wheels, and missing steering by its last value. All other
+missing readings are left out of the sums.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ def take_sample(
 
 @compiled
 def begin_block(memory: MixtureMemory) -> None:
-    """Clear the sums and begin a new block (the samples within the next 0.05 s) at the last
-    sample."""
+    """Clear the sums in `memory`, and begin a new block (the samples within the next 0.05 s) at the
+    last sample.
+    """
     last = memory.last
     block = memory.block
     block.time = last.time

@@ -1,8 +1,8 @@
 """Reported grip in use: the larger force over load of the two axles, smoothed over SMOOTH_S.
 
-The reported value is the largest of the last second. It is smoothed because the largest of twenty
-noisy values would show the sensor noise more than the tyre forces. The value that weights the
-evidence on friction is not smoothed.
+The reported value is the largest one of the last second. The force is smoothed first, because the
+largest of twenty noisy values would show the sensor noise more than the tyre forces. The value that
+weights the evidence on friction is not smoothed.
 
 Where torque is missing, the brakes are assumed to load both axles in proportion to their load. This
 is how ABS and brake-force distribution act near the limit. With a fixed share instead, the force of
@@ -26,8 +26,8 @@ MOST_USED = 1.5
 
 @compiled
 def used_grip(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the force over load [1], smoothed over time, of the axle that uses more. The smoothed
-    forces in `memory` are updated.
+    """Return the grip in use [1]: the larger force over load of the two axles, smoothed over time.
+    The smoothed forces in `memory` are updated with the block (the samples within 0.05 s).
     """
     share = 1.0 - math.exp(-features.duration / SMOOTH_S)
     most = 0.0

@@ -26,8 +26,8 @@ STEP_PACE = 0.1  # [1] weight of a new step in the moving average of steps
 
 @compiled
 def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
-    """Set wheel speeds in the readings `now` (15,) to NaN where they are far above the other
-    wheels; return the health flags.
+    """Set wheel speeds in the readings `now` (15,) to NaN where they are impossibly far above the
+    speeds of the other wheels. Return the health flags.
     """
     slowest = second = math.inf
     for wheel in range(4):
@@ -46,9 +46,11 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
 
 @compiled
 def note_step(last: LastInputs, wheel: int, omega: float) -> None:
-    """Update the estimated resolution (smallest step) of a wheel speed signal with a reading.
+    """Update the estimated resolution (smallest step) of the speed signal of a wheel with its new
+    reading `omega` [rad/s].
 
-    A speed that stays constant over several readings and then jumps is quantised in steps.
+    A speed that stays constant over several readings and then changes is quantised; the change is
+    one step.
     """
     change = abs(omega - last.omega[wheel])
     if change < SAME_RAD_S:

@@ -72,7 +72,9 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
 
 @compiled
 def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
-    """Return True if the wheel that deviates most from the car's speed is a front wheel."""
+    """Return True if, of all wheels, a front wheel deviates most from the estimated speed of the
+    car.
+    """
     front = 0.0
     rear = 0.0
     for wheel in range(4):

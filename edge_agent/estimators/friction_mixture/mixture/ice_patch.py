@@ -1,4 +1,4 @@
-"""Model of short ice patches: on bridges, in shade, where water ran over the road.
+"""Model of short ice patches, which occur on bridges, in shade, or where water ran over the road.
 
 After a few metres without large tyre forces, the estimator lowers the lower end of the friction
 interval, because the road may be icy again. The median is unaffected. The mixture assumes that the

@@ -58,8 +58,8 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def active_nodes(memory: MixtureMemory) -> int:
-    """Return the number of active nodes (friction hypotheses): NODES, or ALL_NODES while the nodes
-    of split roads (different friction left and right) are active too.
+    """Return the number of active nodes (friction hypotheses). It is NODES, or ALL_NODES while the
+    nodes of split roads (different friction left and right) are active too.
     """
     return ALL_NODES if memory.split else NODES
 
@@ -92,7 +92,9 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def _put_moments(memory: MixtureMemory, node: int) -> None:
-    """Set mean and covariance of a node (friction hypothesis) to those of the whole mixture."""
+    """Set mean and covariance of the node (filter of one friction hypothesis) with number `node` to
+    those of the whole mixture.
+    """
     group = node // LANES
     lane = node % LANES
     for i in range(STATES):
@@ -105,11 +107,11 @@ def _put_moments(memory: MixtureMemory, node: int) -> None:
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Account for a possible change of the road within `metres`: move probability between the nodes
-    (friction hypotheses).
+    """Move probability between the nodes (friction hypotheses), because the road may have changed
+    within the last `metres`.
 
-    Also compute scratch.mixing, per node the share of its probability that came from other nodes.
-    `mix_nodes` then replaces this share of the node's state by that of the whole mixture.
+    Also compute scratch.mixing: for each node, the share of its probability that came from other
+    nodes. `mix_nodes` then replaces this share of the node's state by that of the whole mixture.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -143,12 +145,14 @@ def carried_degree(memory: MixtureMemory, constants: Constants, demand: float) -
     """Return the fuzzy degree, 0 to 1, to which the tyres carry as much force as the slippery road
     allows.
 
-    A wheel that grips again after a slide shows another road only if it carries such a force. If
-    the driver has released the brake or the accelerator, the wheel grips on the slippery road too.
+    A wheel that grips again after a slide proves that the road has changed only if it carries such
+    a force. If the driver has released the brake or the accelerator, the wheel grips on the
+    slippery road too.
 
     Args:
         memory: state of the filter; its friction is that of the road before.
-        constants: with `carried_share`, where the degree begins; it is 1 at twice this share.
+        constants: contain `carried_share`, the share of the slippery road's friction up to which
+            the degree is 0; it is 1 from twice this share.
         demand: larger force over load of the two axles [1].
     """
     slippery = min(memory.friction_left.median, memory.friction_right.median)

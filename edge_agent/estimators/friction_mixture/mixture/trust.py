@@ -2,25 +2,25 @@
 contradictions between model and measurements.
 
 **Strain** is the chi-square of the estimated vehicle and sensor states against their prior, divided
-by the degrees of freedom that have been learned (Birge 1932). Errors have common causes. In a car
-with small offsets, lags, and radius and steering errors, the other errors of the axles are small
-too; with large ones, the other errors are large. Therefore strain scales the measurement noise R of
-the axles. It is also an input of the rules that decide how much of the evidence on friction is
+by the degrees of freedom that have been learned (Birge 1932). Errors have common causes. If a car
+has small offsets, lags, radius errors and steering errors, the other errors of its axles are small
+too. If these errors are large, the others are large. Therefore strain scales the measurement noise
+R of the axles. It is also an input of the rules that decide how much of the evidence on friction is
 used.
 
 **Contradiction** is a sequential test of two hypotheses (after Page 1954): that the model holds, or
-that the axles' innovations have FACTOR times the stated variance. The second case occurs with
-delayed steering signals or on the banking of a race track. Data that ice explains do not count
-against the model, and neither do unusual vehicle states alone. The sum of the log-likelihood ratios
-against the model is `odd` [nat]; old terms fade within minutes. Straight driving does not count in
-favour of the model, because the model cannot fail there. Once `odd` reaches the threshold
-`odd_least`, the filter draws no conclusions. The friction interval and the vehicle states then
-return to their prior, and the axles do not affect the motion. The test leaves out slides, slippery
-road and walking pace (`unexplained_ratio`).
+that the axles' innovations have FACTOR times the stated variance. The second case occurs, for
+example, with delayed steering signals or on the banking of a race track. Data that ice explains do
+not count against the model, and neither do unusual vehicle states alone. The sum of the
+log-likelihood ratios against the model is `odd` [nat]; old terms fade within minutes. Straight
+driving does not count in favour of the model, because the model cannot fail there. Once `odd`
+reaches the threshold `odd_least`, the filter draws no conclusions. The friction interval and the
+vehicle states then return to their prior, and the axles do not affect the motion. The test leaves
+out slides, slippery road and walking pace (`unexplained_ratio`).
 
 While the filter draws no conclusions, the model cannot be tested. After `patience` [s] the filter
-tries it again. Each further contradiction makes that time four times as long, because sensors do
-not repair themselves. A motion reset by the wheel speeds counts as half a contradiction.
+uses the model again. Each further contradiction makes that time four times as long, because sensors
+do not repair themselves. A motion reset by the wheel speeds counts as half a contradiction.
 """
 
 from __future__ import annotations
@@ -147,10 +147,10 @@ def mixture_cost(mean: FloatArray, nominal: Nominal) -> float:
 @compiled
 def belief_strain(cost: float, learned: float, prior: float) -> float:
     """Return the strain (chi-square per degree of freedom) of the estimated vehicle and sensor
-    states. `cost` [nat] is half of their chi-square against the prior.
+    states. `cost` [nat] is half of the chi-square of these states against their prior.
 
-    `learned` is the number of degrees of freedom that measurements have determined. `prior` is the
-    number of assumed further degrees of freedom, with chi-square 1 each, so that the result is 1 if
+    `learned` is the number of degrees of freedom that measurements have determined. `prior` further
+    degrees of freedom are assumed, with a chi-square of 1 each. Therefore the result is 1 if
     nothing was learned.
     """
     return (2.0 * cost + prior) / (learned + prior)
@@ -161,7 +161,7 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
     """Return the effective number of learned vehicle and sensor states.
 
     Each state counts by the share of its prior variance that the measurements have removed.
-    `covariance` (n, n) is that of the current estimate.
+    `covariance` (n, n) is the covariance of the current estimate, and `nominal` contains the prior.
     """
     total = 0.0
     for i in range(NodeState.LN_KX, covariance.shape[0]):
@@ -172,8 +172,8 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 @compiled
 def nominal_agreement(trust: Trust, constants: Constants) -> float:
     """Return the degree, 0 to 1, to which the car agrees with its vehicle file. It decreases
-    linearly with the strain (deviation of the states from their prior): 1 without strain, 0 if the
-    strain has its usual value or more.
+    linearly with the strain (deviation of the states from their prior). It is 1 without strain, and
+    0 if the strain has its usual value or more.
     """
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 

@@ -2,9 +2,9 @@
 weaken (temper) the likelihoods, and the measurement noise R is adapted.
 
 While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
-the evidence of such blocks counts less. Where a bend becomes icy the forces stay the same and the
-slip grows, so a change of force or of slip makes the evidence count in full. Where an axle has slid
-and grips again at the same force, the ice has probably ended (`mixing.py`).
+the evidence of such blocks counts less. Where a bend becomes icy, the forces stay the same and the
+slip grows. Therefore a change of force or of slip makes the evidence count in full. Where an axle
+has slid and grips again at the same force, the ice has probably ended (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Advance all groups of active nodes (filters of one friction hypothesis each) by one block
     (0.05 s). Mix their states after a road change, apply the measurements, and predict to the
-    block's end. Store the predictive log-likelihood of the mixture and its NIS (squared
-    innovations, that is, measurement minus prediction, over their variances; mean over the
-    measurements).
+    block's end. Store the predictive log-likelihood of the mixture, and its NIS. The NIS is the
+    squared innovation (measurement minus prediction) over its variance, averaged over the
+    measurements.
     """
     features = scratch.features
     inflation = max(design.constants.correlation_time / features.duration, 1.0)
@@ -165,8 +165,8 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
-    """Return how much the log-likelihood of a node (friction hypothesis) is reduced [nat] because
-    the measurement moved its vehicle states away from their prior.
+    """Return the amount [nat] by which the log-likelihood of a node (friction hypothesis) must be
+    reduced because the measurement moved the node's vehicle states away from their prior.
 
     `price` is the increase of the node's penalty by the block (0.05 s). A negative result (refund)
     never exceeds the amount charged before.
@@ -182,9 +182,11 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the weight, 0 to 1, of the evidence from slip at the speed `vx` [m/s] or, if a wheel
-    is faster, at the speed of the fastest wheel: 0 up to SLOWEST_M_S, 1 from twice that speed. At
-    low speed, slip is a quotient of small numbers.
+    """Return the weight, 0 to 1, of the evidence from slip. At low speed the weight is small,
+    because slip is then a quotient of small numbers.
+
+    The speed is `vx` [m/s], or that of the fastest wheel if this is larger. The weight is 0 up to
+    SLOWEST_M_S, 1 from twice that speed, and linear between them.
     """
     fastest = abs(vx)
     for wheel in range(4):
@@ -197,8 +199,9 @@ def slip_meaning(features: BlockFeatures, vx: float) -> float:
 def update_novelty(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
 ) -> None:
-    """Compute two fuzzy truth values, 0 to 1: features.new ("forces or slips are new") and
-    memory.slip.axle_ended ("the slide has ended"). Update the smoothed usual forces and slips.
+    """Compute two fuzzy truth values, 0 to 1: features.new ("forces or slips have just changed")
+    and memory.slip.axle_ended ("a slide of an axle has ended"). Update the moving averages of the
+    forces and slips, which serve as their usual values.
 
     (vx, vy) [m/s] is the mean velocity in the block (0.05 s).
     """

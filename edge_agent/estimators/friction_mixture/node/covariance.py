@@ -37,8 +37,8 @@ def symmetric_at(covariance: FloatArray, i: int, j: int) -> float:
 
 @compiled
 def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
-    """Compute the first columns of the lower-triangular factors of the covariances: root (n,
-    CURVED, LANES). A pivot (squared diagonal element) is at least LEAST_VARIANCE.
+    """Compute the first columns of the lower-triangular factors of the covariances, and write them
+    to `root` (n, CURVED, LANES). A pivot (squared diagonal element) is at least LEAST_VARIANCE.
     """
     for j in range(CURVED):
         total = lanes_at(covariance, (j, j))
@@ -60,9 +60,10 @@ def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
 def subtract_row(
     mean: FloatArray, covariance: FloatArray, h: FloatArray, per: float, step: float
 ) -> None:
-    """Apply one scalar measurement to the filters of a group: m += h*step and P -= h*h'*per. Here
-    `h` (n, LANES) is the covariance of the states with the measurement, `step` is nu/a (innovation
-    over its variance) and `per` is 1/a.
+    """Apply one scalar measurement to the filters of a group of nodes (friction hypotheses): m +=
+    h*step and P -= h*h'*per, with the means m and the covariances P. Here `h` (n, LANES) is the
+    covariance of the states with the measurement, `step` is nu/a (innovation over its variance) and
+    `per` is 1/a.
     """
     for i in range(mean.shape[0]):
         own = lanes_at(h, i)
@@ -81,8 +82,8 @@ def mix_states(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Replace the share z of each node's state by the state of the whole mixture (moment matching).
-    `mean` (n, LANES) and `covariance` are changed in place.
+    """Replace the share z of the state of each node (friction hypothesis) by the state of the whole
+    mixture (moment matching). `mean` (n, LANES) and `covariance` are changed in place.
     """
     for i in range(mean.shape[0]):
         apart = z * (1.0 - z) * (overall_mean[i] - lanes_at(mean, i))
@@ -162,8 +163,8 @@ def _turn_column(
     bias_y: float,
 ) -> tuple[float, float]:
     """Return the first two elements of F*c, where F is the prediction matrix and c a column of a
-    covariance. Only those elements of c that count are given: velocity (v_x, v_y), leak (share of
-    a_y that is gravity) and accelerometer offsets.
+    covariance. The arguments are those elements of c that affect the result: velocity (v_x, v_y),
+    leak (share of a_y that is gravity) and accelerometer offsets.
     """
     cos, sin = turn
     vx, vy = velocity

@@ -43,8 +43,8 @@ def linearize_nodes(
 ) -> float:
     """Linearise the measurement equations (rows) of a group of nodes (friction hypotheses) at their
     `mean` (n, LANES). Compute tyre forces over load, residuals, noise, and node.derivative, the
-    derivatives of the rows by the linear states. Return the penalty [nat] of each node for sliding
-    wheels.
+    derivatives of the rows by the linear states. Return the penalty [nat] that each node gets for
+    sliding wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
     Therefore the derivative by the leak is a multiple of the derivative by the offset.
@@ -183,7 +183,7 @@ def weigh_slopes(
     curve: TyreCurve, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
     """Compute node.noise, the noise variances of the six residuals (four wheels, two axles) at the
-    slips node.slip. Return a penalty [nat] per node for sliding wheels.
+    slips node.slip. Return a penalty [nat] for sliding wheels per node (friction hypothesis).
 
     The penalty is for wheels on the flat part of the tyre curve. There a wheel may have any slip,
     so the probability density of the measured slip is low.
@@ -233,8 +233,8 @@ def slope_along(slope: float, ratio: float, square: float, whole: float) -> floa
 
 @inlined
 def slip_noise_correction(slope: float) -> float:
-    """Return by how much the noise variance of a residual must be reduced, as a share of the slip
-    noise variance, for a given slope of the tyre curve.
+    """Return the amount by which the noise variance of a residual must be reduced where the tyre
+    curve has the slope `slope`. It is given as a share of the slip noise variance.
 
     A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
     the slip noise enters it (errors in variables). features.noise_std contains one half, the share

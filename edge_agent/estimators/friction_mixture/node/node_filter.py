@@ -227,8 +227,8 @@ def spread_points(
 
 @compiled
 def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Compute node.cross, the covariance of the states with each of the six measurements, and
-    node.spread, the covariance of the measurements with each other.
+    """Compute node.cross, the covariance of the states with each of the six measurements (four
+    wheels, two axles), and node.spread, the covariance of the measurements with each other.
     """
     derivative = node.derivative
     for i in range(STATES):
@@ -256,8 +256,8 @@ def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
 
 @compiled
 def doubted_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor on the measurement noise R of the axles while the consistency test doubts
-    the model.
+    """Return the factor by which the measurement noise R of the axles is multiplied when
+    measurements contradict the model.
 
     It grows with the evidence against the model, so that contradicting readings do not change the
     motion estimate.
@@ -269,8 +269,9 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
-    """Return the factor on the measurement noise R of the rear axle. It is above 1 while the front
-    axle is already on another surface, because then no single friction explains both axles.
+    """Return the factor by which the measurement noise R of the rear axle is multiplied. It is
+    above 1 while the front axle is already on another surface, because then no single friction
+    explains both axles.
     """
     return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
@@ -345,8 +346,8 @@ def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
 
 @inlined
 def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Subtract from the state covariances the part that the measurements explain. It is h*h'*gain
-    for each measurement, where h is the covariance of the states with it.
+    """Subtract from the state covariances the part that the measurements explain. For each
+    measurement it is h*h'*gain, where h is the covariance of the states with the measurement.
     """
     for i in range(STATES):
         for r in range(ROWS):

@@ -61,7 +61,9 @@ FLATTEST = 0.03
 
 @inlined
 def is_measured(features: BlockFeatures, r: int) -> bool:
-    """Return True if all readings for residual r (0 to 3 wheels, 4 and 5 axles) are known."""
+    """Return True if the readings that residual number r needs are known. Residuals 0 to 3 belong
+    to the wheels, 4 and 5 to the axles.
+    """
     reading = features.rolling[r] if r < 4 else features.side[r - 4]
     return not math.isnan(reading)
 
@@ -86,9 +88,9 @@ def gained_velocity(
     """Return the velocity (forward, left) [m/s] that the vehicle gains in the block (0.05 s),
     integrated from the accelerometers.
 
-    It is corrected by the leak (share of a_y that is gravity felt by the rolled body) and by the
-    sensor offsets [m/s^2], to which the slope and bank (lateral slope) of the road have been added.
-    An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
+    The velocity is corrected by the leak (share of a_y that is gravity felt by the rolled body) and
+    by the sensor offsets [m/s^2], to which the slope and bank (lateral slope) of the road have been
+    added. An offset of a_y has the same effect as an offset of a_x, rotated by 90 degrees.
     """
     measured = gain.measured
     unit = gain.unit
@@ -100,8 +102,9 @@ def gained_velocity(
 
 @inlined
 def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] gained in the block (0.05 s), as each node
-    (friction hypothesis) of a group estimates it with its sensor offsets in `mean` (n, LANES).
+    """Return the velocity (forward, left) [m/s] that the vehicle gains in the block (0.05 s), as
+    each node (friction hypothesis) of a group estimates it. `gain` is the integral of the
+    accelerometers, and `mean` (n, LANES) contains the sensor offsets that the nodes assume.
     """
     return gained_velocity(
         gain,
@@ -113,8 +116,8 @@ def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
 
 @compiled
 def find_readings(features: BlockFeatures, node: NodeWorkspace) -> None:
-    """Compute the wheel speeds (node.rolling) and the offset of the steering (node.steering),
-    corrected by the filter states node.point, such as wheel radii and time lags.
+    """Compute the wheel speeds (node.rolling) and the offset of the steering angle (node.steering).
+    They are corrected by the filter states in node.point, such as wheel radii and time lags.
 
     The offset of the steering includes the compliance of the front axle: steering column and
     bushings of production cars yield up to 35 mrad per g of lateral acceleration.
@@ -185,8 +188,8 @@ def find_slips(
 def find_ratios(
     curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace, slip: NodeSlip
 ) -> None:
-    """Compute the forces that the tyre curve gives at the slips `slip`: for each wheel the ratio to
-    the force of a linear tyre, and for each axle the lateral force.
+    """Compute the forces that the tyre curve gives at the slips in `slip`, and write them there.
+    For each wheel this is the ratio to the force of a linear tyre, for each axle the lateral force.
     """
     for axle in range(2):
         model = 0.0

@@ -5,8 +5,9 @@ A tyre beyond its peak does not keep a constant slip: it locks or spins up withi
 second unless a controller acts, and four tyres never do so alike. Therefore, if four wheels agree
 for a second, the speed is computed from them with the slip that their force needs. Without this
 rule, the filter could explain a lasting accelerometer offset only by four wheels sliding on ice.
-This explanation fits any data, so the filter would keep it forever. In the same way, a rear axle
-with hardly any lateral force does not slide sideways, so the lateral velocity is computed from it.
+Four sliding wheels explain any data, so the filter would keep this explanation forever. In the same
+way, a rear axle with hardly any lateral force does not slide sideways, so the lateral velocity is
+computed from it.
 """
 
 from __future__ import annotations
@@ -123,8 +124,9 @@ def _update_standstill(
 def _compute_velocities(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
 ) -> None:
-    """Compute v_x and v_y that rolling wheels at the speed `middle` [m/s] imply, and their standard
-    deviations.
+    """Compute the velocity (v_x, v_y) that follows if the wheels roll, and its standard deviations.
+    `middle` [m/s] is the forward speed according to the wheels, and `step` the resolution of this
+    speed.
 
     The results are written into memory.rolling.
     """
@@ -153,9 +155,9 @@ def _compute_velocities(
 def take_rolling(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, group: int
 ) -> float:
-    """Update a group of nodes (friction hypotheses) with the velocity that rolling wheels imply.
-    Return a penalty [nat] per node, which grows with the difference of this velocity from the
-    node's estimate.
+    """Update a group of nodes (friction hypotheses) with the velocity that follows from rolling
+    wheels. Return a penalty [nat] per node, which grows with the difference of this velocity from
+    the node's estimate.
     """
     rolling = memory.rolling
     constants = design.constants

@@ -47,7 +47,7 @@ def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
 
 @inlined
 def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
-    """Return the scalar product of `row` and vector i of `rows` (n, ROWS, LANES)."""
+    """Return the scalar product of the vector `row` and vector i of `rows` (n, ROWS, LANES)."""
     first = row[0] * lanes_at(rows, (i, 0)) + row[1] * lanes_at(rows, (i, 1))
     middle = row[2] * lanes_at(rows, (i, 2)) + row[3] * lanes_at(rows, (i, 3))
     last = row[4] * lanes_at(rows, (i, 4)) + row[5] * lanes_at(rows, (i, 5))

@@ -1,4 +1,5 @@
-"""The reported friction interval, with levels at both ends that give the stated coverage.
+"""The reported friction interval. The quantile levels of both ends are chosen so that the interval
+covers the true friction as often as stated.
 
 The filter weakens (tempers) evidence so that a repeated error does not count twice. Therefore,
 after many measurements, the node probabilities (of the friction hypotheses) are spread wider than
@@ -54,7 +55,7 @@ def find_interval(
     (NODES,) of the friction hypotheses.
 
     `patch` (PATCH_NODES,) are the probabilities that the car is on an ice patch. `blended` (NODES,)
-    is scratch. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
+    is scratch memory. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
@@ -70,7 +71,7 @@ def find_interval(
 @compiled
 def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> float:
     """Return the upper end of the friction interval for the probabilities `weight` (NODES,) of the
-    friction hypotheses.
+    friction hypotheses. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
 
     The quantile level is chosen so that the true friction lies above the result in at most one case
     of twenty.

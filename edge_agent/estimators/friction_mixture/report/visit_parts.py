@@ -2,10 +2,10 @@
 part of the visit before the surface changed.
 
 The friction belief of a visit starts from the prior and follows the road, so at the end it
-describes only the last surface. In addition, the most informative belief of the visit so far is
-kept; D measures the information. If almost all of the current belief lies at frictions that this
-kept belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the part
-that ends, and the next part begins. A belief in transition between the two surfaces neither
+describes only the last surface. In addition, the filter keeps the most informative belief of the
+visit so far; D measures the information. If almost all of the current belief lies at frictions that
+this kept belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the
+part that ends, and the next part begins. A belief in transition between the two surfaces neither
 replaces the kept belief nor counts as a jump.
 
 Legend
@@ -38,8 +38,8 @@ KNOWING = 0.7
 
 @compiled
 def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
-    """Begin a new part of the visit (the passage of one map cell); a part is a stretch on one
-    surface. It has no evidence on friction yet.
+    """Begin a new part (stretch on one surface) of the visit, which is the passage of one map cell.
+    The new part has no evidence on friction yet.
     """
     copy_vector(memory.surest, design.prior)
     memory.information = 0.0

@@ -37,8 +37,8 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
     """Return the standard deviations (N, STATES) of the states' priors: `std` (STATES,), reduced
     for those states that a vehicle's calibration has measured.
 
-    The means of the priors stay as they are, because the signals have already been corrected by the
-    calibration (inputs.correct).
+    The means of the priors are not changed, because `inputs.correct` has already corrected the
+    signals by the calibration.
     """
     spreads = np.repeat(std[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(spreads, vehicles, strict=True):

@@ -29,8 +29,8 @@ from schemas.numeric import FloatArray
 
 
 class Nominal(NamedTuple):
-    """Prior (mean and standard deviation) of the filter states that describe the vehicle, its
-    sensors or the road; the velocity states have no prior.
+    """Prior of the filter states that describe the vehicle, its sensors or the road: mean, standard
+    deviation, and time of return to the prior. The velocity states have no prior.
     """
 
     mean: Annotated[FloatArray, STATES]

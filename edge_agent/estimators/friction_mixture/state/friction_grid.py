@@ -34,9 +34,10 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RoadChange(NamedTuple):
-    """Probabilities that the road changes within a step. `hazard`: from any node (friction
-    hypothesis) to any friction. `leaving`: in addition, from a node without neighbours to any
-    friction. `drift`: to a neighbouring node (approximately).
+    """Probabilities that the friction changes within a step. `hazard` is the probability of a
+    change from any node (friction hypothesis) to any friction. `leaving` is an additional
+    probability of such a change for nodes without neighbours. `drift` is approximately the
+    probability of a change to a neighbouring node.
     """
 
     hazard: float
@@ -138,9 +139,10 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 
 @compiled
 def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
-    """Return the unnormalised probability mass between nodes j - 1 and j (grid values `mu` of
-    friction), for their prior and probabilities `w`. For j = 0, and for j equal to the number of
-    nodes, the segment extends from the outer node to the end of the friction range.
+    """Return the unnormalised probability mass between nodes j - 1 and j. Nodes are the grid values
+    `mu` of friction, with the prior probabilities `prior` and the current probabilities `w`. For j
+    = 0, and for j equal to the number of nodes, the segment extends from the outer node to the end
+    of the friction range.
     """
     count = mu.shape[0]
     if j == 0:

@@ -83,8 +83,8 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
 def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     """Continue the filter after a gap of dt [s] without samples; return the health flag RESET.
 
-    The friction estimate moves towards the prior according to the metres driven during the gap, and
-    the motion estimate restarts.
+    The friction estimate moves towards the prior, more after more metres driven during the gap. The
+    motion estimate restarts.
     """
     last = memory.last
     now = memory.last.now

@@ -59,7 +59,9 @@ class BlockSums:
 
 
 class LastInputs:
-    """Record of the latest value of each input signal, which the next sample needs."""
+    """Record of the latest value of each input signal, which the filter needs at the next
+    sample.
+    """
 
     time: float  # [s] time of the last sample
     position_time: float  # [s] time of the last position
@@ -124,7 +126,9 @@ class WheelSlip:
 
 
 class Trust:
-    """Record of the consistency test, which asks whether any friction explains the measurements."""
+    """State of the consistency test, which checks that at least one friction explains the
+    measurements.
+    """
 
     # [1] moving average of the axles' squared innovations over their stated variance, without the
     # part that slides or slippery road explain
@@ -138,7 +142,9 @@ class Trust:
 
 
 class Quantiles:
-    """Median, lower and upper end (5 % and 95 % quantile) of friction."""
+    """Median, lower and upper end (5 % and 95 % quantile) of friction, and the probability of a
+    slippery road.
+    """
 
     median: float
     lower: float  # 5 % quantile

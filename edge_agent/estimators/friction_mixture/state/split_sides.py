@@ -1,5 +1,5 @@
-"""Split roads: a low friction under one side of the vehicle and a high friction under the other,
-either way round.
+"""Split roads: a low friction under one side of the vehicle, left or right, and a high friction
+under the other.
 
 The friction of each side is divided into cells of a coarse grid. A node (friction hypothesis)
 represents a triangular density of friction. It has its maximum at the middle of its cell and
@@ -61,7 +61,7 @@ class Triangle(NamedTuple):
 
 def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
     """Return one triangular density per cell (range of friction), with its maximum at the middle of
-    the cell.
+    the cell. `edges` are the borders of the cells.
 
     Each triangle extends to the middles of the neighbouring cells; the first and last extend to the
     outer edges.
@@ -120,10 +120,11 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """Compute out (K,): the probabilities of the nodes with one friction, plus those of the split
-    nodes (different friction left and right).
+    """Compute `out` (K,), the probabilities of K friction values, from the probabilities `w` of all
+    nodes (friction hypotheses). The result is the probability of each node with one friction, plus
+    a part of those of the split nodes (different friction left and right).
 
-    `share` (SPLIT_NODES, K) distributes the probability of each split node over the K nodes.
+    `share` (SPLIT_NODES, K) distributes the probability of each split node over the K values.
     """
     chain = out.shape[0]
     for j in range(chain):

@@ -88,8 +88,9 @@ def curve_tables(curve: Curve) -> TyreCurve:
 
 @inlined
 def interpolate_table(table: FloatArray, place: float) -> float:
-    """Return the value of a table over [0, 1] at `place`, interpolated linearly between the table's
-    points. `place` is a number, or one number per node (friction hypothesis) of a group.
+    """Return the value of `table` at `place`, interpolated linearly. The points of the table are
+    equidistant over [0, 1]. `place` is a number, or one number per node (friction hypothesis) of a
+    group.
     """
     cells: int = table.shape[0] - 1
     scaled = place * cells
@@ -101,7 +102,7 @@ def interpolate_table(table: FloatArray, place: float) -> float:
 @inlined
 def ratio_at(curve: TyreCurve, theta: float, place: float) -> float:
     """Return the tyre force over mu*F_z (friction times load), divided by the normalised slip
-    `theta` >= 0; beyond the table the force is constant. `place` is theta/(1 + theta).
+    `theta` >= 0. Beyond the end of the table the force is constant. `place` is theta/(1 + theta).
     """
     last = curve.ratio.shape[0] - 2
     ratio = interpolate_table(curve.ratio, place)

@@ -1,5 +1,5 @@
-"""Scratch records for intermediate results while one block (0.05 s) of one vehicle is processed.
-Nothing is kept between steps: a step writes each field before it reads it.
+"""Scratch records (working memory) for the intermediate results of one block (0.05 s) of one
+vehicle. Nothing is kept between steps: a step writes each field before it reads it.
 """
 
 from __future__ import annotations
@@ -94,7 +94,9 @@ class NodeForces:
 
 
 class NodeWorkspace:
-    """Scratch arrays for the update of one group of nodes (friction hypotheses)."""
+    """Scratch arrays (working memory) for the update of one group of nodes (friction
+    hypotheses).
+    """
 
     gained_x: Annotated[LaneArray, 1]  # [m/s] mean velocity gained in the block, per node
     gained_y: Annotated[LaneArray, 1]
