@@ -76,8 +76,8 @@ B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of measured r, a_x and a_y, 
 
 
 class DriveWheelState(IntEnum):
-    """Index of a state of WCKF-A and WCKF-B. For a quantity that WCKF-A has per wheel, it is the
-    index of the front left wheel's value.
+    """Index of a state in the state vectors of the filters WCKF-A and WCKF-B. For a quantity that
+    WCKF-A has per wheel, it is the index of the front left wheel's value.
     """
 
     VX = 0
@@ -263,8 +263,8 @@ def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: floa
 
 @compiled
 def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of `dt` [s] of WCKF-B, which estimates the vehicle's motion from the compensated
-    tyre forces.
+    """Run a step of `dt` [s] of the filter WCKF-B, which estimates the vehicle's motion from the
+    compensated tyre forces.
     """
     row = memory.row
     track = memory.track

@@ -104,9 +104,8 @@ class Estimates:
 
     @property
     def mu_wheel(self) -> FloatArray | None:
-        """Return median, lower and upper end of friction per wheel, (T, N, 4, 3).
-
-        Return None where the estimator has one friction for all wheels.
+        """Return median, lower and upper end of the friction interval of each wheel, (T, N, 4, 3).
+        Return None if the estimator has only one friction for all wheels.
         """
         if self.values.shape[-1] == ONE_FRICTION:
             return None

@@ -70,8 +70,9 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 
 def lasting_signals(profile: Profile) -> set[str]:
-    """Return the full names of the signals of a profile's `lasting` channels, which are sent only
-    when they change. A profile assigns signals to channels.
+    """Return the full names of the recorded signals of the `lasting` channels of a profile
+    (assignment of signals to channels). The signals of such a channel are sent only when they
+    change.
     """
     return {
         name

@@ -28,8 +28,8 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Part(BaseModel):
-    """Base class of the records in a profile (assignment of signals to channels); unknown field
-    names are rejected.
+    """Base class of the records in a profile (assignment of signals to channels). It rejects
+    unknown field names.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,5 +1,5 @@
 """Result of a reader: series (recorded signals) by name with a common clock. The module also has
-helpers for readers of foreign files.
+helpers for the readers of other formats.
 """
 
 from __future__ import annotations

@@ -1,3 +1,3 @@
-"""Conversion of estimates along a drive to observations, one per visited cell. The
-package is pure.
+"""Conversion of estimates along a drive to observations, one per visited map cell. The package is
+pure (no I/O).
 """

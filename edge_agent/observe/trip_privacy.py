@@ -45,7 +45,9 @@ class TripEnds:
         return self._metres == 0.0 and self._ns == 0
 
     def advance(self, time: IntArray, speed: FloatArray) -> None:
-        """Advance the filter by a block of samples: time (T, N) [ns UTC], speed (T, N) [m/s]."""
+        """Update the distances driven with a block of samples: `time` (T, N) [ns UTC] and `speed`
+        (T, N) [m/s].
+        """
         if self._is_off:
             return
         if self._began is None:

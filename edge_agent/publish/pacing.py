@@ -76,7 +76,7 @@ class Pacer:
     @property
     def is_idle(self) -> bool:
         """Return True if no batch of this vehicle and region is in flight (sent, not answered) and
-        none waits.
+        no batch waits to be sent.
         """
         return not self.flying and not self._waiting
 

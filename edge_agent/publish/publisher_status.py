@@ -77,7 +77,7 @@ class PublisherStatus:
     @property
     def unanswered_records(self) -> int:
         """Return the number of records in batches that are no longer sent, because the service
-        answered later batches but not these.
+        answered later batches of the same stream but not these.
         """
         return self._outbox.counts.unanswered
 

@@ -1,5 +1,5 @@
-"""Record of the largest grip used (force over load) within the last second, kept in a ring of short
-time intervals (slots).
+"""Record of the largest grip that the wheels used (force over load) within the last second. It is
+kept in a ring of short time intervals (slots).
 """
 
 from __future__ import annotations

@@ -104,7 +104,9 @@ class FederatedMemory(PaperMemory):
 
 
 class SubFilter(NamedTuple):
-    """Mean and covariance root of a sub-filter during a step, with scratch arrays."""
+    """Mean and covariance root of one of the two sub-filters of the motion filter during a step,
+    with scratch arrays.
+    """
 
     number: int  # 0 or 1
     mean: FloatArray

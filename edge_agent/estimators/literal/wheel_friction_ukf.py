@@ -91,8 +91,8 @@ def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
 
 
 class _Model:
-    """Measurement model of the filter: the measurements of a drive, and the function that predicts
-    them, in the precision of the filter.
+    """Measurement model of the friction filter of paper 003: the measurements of a drive, and the
+    function that predicts them, in single or double precision.
     """
 
     def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:

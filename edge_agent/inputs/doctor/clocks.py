@@ -1,4 +1,6 @@
-"""Delays of the devices, computed from the lags between their signals in the turns of a drive."""
+"""Delays of the devices of a car (wheel speeds, steering, inertial unit), computed from the lags
+between their signals in the turns of a drive.
+"""
 
 from __future__ import annotations
 

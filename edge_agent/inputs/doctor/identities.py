@@ -326,7 +326,7 @@ def _median_ratio(x: FloatArray, y: FloatArray) -> float:
 
 def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
     """Return the least-squares solution x (k,) of table · x = y for a table (n, k), fitted twice.
-    The second fit leaves out points whose residual in the first fit exceeds three robust standard
+    The second fit leaves out the rows whose residual in the first fit exceeds three robust standard
     deviations.
     """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]

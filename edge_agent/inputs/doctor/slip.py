@@ -141,8 +141,8 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
 
 
 def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return an array (n,) that is True where the car turns as its steering predicts, that is,
-    where it does not slide.
+    """Return a mask (n,) that is True at the samples at which the car turns as its steering
+    predicts, that is, does not slide.
     """
     fast = np.maximum(np.abs(drive.v), 1.0)
     wanted = drive.wheelbase * drive.r / fast

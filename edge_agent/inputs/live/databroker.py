@@ -97,7 +97,7 @@ class DatabrokerFeed(Feed):
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
 
     def _known_paths(self, channel: Any) -> list[str]:  # noqa: ANN401
-        """Return those of the source's paths that the broker knows. The broker would reject a whole
+        """Return the source's signal paths that the broker knows. The broker would reject a whole
         subscription that contains an unknown path.
         """
         m = self._messages

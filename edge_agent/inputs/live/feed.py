@@ -53,7 +53,9 @@ class HostClock:
         return time.monotonic() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
-        """Return the time since the start of the clock [s] for an instant given as [ns UTC]."""
+        """Return the time [s] from the start of the host's clock to the instant `stamp_ns` [ns
+        UTC].
+        """
         return (stamp_ns - self.start_ns) / NS
 
 

@@ -1,4 +1,4 @@
-"""Live source for positions of a running gpsd, as JSON over TCP."""
+"""Live source for the positions that a running gpsd (position daemon) sends as JSON over TCP."""
 
 from __future__ import annotations
 

@@ -32,7 +32,9 @@ def is_gvret(path: Path) -> bool:
 
 
 def is_bare_trace(path: Path) -> bool:
-    """Return True if a PCAN trace has no header with its version."""
+    """Return True if a PCAN trace (text file of CAN frames) lacks the header that states the
+    version of its format.
+    """
     with path.open("rb") as file:
         head = file.read(65_536).decode("utf-8", errors="replace")
     return "$FILEVERSION" not in head

@@ -1,5 +1,6 @@
-"""Reader of Racelogic VBO files, and of tables with the same columns, with times, positions and
-units of that format.
+"""Reader of Racelogic VBO files, and of tables with the same columns.
+
+Both have these units:
 
     time        hhmmss.ss UTC of the day
     lat, long   minutes, west positive

@@ -190,8 +190,8 @@ def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
 
 @compiled
 def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
-    """Compute mean (n,) and covariance (n, n) of the mixture of the active nodes (filters of one
-    friction hypothesis each) with weights scratch.share.
+    """Compute mean (n,) and covariance (n, n) of the mixture of all active nodes (filters of one
+    friction hypothesis each), weighted by scratch.share, and store them in `memory`.
     """
     groups = (active_nodes(memory) + LANES - 1) // LANES
     apart = scratch.apart

@@ -110,8 +110,8 @@ def update_nodes(
 def put_friction(
     design: MixtureDesign, features: BlockFeatures, node: NodeWorkspace, group: int
 ) -> None:
-    """Write the friction of a group of nodes (hypotheses) under each wheel and axle, and its
-    inverse, to `node`.
+    """Write to `node` the friction that each node (hypothesis) of a group assumes on each side of
+    the car and under each axle, and its inverse.
     """
     for side in range(2):
         mu = lanes_at(design.sides.lanes, (group, side))

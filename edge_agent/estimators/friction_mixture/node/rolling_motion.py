@@ -58,8 +58,8 @@ FARTHEST_FOLLOWED = 0.8
 
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update memory.rolling, the motion according to rolling wheels, with the wheel speeds of the
-    block (the samples within 0.05 s).
+    """Update memory.rolling, the motion that follows if the wheels roll, with the wheel speeds of
+    the block (the samples within 0.05 s).
     """
     rolling = memory.rolling
     row = memory.row

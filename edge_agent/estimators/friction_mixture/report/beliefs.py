@@ -1,4 +1,6 @@
-"""Read-only access to the current friction beliefs of the default estimator's filters."""
+"""Read-only access to the current friction beliefs (probabilities of friction) of the default
+estimator's filters.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,3 @@
-"""Constants, tables and memory of the friction mixture, and functions that need nothing else."""
+"""Constants, tables and memory of the friction mixture (default estimator), and functions that need
+only these.
+"""

@@ -1,4 +1,6 @@
-"""Records of the data that the friction mixture keeps between samples, one set per vehicle."""
+"""Records of the data that the friction mixture (default estimator) keeps between samples, one set
+per vehicle.
+"""
 
 from __future__ import annotations
 

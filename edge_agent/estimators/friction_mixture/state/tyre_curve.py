@@ -69,7 +69,9 @@ def check_curve(curve: Curve) -> Curve:
 
 
 def curve_tables(curve: Curve) -> TyreCurve:
-    """Return the tables of a tyre curve, including how tyres of other shape deviate from it."""
+    """Return the tables of a tyre curve. They include the force differences of tyres whose curve is
+    sharper or rounder.
+    """
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
     f = curve(theta)
