@@ -148,8 +148,8 @@ def stood_where_it_appeared(
     it while it stood.
 
     Args:
-        mu: (T, N) true mean friction of the wheels.
-        speed: (T, N) [m/s].
+        mu: true mean friction of the wheels (T, N).
+        speed: speed of the cars (T, N) [m/s].
         starts: times [s] at which patches appear.
     """
     out = np.zeros(mu.shape, np.bool_)
