@@ -19,8 +19,8 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base class of all groups of settings in a configuration file. Unknown names of settings are
-    refused, so that a misspelt name is reported and not ignored.
+    """Base class of all groups of settings in a configuration file. Unknown names are refused, so
+    that a misspelt name is reported.
     """
 
     model_config = ConfigDict(

@@ -125,7 +125,7 @@ def vss_key(vehicle: str) -> str:
 
 
 def private_keys(vehicle: str) -> list[str]:
-    """Return the keys of messages that only the vehicle and its owner may read."""
+    """Return the Zenoh keys of messages that only the vehicle and its owner may read."""
     return [ahead_key(vehicle), vss_key(vehicle)]
 
 

@@ -91,7 +91,7 @@ class MapQuery(BaseModel):
 
 
 def parse(parameters: Mapping[str, str]) -> MapQuery:
-    """Parse the parameters of a map query.
+    """Parse the text parameters of a map query; return the query with parsed values.
 
     Raises:
         InputError: a parameter is unknown or not valid; the error names it and the fix.

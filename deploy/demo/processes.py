@@ -161,8 +161,8 @@ def run_page(folder: Path, endpoint: str, service: ManagedProcess, port: int) ->
 def start_fleet(
     folder: Path, vehicles: int, duration_s: float, seed: int, warned: float
 ) -> ManagedProcess:
-    """Start the process that simulates all vehicles, and return this process. Each vehicle has its
-    own network session and name. The share `warned` of the drivers receives warnings of ice.
+    """Start the process that simulates all vehicles, each with its own network session and name;
+    return this process. The share `warned` of the drivers receives warnings of ice.
     """
     scripts = Path(sys.executable).parent
     options = {

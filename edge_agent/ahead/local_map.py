@@ -1,10 +1,10 @@
 """Local copy of the fleet's map around one car, limited in size; old values fade to unknown. The
 module is pure: no I/O, and time is an argument.
 
-A map tile contains four values per cell: lower end, median and upper end of μ, and P(slippery).
-From these values this module reconstructs the belief, a probability distribution of the friction.
-With time, the road has more probably changed, so the belief fades to that of an unknown road, as in
-the fleet's map.
+A map tile contains four values per cell: 5 % quantile, median and 95 % quantile of the friction,
+and the probability that the cell is slippery. From these values this module reconstructs the
+belief, a probability distribution of the friction. A road changes with time, so the belief fades
+towards that of an unknown road, as in the fleet's map.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def belief_of(
     """Return the beliefs about n cells (probabilities of friction on the friction grid, (n, 32)),
     computed from the values in a map tile; `mu` may be NaN.
 
-    `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, `slippery` is P(slippery). The
-    distribution function is linear between these values.
+    `lower`, `mu` and `upper` are the 5 %, 50 % and 95 % quantiles, and `slippery` is the
+    probability of a slippery road. The distribution function is linear between these values.
     """
     n = len(lower)
     measured = np.isfinite(mu)

@@ -6,9 +6,9 @@ Legend
     key      cell·4 + sector: a place of the map, int64
     places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
 
-The reports about this road come from cars that may have driven in the next lane, with a position
-error of 1.5 m. Therefore each metre also covers places a little to the left and right. If the
-heading is near the border of two sectors, the metre covers both sectors.
+The map's reports come from cars that may have driven in the next lane, with a position error of 1.5
+m. Therefore each metre also covers places a little to the left and right. If the heading is near
+the border of two sectors, the metre covers both sectors.
 """
 
 from __future__ import annotations

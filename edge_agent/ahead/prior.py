@@ -18,8 +18,8 @@ Legend
     q, p_M  belief with the map at the border, and now                  (32,)
     p       result: mixture of the beliefs with and without the map     (32,)
     β, β'   probability that the map is wrong here, before and after the measurements: β' =
-            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE,
-            its lowest value; a share KEPT of its excess over SHARE passes to the next visit
+            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. β begins at SHARE, its
+            lowest value; the share KEPT of β' - SHARE passes to the next visit
 
 At a border, only the filter's own belief is carried to the next cell, never the mixture p.
 Otherwise the map's belief about one cell would be counted again in the next. Averaging of

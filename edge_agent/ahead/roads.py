@@ -3,9 +3,8 @@ the other.
 
 Place B follows place A on two conditions: B lies within about two cells in front of A, and the
 sector of B is a possible heading for a vehicle that comes from A. At a fork all roads are followed,
-the straightest first. The straightest road is extended straight on beyond its last known place.
-Without this extension the car would never request the map there, because it requests the map only
-along its path.
+the straightest first. The straightest road is extended straight on beyond its last known place,
+because the car requests the map only along its paths.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 """The agent: connects three components in the live loop. They are the estimator bank (estimators of
-all vehicles, advanced together), the pipeline that makes records from estimates, and the publisher.
+all vehicles, advanced together), the pipeline that makes records from estimates, and the publisher
+that sends the records.
 
 It is the counterpart of `fleet_service.app.service`. Signals come from an `AgentSource`. Additional
 components that use the vehicles' Zenoh sessions, such as warnings of the road ahead, are

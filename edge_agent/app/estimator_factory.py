@@ -1,6 +1,6 @@
 """Creation of estimator banks (estimators of N vehicles, advanced together) by name. The
 memberships (fuzzy sets) of these estimators are those stored in this package, or those that the
-caller gives. Estimators that other installed packages provide can be created in the same way.
+caller gives. Estimators of other installed packages are included.
 """
 
 from __future__ import annotations

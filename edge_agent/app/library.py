@@ -85,7 +85,7 @@ def estimate(
 
     As in `edge-agent replay`, two kinds of error are corrected in the signals first: sensor errors
     that the vehicle file states (from a calibration), and delays that the signal doctor (automatic
-    check of the signals) measures.
+    check) measures.
     """
     log, vehicle, *_ = prepare_log(log, vehicle)
     bank = bank_of(estimator, [vehicle], memberships)

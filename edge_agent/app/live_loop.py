@@ -113,8 +113,8 @@ def run_live_loop(
 
 
 def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
-    """Log each controller flag that the pipeline ignores as implausible, once per vehicle. `warned`
-    contains the flags already logged.
+    """Log each controller flag (ABS, ESC or traction control is active) that the pipeline ignores
+    as implausible, once per vehicle. `warned` contains the flags logged so far.
     """
     for vehicle, flag, reason in pipeline.doubted_flags():
         if (vehicle, flag) not in warned:

@@ -32,8 +32,8 @@ def use_agent_library() -> bool:
     the library of the package if one suits this machine, else a library that was built on this
     machine, now or at an earlier start. Call this before other imports.
 
-    Return False if there is no linker or no folder for the library. Numba then compiles the kernels
-    in this process.
+    Return True if the library is used. Return False if there is no linker or no folder for the
+    library; Numba then compiles the kernels in this process.
     """
     shipped = find_shipped_library(SHIPPED, read_processor_features())
     if shipped is not None and _load_library(shipped):

@@ -87,7 +87,7 @@ class Plausibility:
     @property
     def median_speed_error(self) -> float:
         """Return the median relative difference [1] between the estimated forward speed and the
-        wheels' speed; 0 if the car never drove fast enough.
+        wheels' speed; 0 if the car never drove fast enough for a comparison.
         """
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0

@@ -39,7 +39,7 @@ class PublisherState(Protocol):
 
     @property
     def unanswered_s(self) -> float:
-        """Return the time [s] for which sent batches have been unanswered."""
+        """Return the time [s] for which the service has not acknowledged sent batches."""
         ...
 
     @property
@@ -137,7 +137,7 @@ def reasons_not_publishing(
 
 
 class ReasonReporter:
-    """Printer of the reasons why an agent publishes nothing. It checks them first after FIRST_S
+    """Printer of the reasons why an agent publishes nothing. It determines them first after FIRST_S
     seconds and then every EVERY_S seconds, and prints them only if they have changed.
 
     Args:

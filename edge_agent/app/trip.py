@@ -1,6 +1,6 @@
-"""Live trip of a car: the signal doctor (automatic check of the signals) verifies the signals, and
-a calibration is learned from them. Both results are stored next to the outbox (file of unsent
-records).
+"""Live trip of a car: the signal doctor (automatic check) verifies the car's signals, and a
+calibration (sensor errors) is learned from them. Verdict and calibration are stored next to the
+outbox (file of unsent records).
 
 Nothing is published until the doctor has found the signals free of faults, in this trip or in an
 earlier trip with the same vehicle file and profile. A trip is examined in sections of PART_S
@@ -69,8 +69,7 @@ class Trip:
         vehicle: vehicle file of the car.
         profile: assignment of the car's signals to channels.
         path: file with the stored knowledge about the car; it need not exist.
-        trusted: True to publish records regardless of the findings of the signal doctor (automatic
-            check of the signals).
+        trusted: True to publish records whatever the signal doctor (automatic check) finds.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class Trip:
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
         """Yield the blocks of samples of a source after correction of the known sensor errors. The
-        uncorrected blocks are stored for the signal doctor (automatic check of the signals).
+        uncorrected blocks are stored for the signal doctor (automatic check).
 
         The function `ground` returns the speed over ground (T,) [m/s] at the samples of the last
         block.

@@ -70,8 +70,8 @@ class SplitScores(Record):
 
 
 class Budget(Record):
-    """Limits of the searches for fuzzy sets: ants, iterations, and the number of parameter vectors
-    that each search evaluated.
+    """Limits of the searches for fuzzy sets: ants (candidates per iteration), iterations, and the
+    number of parameter vectors that each search evaluated.
     """
 
     ants: Count

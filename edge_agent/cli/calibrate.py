@@ -92,7 +92,7 @@ def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:
 
 def report_lines(found: HeldOut) -> list[str]:
     """Return the lines of the report on a learned calibration: learned values with units, groups of
-    quantities left out because they do not help, and scores on held-out drives.
+    quantities left out because they do not improve predictions, and scores on held-out drives.
     """
     lines = []
     for name, estimate in found.calibration.model_dump(exclude_none=True).items():

@@ -73,8 +73,8 @@ def nogil(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile like `nogil`, but without counting references to arrays. Counting costs two locked
-    additions per array and call.
+    """Compile `function` like `nogil` (without interpreter lock), and without counting references
+    to arrays. Counting costs two locked additions per array and call.
 
     Use this only for functions that neither create nor return arrays, so that the caller owns all
     arrays. Functions that they call must be `refcount_free` too.

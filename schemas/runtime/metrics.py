@@ -28,7 +28,7 @@ READ_S: Final = 5.0  # longest time for receiving a request; then the connection
 
 class Metric(NamedTuple):
     """Metric with one or several values. The keys of `values` are values of the OpenMetrics label
-    named `label`; "" for a metric with a single value.
+    named `label`. For a metric with a single value, `label` is "".
     """
 
     name: str

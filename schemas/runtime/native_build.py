@@ -99,8 +99,7 @@ def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
 
 def _stop_before_machine_code() -> None:
     """Provide a context in which Numba stops each compilation as soon as it has generated LLVM
-    code. Numba then does not merge this code with the functions that it calls, does not optimise it
-    and makes no machine code.
+    code. Numba then does not link or optimise this code and makes no machine code.
 
     The kernel itself has been compiled before this context begins. Its code must not be optimised a
     second time: the optimiser may fuse other multiplications and additions, which changes the last

@@ -130,5 +130,5 @@ def _show_status() -> None:
 
 
 def _load_drawing() -> None:
-    """Import the library that draws the spinner, so that the spinner can appear without delay."""
+    """Import the library that draws the spinner before it is needed."""
     importlib.import_module("rich.progress")

@@ -46,8 +46,8 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class EmptyRecord:
-    """Record without content. A caller passes it to a compiled function that requires a record as
-    argument, in cases where the function reads no field of it.
+    """Record without content, for calls of a compiled function that requires a record as argument
+    but reads no field of it.
     """
 
     unused: bool

@@ -155,7 +155,7 @@ def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
 
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     """Decode the bytes of one batch (message with records). For the columns that were sent, this is
-    the inverse of `codec.encode`. Other columns are filled.
+    the inverse of `codec.encode`. Other columns are filled with defaults.
 
     Raises:
         WireError: the payload is too large or not the expected message, a required column is

@@ -87,8 +87,8 @@ WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 
 @cache
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
-    """Return name and NumPy type of every column of a batch. Times are int64 [ns]; the
-    log-likelihood of friction is uint8, (n, 32).
+    """Return the NumPy type of every column, by name, in a batch of this kind of records. Times are
+    int64 [ns]; the log-likelihood of friction is uint8, (n, 32).
     """
     return {
         column.name: np.dtype(_TYPES.get(column.type, column.type)) for column in _COLUMNS[kind]
