@@ -166,7 +166,7 @@ def largest_bin(p: Bins) -> float:
 
 @refcount_free_inlined
 def unpack_belief(belief: PackedArray, row: int, p: Bins) -> None:
-    """Unpack the stored belief in a row (16-bit integers) and fill `p` (32,) with its
+    """Unpack the belief that one row of 16-bit integers stores, and fill `p` (32,) with its
     probabilities.
     """
     whole = np.uint32(0)
@@ -203,9 +203,10 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
     reflecting ends, then a possible sudden change of the road over `change_s` [s], which mixes in
     the `prior`.
 
-    A uniform belief stays uniform and a non-decreasing one non-decreasing. Therefore the passage of
-    time alone never lowers the upper end of the belief's interval below that of the prior. `padded`
-    (34 or more) is scratch memory.
+    Diffusion leaves a uniform belief uniform and a non-decreasing one non-decreasing. Reports of
+    lower bounds alone give a non-decreasing belief. With a uniform prior, ageing therefore never
+    lowers the upper end of its interval below that of the prior. `padded` (34 or more) is scratch
+    memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s
@@ -224,10 +225,10 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Mix the prior into a belief `p` in place, so that the total probability of a sudden road
-    change is at least CHANGE_LEAST·`power`. This is needed if visits follow each other within
-    seconds: then `forget` mixes in nearly nothing, and a firm belief would resist a real change.
-    `forget` has already applied the change over `change_s` [s]. `power` is the share of the coming
-    vote (effect of one visit) that is new information.
+    change is at least CHANGE_LEAST·`power`. Between visits that follow each other within seconds,
+    `forget` (ageing) mixes in nearly nothing. Without this function, a firm belief would then
+    resist a real change. `forget` has already applied the change over `change_s` [s]. `power` is
+    the share of the coming vote (effect of one visit) that is new information.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:

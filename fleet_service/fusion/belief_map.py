@@ -95,18 +95,21 @@ class BeliefMap:
         )
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
-        """Return the same array (k, 32) as `beliefs_at_last_report`, but with a more cautious
-        tyre-shape slope, as alerts require.
+        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
+        sector), (k, 32), at its last observation. It is more cautious than the belief for other
+        readers, as alerts require.
 
-        The slope states by how much a report may be too low if the vehicle used little grip. Alerts
-        use the upper end of the slope's range; see `shared`.
+        The difference is the tyre-shape slope: by how much a report may be too low if the vehicle
+        used little grip. Alerts use the upper end of the slope's range; see `shared`.
         """
         return self._read_for_alerts(self._shape.alarm, slots)
 
     def _read_for_alerts(self, slope: float, slots: IntArray) -> FloatArray:
-        """Return the beliefs (k, 32) at the last observations. Visits without a friction value do
-        not weaken the evidence of neighbouring cells here, because a cell between vehicles that
-        report ice must get an alert even if its own visitors gave no value.
+        """Return the belief about the road for each slot (cell and heading sector), (k, 32), at its
+        last observation. `slope` is the assumed error of a value per unit of unused grip. Visits
+        without a friction value do not weaken the evidence of neighbouring cells here, because a
+        cell between vehicles that report ice must get an alert even if its own visitors gave no
+        value.
         """
         rule = ReadRule(KERNELS[shape_class(slope)], 0.0)
         rows = self.store.state.live
@@ -144,7 +147,8 @@ class BeliefMap:
     ) -> tuple[IntArray, IntArray]:
         """Return the vehicles that corroborate `side` (grip or ice) in the slots (one per cell and
         heading sector), as two arrays (k, SOURCES): index of the vehicle, and time of its report
-        [ns]. The time is 0 if the vehicle does not count (see `sources`).
+        [ns]. The time is 0 if the service no longer trusts the vehicle, or if the report is not
+        after `since` [ns].
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters

@@ -6,7 +6,8 @@ Terms
     value, bound   report that measures the friction; report that μ is at least the grip used
     vote           effect of one visit on the belief about a cell
     tuning town    simulated town (`lab/town.py`) whose seed serves only to choose constants
-    tuning drive   end-to-end drive with the real estimator (`lab/end_to_end.py`), such a seed too
+    tuning drive   end-to-end drive with the real estimator (`lab/end_to_end.py`), whose
+                   seed also serves only to choose constants
 """
 
 from __future__ import annotations

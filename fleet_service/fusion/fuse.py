@@ -4,9 +4,9 @@ observations.
 
 T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
 the allowed lateness (delay of an observation); older observations are final. Trust in vehicles is
-updated when the checkpoint advances. It applies to observations of the epoch that begins at T.
-Therefore the weight of an observation depends on the time at which the vehicle was in the cell, and
-not on the time of its arrival.
+updated when the checkpoint advances. The new trust applies to observations of the epoch that begins
+at T. Therefore the weight of an observation depends on the time at which the vehicle was in the
+cell, and not on the time of its arrival.
 """
 
 from __future__ import annotations
@@ -205,8 +205,8 @@ class Fusion(BeliefMap):
         return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
-        """Add weather reports. Each must take effect at `next_epoch` or later; otherwise the map
-        would depend on the time of arrival.
+        """Add weather reports. Each must take effect at `next_epoch` (the first minute that is not
+        fused yet) or later; otherwise the map would depend on the time at which a report arrives.
         """
         columns = (
             np.concatenate([getattr(r, f.name) for r in (self.reports, reports)])

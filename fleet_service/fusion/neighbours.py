@@ -116,7 +116,9 @@ class ReadRule(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """State of the map and the rule by which beliefs are read, as `road_beliefs` gets them."""
+    """Arguments of `road_beliefs`: the slots (one per cell and heading sector), the hash table that
+    finds them, the weather, and the rule by which beliefs are read.
+    """
 
     live: Rows
     table: IntArray
@@ -184,8 +186,9 @@ def road_beliefs(
 
 @refcount_free_inlined
 def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
-    """Multiply the belief about a cell by the messages of its three sides, and write the belief
-    about the road to `out` (32); `out` stays unchanged without messages.
+    """Multiply the belief about a cell by the messages (factors) from slippery neighbours on its
+    three sides, and write the resulting belief about the road to `out` (32). If no neighbour sends
+    a message, `out` stays unchanged.
     """
     kernels = parts.rule.kernels
     cells = parts.live.cells
@@ -210,8 +213,9 @@ def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: Flo
 def _choose_message(
     parts: MapParts, asked: Asked, side: int, buffers: Buffers
 ) -> tuple[float, float]:
-    """Write the message of the most informative neighbour on one side of a cell to
-    `buffers.message`. Return its weight w, 0 if there is none, and its factor q for silence.
+    """Write the message (factors on a belief) of the most informative neighbour on one side of a
+    cell to `buffers.message`. Return the message's weight w, 0 if no neighbour sends one. Also
+    return the factor q, which is below 1 if the cell's own visitors gave few friction values.
     """
     live = parts.live
     cells = live.cells
@@ -246,8 +250,9 @@ def _choose_message(
 
 @refcount_free_inlined
 def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
-    """Return the cell of the neighbour number `step` on a side of `cell`; `there` is the one before
-    it. The road's other direction is in the same cell (1), or in the one to its left or right.
+    """Return the cell of the neighbour number `step` (from 1) on a side of `cell`; `there` is the
+    cell of the neighbour number `step` - 1. The neighbours on the side of the road's other
+    direction are, in this order, the same cell and the cells to its left and right.
     """
     if side != _ACROSS:
         return next_cell(there, (sector + 2 * side) % grid.SECTORS)
@@ -299,8 +304,9 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
 
 @refcount_free_inlined
 def _silence_factor(cells: RecordArray, row: int, neighbour: int, silence: float) -> float:
-    """Return the factor q in (0, 1] on the weight of a slippery neighbour's message. It is small if
-    many visits to the cell in `row` gave no friction value although visits to the neighbour did.
+    """Return the factor q in (0, 1] by which the message (factors on a belief) of a slippery
+    neighbour is weakened. The factor is small if many visits to the cell in `row` gave no friction
+    value although visits to the neighbour did.
     """
     visits = float(cells[row].visits) / max(float(cells[neighbour].visits), 1.0)
     lacking = _recent_values(cells, neighbour) * min(visits, 1.0) - _recent_values(cells, row)
@@ -325,8 +331,8 @@ def _slippery_probability(road: Bins) -> float:
 
 @refcount_free_inlined
 def _stored_slippery(live: Rows, row: int) -> float:
-    """Return P(slippery) of the belief stored in `row` of the cells without unpacking it, which
-    takes a tenth of the time.
+    """Return P(slippery) of the belief that is stored for the cell in row `row`. The belief is not
+    unpacked, so that the function takes a tenth of the time.
     """
     whole = 0.0
     slippery = 0.0

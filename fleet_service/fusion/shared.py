@@ -180,8 +180,8 @@ KERNELS: Final = tuple(_kernel_table(slope) for slope in SHAPES)
 
 
 def shape_class(slope: float) -> int:
-    """Return the index of that slope in SHAPES which is nearest to `slope`; kernels are stored for
-    these slopes (error of a value per unit of unused grip).
+    """Return the index of the number in SHAPES that is nearest to `slope`, the error of a friction
+    value per unit of unused grip. Kernels are stored only for the slopes in SHAPES.
     """
     away = [abs(shape - slope) for shape in SHAPES]
     return away.index(min(away))
@@ -272,8 +272,9 @@ def _moving_mean(before: int, new: float, part: float) -> np.uint8:
 
 @refcount_free
 def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
-    """Reduce two weights of a cell for the time from `begin` to `end` [ns]: the weights of the
-    manoeuvres, and the number of reports by untrusted vehicles.
+    """Reduce two kinds of numbers that fade with time, for the time from `begin` to `end` [ns]: the
+    weights of the kinds of manoeuvre in a cell, and the number of its reports by untrusted
+    vehicles.
     """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
     if borders > 0:

@@ -37,8 +37,8 @@ def other_cells(
 
     An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST, yaw or
     the standard deviation is unknown, or the other cell lies in another region, which another
-    service may own. The probabilities sum to at most 1 and `cell` gets the rest, so no vote counts
-    twice.
+    service may own. The probabilities sum to at most 1. The reported cell gets the rest, so the
+    effect of one visit is divided and not multiplied.
     """
     cosine = np.cos(np.nan_to_num(yaw))
     sine = np.sin(np.nan_to_num(yaw))

@@ -1,16 +1,17 @@
 """Trust in vehicles, computed by comparison with other vehicles in the same cells. Pure; loops over
 rows are compiled.
 
-Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed
-(`agreed`). Every other vehicle counts once, weighted by the trust in it; the number of meetings
-does not matter. So a colluding group counts only by the number of its members, not by the number of
-cells in which it drives alone. Once the majority distrusts the group, the group's reports about
-others have no weight.
+Two vehicles meet when both report a friction value in the same cell within PEER_S. For each vehicle
+the service stores the other vehicles that it met: how often (`met`) and how well they agreed
+(`agreed`). Every other vehicle counts once, weighted by the trust in it, however often the two met.
+So colluding vehicles cannot gain trust by many meetings with each other. Once they are distrusted,
+their agreement has only the weight TRUST_HEARD_LEAST.
 
-The module does not learn a vehicle's error from its differences to others, because they show only
-relative errors. It learns one thing about the whole fleet: by how much a friction value is too low
-if the vehicle used little of the grip (`shape_of`). It learns this from two visits of one vehicle
-to one cell, because a constant error of the vehicle cancels in their difference.
+The module does not estimate a vehicle's constant error: differences between vehicles show only
+which of two reads higher. It estimates one number for the whole fleet: by how much a friction value
+is too low if the vehicle used little of the grip (`shape_of`). The estimate uses two visits of one
+vehicle to one cell, because a constant error of the vehicle cancels in the difference of their
+values.
 
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
@@ -148,8 +149,8 @@ def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
     """Record how a vehicle's friction values in one cell change with the grip that the vehicle
-    used. `difference` is the difference of two values and `used` the difference of the grip used,
-    both relative to friction. `variance` is the variance of `difference`.
+    used. Of two visits, `difference` is the difference of the values and `used` that of the grip
+    used, both relative to friction. `variance` is the variance of `difference`.
 
     A constant relative error of the vehicle cancels in these differences.
     """
@@ -171,8 +172,9 @@ def _own_variance(mean: float, std: float) -> float:
 
 @refcount_free
 def _pair_rank(vehicle: int, other: int) -> int:
-    """Return a fixed pseudo-random number of two vehicles, by which pairs are ranked. It depends on
-    the two vehicle numbers and not on their order of arrival.
+    """Return a fixed pseudo-random number of two vehicles, by which pairs are ranked. It is
+    computed from the permanent numbers of the two vehicles, so the order in which the vehicles
+    report has no influence.
 
     A vehicle's table of other vehicles has only PEERS places. If two others compete for a place,
     the pair with the lower number keeps it. So a vehicle that was met rarely is as likely to be

@@ -51,7 +51,9 @@ from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
 
 class ScratchRow(IntEnum):
-    """Row of the scratch memory (3, PADDED), single precision."""
+    """Row number in the scratch memory (3, PADDED), single precision, in which the belief about one
+    cell is updated.
+    """
 
     BELIEF = 0
     PADDED = 1  # padded copy for `forget` and `convolve_bias`
@@ -69,12 +71,13 @@ _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 @refcount_free_inlined
 def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
-    """Fill in the kind of one stored observation (VALUE, or BOUND for a lower bound) and its mean,
-    standard deviation and P(slippery). `entry` is its row in `entries`; its likelihood is written
-    to `scratch`.
+    """Fill in four fields of the stored observation in row `entry` of `entries`: its kind (VALUE,
+    or BOUND for a lower bound), and mean, standard deviation and P(slippery) of its friction. A
+    lower bound gets no standard deviation. Write the observation's likelihood to `scratch` (work
+    memory).
 
-    If the vehicle reported a value (`reported` (3,) is not NaN), these numbers are taken from the
-    report, even if only a part of its likelihood is used.
+    If the vehicle reported a value, the last three fields are copied from `reported` (3,), which is
+    otherwise NaN.
     """
     evidence = entries[entry].evidence
     likelihood = scratch[ScratchRow.LIKELIHOOD]
@@ -98,8 +101,8 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 
 @refcount_free
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
-    """Compute the likelihood of a stored entry (an observation in one cell) again and write it to
-    `scratch`.
+    """Compute the likelihood of a stored entry (an observation in one cell) again from its reported
+    log-likelihood, and write it to `scratch` (work memory).
     """
     _clear_padding(scratch)
     this = entries[entry]
@@ -215,8 +218,8 @@ def update(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update the state of a cell with the effect of one entry (an observation), whose likelihood is
-    in `scratch`.
+    """Update the state of a cell with the effect of one entry (an observation), whose likelihood
+    the caller has written to `scratch` (work memory).
     """
     row, sources = place
     belief = rows.belief

@@ -81,7 +81,7 @@ class Weather(NamedTuple):
     without reports.
 
     Attributes:
-        region: (r,) sorted.
+        region: (r,) numbers of the regions, ascending.
         start: (r + 1,) first row of each region.
         time: (m,) time from which a row applies [ns].
         clock: (m, 2) road time of drift τ_d and of change τ_c at that time [s].

@@ -54,7 +54,8 @@ class Arrivals(NamedTuple):
     """A batch of n observations, arrays of shape (n,) with the fields of `Observations`.
 
     `vehicle` is the index of the vehicle in this service, `number` its permanent number, and
-    `weight` the trust in it. The other fields are the same as in `EntryRecord`.
+    `weight` the trust in it. The other fields describe the visit: time, likelihood, grip used and
+    so on (see `EntryRecord`).
     """
 
     time: IntArray

@@ -85,7 +85,7 @@ def measure(seeds: range) -> dict[str, float]:
 
 def count_differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
     """Return the number of cells in which the attack raised or suppressed an alert, compared with
-    the drive without it (`alone`).
+    the alerts `alone` of the same drive without the attack.
     """
     raised = np.zeros(CELLS, bool)
     suppressed = np.zeros(CELLS, bool)

@@ -97,8 +97,8 @@ def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
 
 
 def drives_end_to_end(quick: bool) -> Drives:
-    """Return one function per world (LEVEL and rough, with realistic sensor errors) that simulates
-    an end-to-end drive; if `quick`, the drives last only a few seconds.
+    """Return one function per simulated world (terrain, sensor errors and seed). Each function
+    simulates an end-to-end drive in its world; if `quick`, the drive lasts only a few seconds.
     """
     return {
         world: end_to_end.drive_command(*((4, 3.0) if quick else length), world)

@@ -30,8 +30,8 @@ UNREACHED: Final = 99  # number of passes if the map did not show the change unt
 
 
 def changing_town(rng: Generator, before: float, after: float) -> Town:
-    """Return a town whose first road changes its friction from `before` to `after`, drawn at
-    random.
+    """Return a random town in which the friction of the first road changes from `before` to
+    `after`.
     """
     drawn = town.draw_town(rng, MINUTES, 0.0)
     mu = drawn.mu.copy()

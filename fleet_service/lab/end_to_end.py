@@ -68,7 +68,9 @@ WAYS: Final = tuple(
 
 
 def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
-    """Return a function that simulates a drive with the command `python -m deploy.end_to_end`."""
+    """Return a function that simulates a drive in `world` with the command `python -m
+    deploy.end_to_end`, which writes its files to the folder given to the function.
+    """
     import sys
 
     def run_drive(folder: Path) -> None:

@@ -1,11 +1,11 @@
-"""Fleets whose errors differ from the assumptions of the fusion (the map's computation), and one
-fleet that follows them. Pure (no I/O).
+"""Evaluation of the map with simulated fleets. The errors of one fleet follow the assumptions of
+the fusion (the map's computation); those of the other fleets differ from them. Pure (no I/O).
 
-Each fleet first drives half of the roads, so that the service gets to know its vehicles. It is
-judged on the other half, which no vehicle visited before. So the map there rests only on the
-vehicles that used enough grip in each cell to measure the friction. Towns, drives and errors are
-drawn with random seeds that are used only for judging, not for tuning. One fleet follows no error
-model: its errors are those of the real estimator on simulated drives (`resampled`).
+Each fleet first drives on half of the roads, so that the service can compare its vehicles and give
+them trust. Then it drives on the other half, which no vehicle visited before, and the map of these
+roads is judged. Towns, drives and errors are drawn with random seeds that are used only for
+judging, not for tuning. The errors of one fleet are not drawn from an error model: they are those
+of the real estimator on simulated drives (`resampled`).
 """
 
 from __future__ import annotations
@@ -55,8 +55,9 @@ MODELS: Final[dict[str, ErrorModel]] = {
 def score_town(
     model: ErrorModel, seed: int, ways: DrivenVisits | None = None
 ) -> tuple[Scores, list[Scores]]:
-    """Return the scores of the map, and of the simple rules, in one town drawn by the seed. If
-    `ways` is given, the vehicles' reports are drawn from these simulated drives.
+    """Return the scores of the map, and of the simple rules, in one town drawn by the seed. `model`
+    describes the errors of the fleet. If `ways` (visits of simulated drives with the real
+    estimator) is given, the vehicles' reports are drawn from these visits instead.
     """
     rng = np.random.default_rng([seed, 11])
     place = town.draw_town(rng, MINUTES, 0.0, model)

@@ -153,9 +153,9 @@ def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
 def score_rules(
     v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of the maps that the simple rules RULES compute from the visits `v`, by
-    rule, at the minutes `at`. Cells outside the mask `where` are left out, and so are cells in
-    which no vehicle used enough grip to measure the friction.
+    """Return the scores of the maps that the simple rules RULES compute from the visits `v`, one
+    item per rule, for the map at the minutes `at`. Cells outside the mask `where` are left out, and
+    so are cells in which no vehicle used enough grip to measure the friction.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)

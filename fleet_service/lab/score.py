@@ -92,7 +92,8 @@ def of_intervals(
     rank: FloatArray,
     slippery: FloatArray,
 ) -> Scores:
-    """Return the scores of 90 % intervals of friction; each argument is an array (k,).
+    """Return the scores of 90 % intervals of friction for k answers of the map; each argument is an
+    array (k,).
 
     `quantiles` are the 5 %, 50 % and 95 % quantiles. The interval score is the width plus 20 times
     the distance by which the interval misses the true value.
@@ -193,8 +194,8 @@ def safe_share(s: Scores) -> float:
 
 
 def of_class(s: Scores, n: int) -> Scores:
-    """Return the scores of answers about cells in which at least `n` vehicles, but fewer than the
-    next number in COUNTS, used enough grip to measure the friction.
+    """Return the scores of answers about one class of cells: those in which at least `n` vehicles,
+    but fewer than the next larger number in COUNTS, used enough grip to measure the friction.
     """
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))

@@ -1,5 +1,5 @@
-"""Value of the map to its users: share of the road that is known, quality of alerts compared with
-two simpler rules, and minutes until ice is noticed. Pure (no I/O).
+"""Evaluation of the map's usefulness: share of the road whose friction is known, quality of alerts
+compared with two simpler rules, and minutes until the map shows new ice. Pure (no I/O).
 
 Drivers use the grip that a place demands. On a slippery road this is a large share of the available
 grip, so every vehicle measures the friction; on a dry road hardly any vehicle does. All vehicles

@@ -23,7 +23,9 @@ class AlertMirror:
         self.heard = 0.0  # arrival time of the last message [s since 1970]
 
     def take_alert(self, alert: Alert, now: float) -> None:
-        """Record that the alert of a cell was raised, repeated or cleared."""
+        """Apply a received alert to the local copy: the alert of a cell was raised, repeated or
+        cleared.
+        """
         with self._lock:
             self.heard = now
             self.heard_count += 1
@@ -48,8 +50,8 @@ class AlertMirror:
             return found
 
     def stretches(self) -> list[StretchAlert]:
-        """Return the stretches of road with an active alert, according to everything received until
-        now.
+        """Return the stretches of road with an active alert, according to all messages received
+        until now.
         """
         with self._lock:
             self._changed |= bool(self._stretches.take_changes())

@@ -79,8 +79,8 @@ class BoundedProtocol(H11Protocol):
         self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
 
     def _close_silent(self, before: object) -> None:
-        """Close the browser's connection if no request has come since the time limit began;
-        `before` is the last request at that time.
+        """Close the browser's connection if no request has come within the time limit. `before` is
+        the request that was the last one when the time limit began.
         """
         if not self.is_silent:
             return
@@ -91,8 +91,8 @@ class BoundedProtocol(H11Protocol):
 
 
 class RareMessages(logging.Filter):
-    """Log filter that passes each message at most once per LOG_S, and adds the number of equal
-    messages that were held back.
+    """Log filter that passes each message at most once per LOG_S seconds, and adds to it the number
+    of equal messages that were not logged in between.
     """
 
     def __init__(self) -> None:

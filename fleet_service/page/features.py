@@ -77,8 +77,8 @@ def _make_link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 
 def landing_document(base: str) -> dict[str, Any]:
-    """Return the landing page of the OGC API as a JSON document; `base` is the address without a
-    final slash.
+    """Return the landing page of the OGC API as a JSON document; `base` is the web address of this
+    server without a final slash.
     """
     return {
         "title": "GripMap",
@@ -237,8 +237,8 @@ def page_of(
 
 
 def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Yield the features (GeoJSON objects, one per cell and heading) with an id added. Properties
-    that repeat the geometry are left out.
+    """Yield the given features (GeoJSON objects, one per cell and heading) with their ids added.
+    Properties that repeat the geometry are left out.
     """
     names = {field.name for field in COLUMNS}
     for feature in features:

@@ -34,8 +34,8 @@ class ServiceHealth:
         self._before: dict[str, tuple[float, float]] = {}
 
     def services(self) -> list[dict[str, Any]]:
-        """Return one entry per fleet service: `address`, `answers` (True if it answered), and its
-        values.
+        """Return one entry per fleet service: `address`, `answers` (True if the service answered),
+        and the values of its metrics.
         """
         with self._lock:
             if time.monotonic() - self._asked >= KEPT_S:

@@ -28,7 +28,7 @@ class MirroredTile:
 
     Attributes:
         cells: records of the cells.
-        version: number of changes so far.
+        version: number of changes of the tile so far.
         heard: time at which the tile was received [s since 1970].
         made: blocks (encoded cells of the tile) by zoom level, kept for the next request.
     """
@@ -78,7 +78,9 @@ class MapMirror:
         return max(self._heard, self.alerts.heard)
 
     def remember(self, now: float) -> None:
-        """Store the present map, so that the time slider of the page can show it later."""
+        """Store the present map among the recent moments, so that the time slider of the page can
+        show it later.
+        """
         with self._lock:
             self.recent.keep(
                 now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)}

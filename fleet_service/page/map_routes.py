@@ -38,7 +38,7 @@ class MapRoutes:
         }
 
     async def tiles(self, request: Request) -> Response:
-        """Return the numbers of the tiles that have cells, now or at the time `at`."""
+        """Return the numbers of the map tiles that have cells, now or at the past time `at`."""
         at = request_params.parse_moment(request)
         found = (
             self._of.world.tiles()
@@ -49,8 +49,8 @@ class MapRoutes:
 
     async def blocks(self, request: Request) -> Response:
         """Return the requested `tiles` as blocks (encoded records of their cells) at a zoom
-        `level`, now or at the time `at`. With `borrowed`, cells estimated from neighbours are
-        included.
+        `level`, now or at the time `at`. With `borrowed`, the blocks also contain cells without
+        visits, whose friction is estimated from neighbouring cells.
         """
         wanted = request_params.parse_tiles(request)
         level = request_params.parse_level(request)
@@ -77,7 +77,9 @@ class MapRoutes:
         )
 
     async def events(self, request: Request) -> Response:
-        """Return a stream of the changes in `bbox` at a zoom `level`, from now on."""
+        """Return a stream of events: the changes of the map in the box `bbox`, at a zoom `level`,
+        from now on.
+        """
         try:
             stream = self._of.watchers.enter(
                 request_params.parse_view(request), request.client.host if request.client else ""
@@ -96,8 +98,8 @@ class MapRoutes:
         return JSONResponse(await run_in_threadpool(overlay.read_overlay, self._of.overlay))
 
     async def roads(self, _: Request) -> Response:
-        """Return the lines along which the page draws ribbons: from the operator's file, or derived
-        from the cells.
+        """Return the road lines along which the page draws coloured ribbons of friction. They come
+        from the operator's file, or are derived from the cells.
         """
         if self._of.roads is not None:
             return JSONResponse(self._of.roads.as_json() | {"learned": False})

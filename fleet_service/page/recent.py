@@ -26,8 +26,8 @@ class RecentMoments:
         self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
 
     def keep(self, now: float, tiles: Mapping[int, Records]) -> None:
-        """Store the tiles of a moment if the last stored moment is old enough and a tile has
-        changed since then.
+        """Store `tiles` (the whole map) as the moment `now` [s since 1970]. Do nothing if the last
+        stored moment is too recent, or if no tile has changed since then.
         """
         moment = int(now)
         last = next(reversed(self._kept), None)
@@ -48,7 +48,9 @@ class RecentMoments:
         return list(self._kept)
 
     def at(self, moment: int) -> dict[int, Records] | None:
-        """Return the tiles of a moment; None if the moment is not stored."""
+        """Return the tiles of the map at a stored moment [s since 1970]; None if no map of this
+        moment is stored.
+        """
         return self._kept.get(moment)
 
 

@@ -61,7 +61,8 @@ class TileBlock(NamedTuple):
         version: number of changes of the tile, from 1.
         base: version to which the changes apply; 0 for a complete tile.
         moment: time of the data [s since 1970].
-        records: records ordered by place; `basis` GONE means that the place is removed.
+        records: records ordered by place. In `basis` (measured, bounded or estimated), GONE means
+            that the place has no cell any more.
     """
 
     tile: int
@@ -117,7 +118,9 @@ def _to_steps(
 
 
 def as_values(row: Any) -> dict[str, Any]:  # noqa: ANN401 one record
-    """Return a record as numbers; `mu` is None if no value was measured."""
+    """Return the fields of a cell's record as numbers by name; `mu` is None if no value was
+    measured.
+    """
     measured = row["basis"] != BOUND and row["mu"] != NO_NUMBER
     return {
         "mu": int(row["mu"]) / MU_STEPS if measured else None,

@@ -80,8 +80,8 @@ def parse_feature_id(text: str) -> int:
 
 
 def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
-    """Return the begin [ns] of the selected observations, and the time [ns] of the map (None for
-    now).
+    """Parse a time parameter. Return the time [ns] from which observations are selected, and the
+    time [ns] of the requested map (None for now).
 
     The text is in the notation of RFC 3339: an instant, or an interval, one side of which may be
     open (`..` or nothing).

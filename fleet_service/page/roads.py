@@ -1,9 +1,9 @@
 """Roads of the page: lines and place names from a GeoJSON file, or lines derived from the cells
 that vehicles visited.
 
-The page draws one ribbon per direction along each line. Lines of a file have names. Derived lines
-follow the centres of neighbouring cells with the same heading, smoothed. Pure except for reading
-the file.
+The page draws one ribbon (coloured band of friction) per direction along each line. Lines of a file
+have names. Derived lines follow the centres of neighbouring cells with the same heading, smoothed.
+Pure except for reading the file.
 """
 
 from __future__ import annotations
@@ -117,8 +117,9 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Group the cells of one heading by their step along this heading. Return, for each step, the
-    position or positions of the road across the heading.
+    """Group the cells of one heading by their step (number of cells) along this heading. Return,
+    for each step, the road's position across the heading; several positions if several roads are
+    parallel.
 
     The error of the satellite receiver spreads one lane over neighbouring cells. Therefore cells of
     one step that are at most AHEAD apart become one position, their mean.

@@ -31,9 +31,10 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
     service returned.
 
     Returns:
-        `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis
-        and, where measured, mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by sight
-        distance [m]; `worst`: index of the stretch with the lowest lower bound, or None.
+        `length_m`; `share` of the length by basis (measured, bound, borrowed from neighbouring
+        cells, or unknown); `stretches` with from_m, to_m, middle, basis and, where measured, mu,
+        its quantiles, P(slippery), age_s and safe speeds [m/s] by sight distance [m]; `worst`:
+        index of the stretch with the lowest lower bound, or None.
 
     Raises:
         InputError: the route is too long or not valid.

@@ -18,8 +18,8 @@ MOST: Final = 256  # largest number of watched regions
 
 
 class ServedRegions:
-    """Regions with cells, and regions that lost their service before the page knew one of their
-    cells.
+    """Regions whose cells the page shows, and regions whose service disappeared before the page
+    knew one of their cells.
     """
 
     def __init__(self) -> None:
@@ -69,8 +69,8 @@ class ServedRegions:
         return any(self.is_answered(region) for region in self._queriers)
 
     def as_json(self) -> list[dict[str, Any]]:
-        """Return each region in a form for JSON: its box, whether a service answers for it, and, if
-        not, since when.
+        """Return each region in a form for JSON: its box, True if a service answers for it, and
+        otherwise the time [s since 1970] since which no service answers.
         """
         watched = [
             {

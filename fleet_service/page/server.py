@@ -52,7 +52,8 @@ class PageSettings:
         metrics: addresses at which services publish their metrics, for the health view.
         overlay: Parquet file of cell, sector and mu to draw over the map.
         base_map: tiles below the roads; None without a base map.
-        roads: lines along which ribbons are drawn; None to derive them from the cells.
+        roads: road lines along which coloured ribbons of friction are drawn; None to derive them
+            from the cells.
         datex: DATEX II publication to keep up to date and to serve; None without one.
         most: maximum number of browsers that receive live changes.
     """

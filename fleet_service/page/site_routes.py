@@ -96,7 +96,9 @@ class SiteRoutes:
         )
 
     async def health(self, _: Request) -> Response:
-        """Return the health of the fleet services and of this page as JSON."""
+        """Return, as JSON, the metrics of the fleet services and the state of this page:
+        connection, browsers and requests.
+        """
         services = await run_in_threadpool(self._of.health.services)
         reader = self._of.reader
         watchers = self._of.watchers

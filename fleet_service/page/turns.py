@@ -59,7 +59,8 @@ class PastTurns:
 
     @asynccontextmanager
     async def take(self, client: str) -> AsyncIterator[None]:
-        """Wait until it is this query's turn, and occupy the queue while the block runs.
+        """Wait until all earlier queries about the past have ended; other queries wait while the
+        block runs. `client` is the browser that sent the query.
 
         Raises:
             TooManyQuestionsError: too many queries are waiting.

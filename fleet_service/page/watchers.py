@@ -1,7 +1,8 @@
 """Server-sent events to browsers. Each browser has a view and a short queue; a browser that is too
 slow is asked to reload.
 
-tiles    blocks in base64, one per line: changed cells, or a complete tile when zoomed out
+tiles    blocks (encoded cells of tiles) in base64, one per line: changed cells, or a complete
+         tile when zoomed out
 alerts   all stretches with an active alert
 beat     time, served regions, number of active alerts: every two seconds
 reload   this browser has missed an event and must query again

@@ -99,9 +99,9 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 
 def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """Return the table with nulls in the columns `names` where `known` (n,) is False. In these rows
-    only a lower bound of friction is known; without the nulls a map program would colour such a row
-    like a measured value.
+    """Return the table with nulls in the columns `names` where `known` (n,) is False, which means
+    that only a lower bound of friction is known. Without the nulls a map program would colour the
+    lower bound like a measured value.
     """
     for name in names:
         column = table[name]

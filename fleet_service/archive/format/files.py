@@ -85,7 +85,7 @@ def write_table(
             syncs the folder.
 
     Raises:
-        OSError: the disk is full or read-only; no draft is left.
+        OSError: the disk is full or read-only; no draft (unfinished file) is left.
     """
     names = table.schema.names
     options: dict[str, Any] = {

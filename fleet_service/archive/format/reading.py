@@ -93,7 +93,9 @@ def read_tables(
 def read_wanted(
     root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
 ) -> Iterator[pa.Table]:
-    """Yield tables like `read_tables`, with the rows, columns and files that `wanted` selects."""
+    """Yield tables that together contain every selected row once; `wanted` selects rows, columns
+    and files. Damaged files are skipped.
+    """
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
     for path in listing.files:
@@ -139,9 +141,9 @@ class Listing:
             )
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
-        """Read a file like `load`, but pass the matching rows to `take`, one Parquet row group at a
-        time. Return False if the file is damaged or missing; the caller must then discard the rows
-        passed to `take`.
+        """Read one file of the archive, and pass the rows that match the selection and the filter
+        `where` to `take`, one Parquet row group (part of the file) at a time. Return False if the
+        file is damaged or missing; the caller must then discard the rows passed to `take`.
         """
         both = [*(self._wanted.where or ()), *where]
         try:
@@ -213,8 +215,9 @@ def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, se
 
 
 def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
-    """Return the rows of a table of new rows that do not belong to the partitions `done`, because
-    compacted (sorted) files already contain the rows of these partitions (day and map square).
+    """Return those rows of the table that lie outside the partitions `done` (pairs of day and map
+    square). The table contains new rows of a segment; its rows inside `done` are already in
+    compacted (sorted) files.
     """
     if not done or not table.num_rows:
         return table

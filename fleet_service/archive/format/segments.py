@@ -99,7 +99,7 @@ class Writer:
         `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for rows that have a likelihood.
 
         Raises:
-            OSError: the file could not be written; no draft is left.
+            OSError: the file could not be written; no draft (unfinished file) is left.
         """
         self._seq += 1
         path = segment_folder(self._root, kind) / layout.segment_name(

@@ -26,7 +26,7 @@ def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
     the file.
 
     Raises:
-        OSError: the file could not be written; no draft is left.
+        OSError: the file could not be written; no draft (unfinished file) is left.
     """
     path = path_of(root, now)
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)

@@ -61,8 +61,9 @@ class DamagedError(Exception):
 
 
 def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return key-value pairs for the footer of an archive file: `entries`, the digest (checksum),
-    and the current version unless `entries` contains one.
+    """Return the key-value pairs for the footer of an archive file: the pairs `entries`, the digest
+    (checksum of the columns `schema`), and the current format version unless `entries` contains
+    one.
     """
     own = {KEY: str(VERSION), **(entries or {})}
     own = {key: value for key, value in own.items() if key != DIGEST}

@@ -53,10 +53,10 @@ class Pseudonyms:
         self._month_of_day: dict[int, str] = {}
 
     def of(self, vehicle: str, time: int) -> str:
-        """Return the pseudonym (16 hexadecimal digits) of a vehicle at a time [ns].
+        """Return the pseudonym (16 hexadecimal digits) of a vehicle in the month of `time` [ns].
 
         Raises:
-            OSError: a key can neither be read nor written.
+            OSError: the key of the month can neither be read nor created.
         """
         month = self._month(time // _DAY_NS)
         pseudonym = self._known.get((month, vehicle))
@@ -66,11 +66,12 @@ class Pseudonyms:
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
-        """Return the pseudonymous number (63 bits) that stands for a vehicle's start (`boot`) at a
-        time [ns].
+        """Return the pseudonym of one start of a vehicle, as a number of 63 bits. It replaces
+        `boot`, the number of this start in the vehicle's messages. The key is that of the month of
+        `time` [ns].
 
         Raises:
-            OSError: a key can neither be read nor written.
+            OSError: the key of the month can neither be read nor created.
         """
         text = f"{vehicle}/{boot}".encode()
         digest = blake2b(text, key=self._key(self.month(time)), digest_size=_DIGEST_BYTES).digest()
@@ -83,7 +84,7 @@ class Pseudonyms:
         return month
 
     def month(self, time: int) -> str:
-        """Return the month (2026-01) whose key is used at a time [ns]."""
+        """Return the month (2026-01) that contains `time` [ns]; its key makes the pseudonyms."""
         return self._month(time // _DAY_NS)
 
     def _key(self, month: str) -> bytes:

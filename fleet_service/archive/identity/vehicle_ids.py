@@ -57,7 +57,8 @@ class VehicleIds:
         this month (2026-01). The record is durable after `sync`.
 
         Raises:
-            OSError: the key can neither be read nor written, or the line cannot be written.
+            OSError: the secret key can neither be read nor created, or the record cannot be
+                written.
         """
         number = self.number_of(vehicle)
         if self._known is None:
@@ -75,10 +76,10 @@ class VehicleIds:
         return number
 
     def number_of(self, vehicle: str) -> int:
-        """Return the permanent number of a vehicle.
+        """Return the permanent number of a vehicle: the keyed hash (64 bits, signed) of its name.
 
         Raises:
-            OSError: the key can neither be read nor written.
+            OSError: the secret key of the hash can neither be read nor created.
         """
         if self._key is None:
             self._key = load_or_create_key(self._folder / _KEY)

@@ -3,7 +3,8 @@
 
 A round takes the oldest segments (files of new rows). It adds files before it deletes segments:
 
-    1. all files of the round are written and synced as drafts; the footer of each names its sources
+    1. all files of the round are written to `drafts/` and synced; the footer of each names its
+       sources, the segments from which its rows come
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 

@@ -71,7 +71,7 @@ def register(root: Path, place: Place) -> RegistrationResult:
 
     Raises:
         InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at
-            `place.at`.
+            the URL `place.at`.
         OSError: the archive cannot be read or written.
     """
     total = RegistrationResult(0, 0, 0)
@@ -128,8 +128,9 @@ def place_of(root: Path) -> Place | None:
 
 
 def _record_registration(root: Path, place: Place) -> None:
-    """Record the registration before it happens. Otherwise a crash could leave a registered file
-    without a record, and the file could be removed without `unregister`.
+    """Record in the archive the Iceberg tables in which its files will be registered. The record
+    must precede the registration. Otherwise a crash between the two could leave registered files
+    that `unregister` does not find, and the tables would refer to missing files.
     """
     path = root / RECORD
     try:

@@ -111,8 +111,8 @@ def forget_period(root: Path, month: str) -> None:
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """Destroy the key of a month like `forget_period`. The caller must have locked the archive and
-    must not have data of the month in memory.
+    """Destroy the key of a month (2026-01), so that its pseudonyms can no longer be attributed to
+    vehicles. The caller must have locked the archive and must not have data of the month in memory.
 
     Measurements of the month up to `newest` [ns], the time of the newest measurement in the
     archive, are not accepted again.
@@ -131,8 +131,9 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
 def _newest_first_time(
     root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf
 ) -> int:
-    """Return the latest start time [ns] among the records of these days; -1 if there is no record.
-    The search stops early when it finds a start time of `until` or later.
+    """Return the latest time [ns] at which a stored record of the days `days` begins (for example,
+    a visit to a cell); -1 if there is no record. The search stops early when it finds a time of
+    `until` or later.
     """
     newest = -1
     for kind, name in layout.FIRST_TIME.items():

@@ -70,7 +70,7 @@ def grow_pairs(state: State, most: int) -> State:
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
     """Return the fusion's state after two changes. All pairs (vehicles in cells) without an
     observation in a window move to the settled pairs, which are sorted records without free space.
-    Reports that are not remembered at `now` [s] are deleted.
+    Reports that are too old to have an effect at `now` [s] are deleted.
 
     `names` (V,) are the records of the vehicles, and `size` is the number of slots (one per cell
     and heading sector) in use.
@@ -138,7 +138,8 @@ def grow_rows(old: Array, rows: int) -> Array:
 
 def _free_rows(old: Int32Array, used: IntArray, which: int, rows: int) -> Int32Array:
     """Return the list of free rows of an array of records that has grown to `rows`: the earlier
-    free rows `old` and the new rows. The number of free rows is written to `used[which]`.
+    free rows `old` and the new rows. The number of free rows is written to `used[which]`; `used`
+    contains the counts of the fusion's memory.
     """
     count = int(used[which])
     more = rows - len(old)

@@ -91,8 +91,9 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_waiting: int) -> int:
-    """Move the records of active pairs to another table. If `only_waiting` is 1, move only those
-    with an observation in a window. Return their number.
+    """Move the records of active pairs (vehicles in cells) from the hash table `old` to the hash
+    table `new`. If `only_waiting` is 1, move only pairs with an observation in a window (recent
+    observations). Return the number of moved records.
     """
     count = 0
     for begin in range(0, len(old), AHEAD):

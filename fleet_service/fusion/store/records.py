@@ -228,11 +228,14 @@ class PairRecord:
 
 
 class SettledRecord:
-    """Last report of one kind of a settled pair.
+    """Last report of one kind (value or lower bound) of a settled pair, which is one vehicle in one
+    slot without recent observations.
 
     Attributes:
-        time: last 16 bits of the time [s] of the report; `settled` restores the others.
-        mean, spent: as in `PairRecord`.
+        time: last 16 bits of the time [s] of the report; the module `settled` restores the other
+            bits.
+        mean, spent: mean friction that stands for the vehicle's reports of this kind in the cell,
+            and number of votes that it has used up there, in units of 1/FINE.
     """
 
     time: np.uint16
@@ -314,8 +317,8 @@ class Rows(NamedTuple):
     Attributes:
         belief: packed beliefs, (n, 32).
         cells: `CellRecord` of each slot, (n,).
-        reporters: `ReportersRecord`, or for copies only `SourcesRecord`, with their own row
-            numbers.
+        reporters: records of the vehicles that recently reported in a slot; `CellRecord.reporters`
+            is the row. They are `ReportersRecord`, or in copies only `SourcesRecord`.
     """
 
     belief: PackedArray
@@ -347,7 +350,8 @@ class State(NamedTuple):
         settled_std: `std` (see `PairRecord`) of the settled reports that are values, in order.
         settled_begin: rows of `settled` and of `settled_std` at which the reports of each slot
             begin, (m + 1, 2). Slots from m on, which are new, have no settled pairs.
-        used: (6,) counts, see FREE_WINDOWS.
+        used: (6,) counts, such as the number of free rows of `windows`; the constants from
+            FREE_WINDOWS on are the indices.
     """
 
     live: Rows

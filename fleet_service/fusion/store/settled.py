@@ -45,7 +45,8 @@ def _to_int(number: np.unsignedinteger[Any]) -> int:
 @refcount_free_inlined
 def _make_key(vehicle: int, kind: int) -> np.uint32:
     """Return the key of a settled report, one integer made from the index of the vehicle, the kind
-    of report (BOUND or VALUE), and the flag _MOVED.
+    of report (BOUND or VALUE), and the flag _MOVED, which is set if the vehicle reports in the cell
+    again.
     """
     return np.uint32(4 * vehicle + 2 * kind)
 
@@ -275,8 +276,8 @@ def insert_reports(
 
 @refcount_free_inlined
 def returning_bit(number: int) -> np.uint64:
-    """Return the bit that represents a vehicle in `Cells.returned`; several vehicles share a
-    bit.
+    """Return the bit that represents a vehicle in `Cells.returned`, the set of vehicles whose
+    reports in a cell were deleted; several vehicles share a bit.
     """
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
 
