@@ -6,8 +6,8 @@ Each number of `Constants` and of the shipped memberships (fuzzy sets) is multip
 manoeuvres, all with inaccurate cars. Their seeds belong to tuning and are not used for published
 results.
 
-Legend of the columns; each states the change compared with the unchanged filter score mean interval
-    score of friction over the drives [%]; less is better
+Legend of the columns; each states the change compared with the unchanged filter
+    score      mean interval score of friction over the drives [%]; less is better
     false ice  share of the samples above a friction of .6 that are called slippery [percentage
                points]
     found      share of the excited samples (a wheel uses much of its grip) on slippery road that
