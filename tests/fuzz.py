@@ -173,7 +173,9 @@ class Fuzzer:
             self._run_input(one, always=True)
 
     def run(self, seconds: float = float("inf"), executions: float = float("inf")) -> Result:
-        """Fuzz until `seconds` have passed or `executions` inputs have run. Return the counts."""
+        """Fuzz until `seconds` have passed or `executions` inputs have run. Return the run's
+        counts.
+        """
         end = time.monotonic() + seconds
         while self._executions < executions and time.monotonic() < end:
             self._run_input(self._mutate_input(self._random.choice(self._corpus)))

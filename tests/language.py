@@ -5,7 +5,7 @@
     python -m tests.language RULE     print every text that breaks this rule
 
 CONTRIBUTING.md, section "Rules for language", states the rules. `language_ceilings.json` has the
-ceilings per package. This program never raises a ceiling.
+ceilings per package. No ceiling is ever raised.
 """
 
 from __future__ import annotations

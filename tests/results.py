@@ -249,9 +249,7 @@ def list_pages() -> list[Path]:
 
 
 def read_kept(name: str) -> dict[str, Row]:
-    """Return the stored figures of a campaign, by name of the figure. The result is empty if none
-    are stored.
-    """
+    """Return the stored figures of a campaign, by name of the figure; none if nothing is stored."""
     return {row["name"]: row for row in _read_rows(name)[1:]}
 
 

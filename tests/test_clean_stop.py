@@ -1,5 +1,5 @@
 """Tests of SIGTERM and Ctrl-C. With and without a working router, agent and service must write
-their stored data, deliver as many reports as possible, and end.
+waiting data to disk, deliver as many reports as possible, and end.
 """
 
 from __future__ import annotations

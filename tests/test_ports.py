@@ -1,5 +1,5 @@
-"""Tests of `free_ports`. The returned ports must be unused, and lie below the range of outgoing
-connections.
+"""Tests of `free_ports`. The returned ports must be unused, and lie below the system's port range
+for outgoing connections.
 """
 
 import socket

@@ -1,5 +1,5 @@
-"""Tests of the commands of `fleet-service`, run as processes: output and exit codes are right, and
-each mistake gives one line that names it.
+"""Tests of the commands of `fleet-service`, run as processes. Output and exit codes must be right,
+and each mistake must give one line that names it.
 """
 
 from __future__ import annotations

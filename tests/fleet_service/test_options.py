@@ -298,8 +298,8 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("command", SHOWN_BELOW)
 def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
-    """Each listed option must occur in the test that shows its effect. The present test searches
-    the source of the command's test module, and of this module below the tables.
+    """Each listed option must occur in the test that shows its effect. This test searches the
+    source of the command's test module, and of this module below the tables.
     """
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]

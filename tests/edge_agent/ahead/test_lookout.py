@@ -60,9 +60,8 @@ class Driving:
         self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
-        """Report the car's pose (position, heading, speed) repeatedly, until the car's outlook
-        meets the condition. The outlook is its warnings and the friction of the road ahead. Return
-        this outlook.
+        """Report the car's pose (position, heading, speed) until the car's outlook (its warnings
+        and the friction of the road ahead) meets the condition. Return this outlook.
         """
 
         def has_outlook() -> bool:

@@ -1,5 +1,5 @@
 """Tests of the map as a prior of the friction estimate. The car must use the map when it enters a
-cell and drop it if it is wrong. A published report must never contain it.
+cell, and drop the map if it is wrong. A published report must not contain the map.
 """
 
 from __future__ import annotations

@@ -33,7 +33,9 @@ def drive(
 
 
 def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:
-    """Return times (T,) and signals (T, 18) of several drives in succession, 10 ms apart."""
+    """Return times (T,) and signals (T, 18) of several drives in succession; each begins 10 ms
+    after the previous one ends.
+    """
     clock = []
     rows = []
     end = 0.0

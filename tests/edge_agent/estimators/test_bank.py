@@ -266,8 +266,8 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
 
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
 def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
-    """During gentle acceleration the estimator must report no ice. Four sliding wheels, with a
-    suitable stiffness or sensor offset, would also explain the slip.
+    """During gentle acceleration the estimator must report no ice, although four sliding wheels
+    with a suitable stiffness or sensor offset would also explain the slip.
     """
     for seed in range(6):
         t, signals, vehicle = drive(name, 0.9, seed)

@@ -22,7 +22,9 @@ CELL_M = 10.2  # [m] side of a cell at this latitude
 
 
 def straight(samples: int, speed: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return east, north and yaw (T, 1) of a drive east along a line, 10 samples a second."""
+    """Return east and north [m] and yaw [rad], each (T, 1), of a drive due east, 10 samples a
+    second.
+    """
     east = (np.arange(samples) * speed / 10.0)[:, None]
     return east, np.zeros_like(east), np.zeros_like(east)
 

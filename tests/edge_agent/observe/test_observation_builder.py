@@ -167,8 +167,8 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     """A car brakes on dry road before a cell with ice. The braking must not count as grip in the
-    icy cell. The estimator reports the largest grip of the last second, and at 14 m/s a car crosses
-    a cell in less time.
+    icy cell. At 14 m/s a car crosses a cell in less than the second over which the estimator
+    reports the largest grip.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4

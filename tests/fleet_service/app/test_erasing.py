@@ -47,7 +47,7 @@ MONTH = f"{datetime.now(UTC):%Y-%m}"
 
 def sent_by(vehicle: str, seq: int) -> Batch:
     """Return a vehicle's batch with two visits (passes through cells). All vehicles of the test
-    visit the first cell. Only the vehicle that the test erases visits the second.
+    visit the first cell. Only the vehicle that the test erases visits the other.
     """
     now = time.time_ns() - SECOND
     latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])

@@ -16,8 +16,8 @@ from pyarrow import dataset
 
 
 class Seen(NamedTuple):
-    """Results of one tool that has read the observations of an archive: number of rows, mean of mu,
-    rows with a likelihood, and zones (map squares of zoom 7).
+    """Results of one tool that has read the observations of an archive: numbers of rows and of rows
+    with a likelihood, mean of mu, and zones (map squares of zoom 7).
     """
 
     rows: int

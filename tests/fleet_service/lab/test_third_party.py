@@ -1,5 +1,5 @@
-"""Tests of the simulated fleet of another car maker. Its reports must have the stated errors, and
-its figures must be right for maps with known answers.
+"""Tests of the simulated fleet of another car maker. Its reports must have the stated errors. The
+evaluation's figures must be right for maps with known answers.
 """
 
 from __future__ import annotations

@@ -35,8 +35,8 @@ def make_ice_table() -> pa.Table:
 
 
 def ends(first: int, last: int) -> list[tuple[float, float]]:
-    """Return a route as two points (longitude, latitude) [deg]. They are the centres of the cells
-    number `first` and `last`, counted eastward from the middle of the test street.
+    """Return a route as two points (longitude, latitude) [deg]: the centres of the cells number
+    `first` and `last`, counted eastward from the middle of the test street.
     """
     x = street.MIDDLE[0] + np.array([first, last])
     latitude, longitude = grid.centre(grid.interleave(x, np.array([street.MIDDLE[1]] * 2)))

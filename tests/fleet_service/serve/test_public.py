@@ -159,8 +159,8 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
     """A vehicle that passes alone at night must not be visible in answers, routes, stored maps
-    (snapshots) and tiles. Only vehicles of the last hours may make a cell public. The many vehicles
-    of the day must not count.
+    (snapshots) and tiles, although many passed by day. Only vehicles of the last hours may make a
+    cell public.
     """
     engine = start(3)
     day = (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND

@@ -254,7 +254,7 @@ def test_who_is_found_after_it_was_asked_is_asked_again(
 ) -> None:
     """The service answers map queries, but clients do not see its liveliness token (sign of a
     connected service). The client's first query gets no reply. The client must then find that the
-    service can answer, and query again.
+    service answers, and query again.
     """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:

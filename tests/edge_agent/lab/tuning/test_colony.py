@@ -63,8 +63,8 @@ def run(search: object, objective: Objective, seed: int, **options: object) -> R
 def test_colony_beats_random_search_in_at_least_21_of_24_trials(
     family: Callable[[int], Objective],
 ) -> None:
-    """The ant colony must win at least 21 of 24 trials against random search. If both searches were
-    equally good, this would have a probability of 1 in 7 000.
+    """The ant colony must win at least 21 of 24 trials against random search. Between equally good
+    searches this has a probability of 1 in 7 000.
     """
     wins = 0
     for trial in range(TRIALS):
