@@ -100,7 +100,9 @@ OMEGA_STD = 0.03  # [rad/s] noise of the wheel speed
 
 
 class WheelFrictionState(IntEnum):
-    """Index of a state in the state vector of the filter `sr-ukf`."""
+    """Index of a state in the state vector of the filter `sr-ukf` (unscented filter of paper
+    003).
+    """
 
     VX = 0
     VY = 1
@@ -109,7 +111,9 @@ class WheelFrictionState(IntEnum):
 
 
 class UnscentedMemory(PaperMemory):
-    """State of the filter `sr-ukf` for one vehicle, kept from one sample to the next."""
+    """State of the filter `sr-ukf` (unscented filter of paper 003) for one vehicle, kept from one
+    sample to the next.
+    """
 
     mean: Annotated[FloatArray, STATES]
     root: Annotated[FloatArray, STATES, STATES]

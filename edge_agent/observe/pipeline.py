@@ -121,9 +121,9 @@ class Pipeline:
         )
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return two arrays (N, 32), as described in `EstimatorBank.beliefs`: the estimators'
-        current beliefs (probabilities of friction), and the likelihoods of the measurements in the
-        current visits (passages of a map cell) so far.
+        """Return two arrays (N, 32) over the bins of the friction grid, or None if the estimator
+        has no grid. The first is log(posterior/uniform) of each vehicle's friction. The second is
+        the log-likelihood of the measurements in the current visit (passage of a map cell) so far.
         """
         return self._bank.beliefs()
 

@@ -45,8 +45,8 @@ class TripEnds:
         return self._metres == 0.0 and self._ns == 0
 
     def advance(self, time: IntArray, speed: FloatArray) -> None:
-        """Update the distances driven with a block of samples: `time` (T, N) [ns UTC] and `speed`
-        (T, N) [m/s].
+        """Update the distance that each of N vehicles has driven with a block of samples: `time`
+        (T, N) [ns UTC] and `speed` (T, N) [m/s].
         """
         if self._is_off:
             return

@@ -148,7 +148,7 @@ class HeldBatches:
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
         """Return two sequence numbers of a stream (vehicle, start, kind, region): the next free
-        one, and the lowest one of a batch in the outbox (store on disk).
+        number, and the lowest number of a batch in the outbox (store on disk).
         """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()

@@ -75,9 +75,9 @@ def dependence_factor(demand: float, dt: float) -> float:
     """Return the factor by which a filter increases the standard deviation of a measurement, for a
     sample `dt` [s] after the previous one, at a force of `demand` [g].
 
-    The factor has two reasons. Errors of the model last for INDEPENDENT_S, so all samples within
-    this time count as one measurement. Without force, only slip noise is left, which carries no
-    information on friction.
+    The factor grows for two reasons. Errors of the model last for INDEPENDENT_S, so all samples
+    within this time together count as one measurement. At small forces, a measurement is mostly
+    slip noise, which carries no information on friction.
     """
     return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 

@@ -6,7 +6,7 @@ size of the delay, the log is corrected before the estimator reads it. A delay o
 remains a finding (reported fault), and the records of the log are not published.
 
 Smaller delays are not corrected here, because the filter itself estimates them. Therefore a log
-without faults is estimated as in a car: no result depends on later samples.
+without faults is processed as in a car, where no estimate depends on later samples.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Adopted(NamedTuple):
 
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Return the log for the estimator. It is corrected first by the vehicle's calibration, then by
+    """Return `log`, corrected for use by the estimator: first by the vehicle's calibration, then by
     the measurements of the signal doctor (automatic check of the signals).
     """
     return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)

@@ -1,5 +1,5 @@
-"""Test for a car on a lift or on rollers: wheels turn and change speed, but the body does not
-accelerate.
+"""Test that detects a car on a lift or on rollers: wheels turn and change speed, but the body does
+not accelerate.
 
 On a road, wheels that gain 0.5 m/s² for a second accelerate the body, and the accelerometer shows
 it. Wheels that spin on ice are an exception: the body hardly accelerates, but the other wheels show

@@ -167,8 +167,8 @@ class Verdict:
     """Result of the search for faults (wrong units and signs) of measured quantities.
 
     `faults` has the fault of each quantity in the best explanation, None if there is none.
-    `margins` has, for each quantity, by how much the best explanation that gives this quantity
-    another fault (or none) costs more.
+    `margins` has, for each quantity, the additional cost of the best explanation that gives this
+    quantity another fault (or none).
     """
 
     faults: dict[str, Mistake | None]

@@ -54,7 +54,7 @@ class Decoder:
 
 
 class CanFeed(Feed):
-    """Live source for one bus of python-can.
+    """Live source for one CAN bus, read by the library python-can.
 
     Args:
         name: name of the source.

@@ -54,7 +54,7 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
 @compiled
 def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
     """Return the upper end of the reported friction interval. It is the larger of `friction.upper`
-    and the recent grip in use plus ABOVE.
+    and the recent grip in use plus the margin ABOVE.
 
     The result may exceed 1.2, the end of the friction grid, because racing tyres have a larger
     friction.

@@ -219,7 +219,8 @@ def slope_along(slope: float, ratio: float, square: float, whole: float) -> floa
     """Return the derivative [1] of the tyre's force along one direction by the slip along this
     direction, with slip expressed as the force of a linear tyre.
 
-    It is 1 at small slip, 0 on the flat part of the curve, and limited to at least FLATTEST.
+    The derivative is 1 at small slip and decreases towards the flat part of the curve. It is
+    limited to at least FLATTEST.
 
     Args:
         slope: slope of the tyre curve at the slip [1].

@@ -4,10 +4,9 @@ alike, or the rear axle does not slide.
 A tyre beyond its peak does not keep a constant slip: it locks or spins up within a tenth of a
 second unless a controller acts, and four tyres never do so alike. Therefore, if four wheels agree
 for a second, the speed is computed from them with the slip that their force needs. Without this
-rule, the filter could explain a lasting accelerometer offset only by four wheels sliding on ice.
-Four sliding wheels explain any data, so the filter would keep this explanation forever. In the same
-way, a rear axle with hardly any lateral force does not slide sideways, so the lateral velocity is
-computed from it.
+rule, a lasting accelerometer offset could lead the filter to assume that four wheels slide on ice.
+This assumption fits any data, so the filter would keep it forever. In the same way, a rear axle
+with hardly any lateral force does not slide sideways, so the lateral velocity is computed from it.
 """
 
 from __future__ import annotations

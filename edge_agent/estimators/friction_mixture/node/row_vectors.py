@@ -1,4 +1,4 @@
-"""Operations on vectors ("rows") with one number per measurement (ROWS = 6: four wheels, two
+"""Operations on vectors (called rows) with one number per measurement (ROWS = 6: four wheels, two
 axles).
 
 The vectors are tuples, so that the compiler keeps them in registers during a loop. Elements of an

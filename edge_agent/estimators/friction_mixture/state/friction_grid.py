@@ -120,7 +120,7 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 @compiled
 def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
     """Return the probability that the friction is below `limit`, given probabilities w (K,) of the
-    grid values mu (K,). The density between grid values is interpolated as in `quantile`.
+    grid values mu (K,). The density between grid values is interpolated linearly.
     """
     count = mu.shape[0]
     below = total = 0.0

@@ -136,8 +136,8 @@ class NodeWorkspace:
 
 
 class Scratch:
-    """Scratch arrays for intermediate results of one block (the samples within 0.05 s) of one
-    vehicle.
+    """Scratch arrays (working memory) for intermediate results of one block (the samples within
+    0.05 s) of one vehicle.
     """
 
     features: BlockFeatures
