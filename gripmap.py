@@ -7,7 +7,7 @@
 The distribution contains four top-level packages with plain names. Another package or folder with
 one of these names, for example your own folder `schemas`, hides GripMap's package if it comes first
 on Python's search path. Importing this module then raises an error that names the hidden package
-and the path of the package or folder that hides it.
+and the path of the other one.
 """
 
 from __future__ import annotations

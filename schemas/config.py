@@ -136,8 +136,7 @@ class ArchiveSettings(Settings):
     @property
     def options(self) -> dict[str, str]:
         """Return the options, by name, with which the archive's bucket (object store) is opened.
-        They come from the setting `store`; secrets among them, such as keys, are returned in plain
-        text.
+        They come from the setting `store`; secrets among them are in plain text.
         """
         return {name: value.get_secret_value() for name, value in self.store.items()}
 

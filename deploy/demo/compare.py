@@ -265,8 +265,8 @@ class LostGrip:
     cell: IntArray
 
     def figures(self) -> list[Figure]:
-        """Return two figures each for warned and for unwarned drivers: the share of passes over new
-        ice that lost grip, and the number of passes.
+        """Return the figures (measured values) for warned and for unwarned drivers: the share of
+        passes over new ice in which grip was lost, and the number of passes.
         """
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         # Without passes there is no share.

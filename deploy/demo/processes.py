@@ -40,7 +40,7 @@ class ManagedProcess:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def lines(self) -> list[str]:
-        """Return the lines of text that this process of the demo has printed so far."""
+        """Return the lines that this process of the demo has printed so far."""
         return self.log.read_text().splitlines()
 
     def line_with(self, start: str, patience_s: float = START_S) -> str:

@@ -17,8 +17,9 @@ import fleet_service
 
 
 def main(archive: Path, folder: Path) -> None:
-    """Compute the median friction per cell with DuckDB and with pandas. Find the stretches with the
-    lowest friction with GripMap, and write a map of them for a geographic information system.
+    """Compute the median friction per cell with DuckDB and with pandas. Find the road stretches
+    with the lowest friction with GripMap, and write a map of them for a geographic information
+    system.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = f"{archive}/observations/*/*/*.parquet"

@@ -52,8 +52,8 @@ def limit_ahead(distance: FloatArray, safe_speed: FloatArray) -> float:
     known.
 
     Each place ahead has a safe speed. A vehicle that drives at the returned speed can reach each
-    place's safe speed MARGIN_M metres before the place. It is assumed to begin braking after LATE_S
-    seconds, with the deceleration COMFORT.
+    place's safe speed MARGIN_M metres before the place. The vehicle is assumed to brake after
+    LATE_S seconds, with the deceleration COMFORT.
 
     Args:
         distance: (M,) distance of each place from the vehicle [m].
@@ -93,8 +93,8 @@ def limit_of(horizons: list[Horizon]) -> float:
 
 
 class SteadyLimit:
-    """Speed limit for the motion planner, with hysteresis. It follows a fall of the computed limit
-    at once, but rises only after the computed limit has been higher for HOLD_S seconds.
+    """Speed limit for the motion planner, with hysteresis. It follows a clear fall of the computed
+    limit at once, but rises only after the computed limit has been higher for HOLD_S seconds.
     """
 
     def __init__(self) -> None:

@@ -40,7 +40,8 @@ SLOWEST: Final = 0.5  # [m/s] at lower speeds a warning contains no time to the 
 @dataclass(frozen=True)
 class Active:
     """Current warning about a slippery stretch of road: the warning as last reported, the stretch's
-    places (cell·4 + sector), time [ns UTC] and distance [m] when it was last ahead.
+    places (cell·4 + sector), and the time [ns UTC] and distance [m] at which the stretch was last
+    seen ahead.
     """
 
     warning: GripWarning

@@ -18,7 +18,8 @@ _JSON: Final = {"double": "number", "int32": "integer"}
 
 
 class McapTableWriter:
-    """Writer of tables of estimates. Log times count from the first sample of the drive.
+    """Writer of tables of estimates to an MCAP file. The file's log times count from the first
+    sample of the drive.
 
     A value that is NaN or null is left out of its message, because JSON cannot represent NaN.
 

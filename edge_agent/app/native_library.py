@@ -33,7 +33,7 @@ def use_agent_library() -> bool:
     machine, now or at an earlier start. Call this before other imports.
 
     Return True if the library is used. Return False if there is no linker or no folder for the
-    library; Numba then compiles the kernels in this process.
+    library; Numba then compiles the kernels.
     """
     shipped = find_shipped_library(SHIPPED, read_processor_features())
     if shipped is not None and _load_library(shipped):

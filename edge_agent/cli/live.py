@@ -52,8 +52,8 @@ class LookoutPart:
 
     # The argument `admitted` is unused, because warnings are given even if nothing is published.
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:  # noqa: ARG002
-        """Pass to the lookout (the thread that looks ahead in the map) the vehicles' positions, and
-        the beliefs of their filters (probabilities of friction).
+        """Pass the vehicles' positions, and the beliefs of their filters (probabilities of
+        friction), to the lookout (thread that looks ahead in the map).
         """
         if pipeline.seen is None:
             return
@@ -62,8 +62,8 @@ class LookoutPart:
         self._lookout.believe(pipeline.places, pipeline.beliefs())
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop the lookout (thread that looks ahead in the map), and return the counts of warnings
-        and messages.
+        """Stop the lookout (thread that looks ahead in the map); return the counts of warnings and
+        messages.
         """
         self._lookout.close()
         return self._lookout.counts.values()

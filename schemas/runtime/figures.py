@@ -1,5 +1,5 @@
-"""Figures measured by a campaign (one run of an evaluation), each with its target: the file
-`figures.json` and a Markdown table.
+"""Figures (measured values) of a campaign (one run of an evaluation), each with its target, written
+as the file `figures.json` and a Markdown table.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ def inverse_of(x: float) -> float:
     """Return 1/x of a positive normal x with a relative error below 3e-16.
 
     A division occupies the processor as long as thirty multiply-adds. The third-order Newton method
-    used here, y <- y*(1 + e + e^2) with e = 1 - x*y, needs nine in its three steps. Each step
-    raises the relative error to the third power.
+    used here, y <- y*(1 + e + e^2) with e = 1 - x*y, needs nine multiply-adds in its three steps.
+    Each step raises the relative error to the third power.
     """
     y = guess_inverse(x)
     for _ in range(3):

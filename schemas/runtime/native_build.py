@@ -98,12 +98,12 @@ def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 def _stop_before_machine_code() -> None:
-    """Provide a context in which Numba stops each compilation as soon as it has generated LLVM
-    code. Numba then does not link or optimise this code and makes no machine code.
+    """Make Numba, for the rest of this process, stop each compilation after its LLVM code. Numba
+    then does not link or optimise this code and makes no machine code.
 
-    The kernel itself has been compiled before this context begins. Its code must not be optimised a
-    second time: the optimiser may fuse other multiplications and additions, which changes the last
-    bit of results.
+    The kernel itself has been compiled before this call. Its code must not be optimised a second
+    time: the optimiser may fuse other multiplications and additions, which changes the last bit of
+    results.
     """
     library: Any = codegen.JITCodeLibrary
     library.finalize = _mark_finalized

@@ -98,6 +98,6 @@ class _Cache(FunctionCache):
         return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
     def save_overload(self, sig: object, data: object) -> None:
-        """Save a function's compiled code in the cache; ignore errors of the disk."""
+        """Save a function's compiled code in the cache; ignore errors of writing to disk."""
         with suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]

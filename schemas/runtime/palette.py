@@ -9,7 +9,6 @@ The classes have an order: ice, snow, rather slippery, wet, rather not slippery,
 to good grip, lightness rises on a light background and falls on a dark one. Therefore ice, the most
 dangerous class, stands out most. `GRIP` is a colour scale through `FOUR` at the values of
 `SURFACES`, in steps of equal lightness. No colour is green, because green would promise safety.
-`tests/test_palette.py` checks order and distances.
 """
 
 from __future__ import annotations

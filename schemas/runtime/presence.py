@@ -72,7 +72,7 @@ class PresenceTracker:
 
         Both sources are needed. A router's answer may lack a token that the router is just sending
         to the subscription of the same session (1 of 60 answers). The subscription then delivers
-        that token, which is tracked, before the answer ends.
+        that token before the answer ends.
         """
         return active_tokens(session) | self.active
 
