@@ -237,9 +237,10 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 @refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
-    """Return the kind of a visit's likelihood (32,): VALUE (a measurement) if it falls by at least
-    VALUE_DROP_STEPS from its maximum to the highest friction, so that it limits μ from above; else
-    BOUND, because it is only a lower bound of μ.
+    """Return the kind of a visit's likelihood of friction (32,), VALUE or BOUND. It is VALUE (a
+    measurement) if the likelihood falls by at least VALUE_DROP_STEPS from its maximum to the
+    highest friction, because it then limits μ from above. Otherwise it is BOUND, only a lower bound
+    of μ.
     """
     least = np.uint8(255)
     for i in range(_BINS):

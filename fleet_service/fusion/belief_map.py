@@ -124,7 +124,8 @@ class BeliefMap:
 
     def trust(self, vehicle: int) -> float:
         """Return the weight that the next report of a vehicle will have in the map's beliefs about
-        friction; it depends on the vehicle's agreement with others, and 0 means no trust.
+        friction. The weight depends on the vehicle's agreement with other vehicles; 0 means no
+        trust.
         """
         return float(self.vote_weights[-1].weights(self._index(vehicle))[0])
 

@@ -10,8 +10,9 @@ the road at the checkpoint C, given a measurement at an earlier time t, is
 
 If no other vehicle visited the cell between t and C, the result equals that of an observation in
 time. Otherwise the late visit counts in addition to the others, as an old report about the present
-road. All late visits get times directly after the checkpoint, the newest visit first. So the newest
-visit of each vehicle counts, and the order of arrival between two checkpoints does not matter.
+road. All late visits get times directly after the checkpoint, the newest visit first. Of several
+visits of one vehicle to a cell, the newest therefore counts fully and the older ones as
+repetitions. The order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations

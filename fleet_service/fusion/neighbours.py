@@ -138,9 +138,10 @@ class Asked(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Memory for intermediate results: `scratch` for ageing; product of the cell's own belief and
-    all messages, `product` (32), and the same with messages weakened by silence, `quiet` (32); one
-    message (32); belief about the road of a neighbour (32).
+    """Memory for intermediate results. `scratch` serves to age a belief. `product` (32) is the
+    product of the cell's own belief and all messages (factors from neighbours). `quiet` (32) is the
+    same product with messages that are weaker because visits gave no friction value. `message` (32)
+    is one message, and `road` (32) the belief about the road of a neighbour.
     """
 
     scratch: FloatArray

@@ -109,7 +109,8 @@ class Shape(NamedTuple):
 
         A new service assumes .5. A service that has compared many passages of vehicles assumes
         little more than the slope of `reader`. Missed ice on tuning seeds: with .5 for all
-        services, .044 of the icy cell-minutes of a clean fleet had no alert; with this rule .010.
+        services, .044 of the icy cell-minutes of a fleet without misbehaving vehicles had no alert;
+        with this rule .010.
         """
         return self.reader + Z_95 * self.std
 

@@ -35,10 +35,10 @@ def other_cells(
     """Return the other cells in which the vehicles of n visits (passages of a cell) may have been,
     and the probability of each; both arrays are (n, 2·SPREAD_CELLS).
 
-    An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST, yaw or
-    the standard deviation is unknown, or the other cell lies in another region, which another
-    service may own. The probabilities sum to at most 1. The reported cell gets the rest, so the
-    effect of one visit is divided and not multiplied.
+    An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST; the yaw
+    angle or the standard deviation is unknown; or the other cell lies in another region, which
+    another service may own. The probabilities sum to at most 1. The reported cell gets the rest, so
+    the effect of one visit is divided and not multiplied.
     """
     cosine = np.cos(np.nan_to_num(yaw))
     sine = np.sin(np.nan_to_num(yaw))

@@ -177,9 +177,9 @@ def _pair_rank(vehicle: int, other: int) -> int:
     report has no influence.
 
     A vehicle's table of other vehicles has only PEERS places. If two others compete for a place,
-    the pair with the lower number keeps it. So a vehicle that was met rarely is as likely to be
-    kept as one that was met often; otherwise the vehicles that report most would displace the
-    others.
+    the pair with the lower number keeps it. A vehicle that was met rarely is thus as likely to keep
+    its place as one that was met often. Without this rule, the vehicles that report most would
+    displace the rarely met ones.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -235,8 +235,8 @@ def _update_weights(
     peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
 ) -> bool:
     """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the previous
-    weights `before`. Return True if newcomers got less weight: the service is established and
-    accepts also vehicles that are not enrolled, see `compute_vote_weights`.
+    weights `before`. Return True if newcomers got less weight. That is so if the service knows and
+    trusts enough vehicles, and also accepts vehicles that are not on the operator's list.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
@@ -271,8 +271,9 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
 
     For each vehicle the service counts cells where other vehicles confirmed or contradicted a flag.
     The count starts with TRUST_PRIOR_PEERS imagined cells, of which a share TRUST_PRIOR was
-    confirmed. If the share of confirmations is below TRUST_NONE, the flags support no alert. So a
-    vehicle whose flag is always on is excluded after two dry cells.
+    confirmed. If the share of confirmations is below TRUST_NONE, the flags support no alert. For
+    example, the flags of a vehicle that always reports an intervention support no alert after two
+    dry cells.
     """
     right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
     whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
@@ -298,7 +299,8 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
 
 def initial_trust(established: bool) -> float:
     """Return the weight of a vehicle that has not been compared with others yet; it is at most
-    NEWCOMER if the service is `established`, see `compute_vote_weights`.
+    NEWCOMER if the service is `established`, which means that it knows and trusts enough other
+    vehicles.
     """
     weight = _scale_trust(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight

@@ -120,12 +120,13 @@ def _clear_padding(scratch: Bins) -> None:
 
 @refcount_free_inlined
 def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
-    """Compute how much of a vote (effect of an observation on a cell) is new information, given the
-    vehicle's earlier reports in this cell. Reports that are not yet final are stored one by one,
-    older ones in one record per vehicle and cell.
+    """Compute the share `power` of a vote (effect of an observation on a cell) that is new
+    information, given the vehicle's earlier reports in this cell. Write the result to row `entry`
+    of `entries`. Reports that are not yet final are stored one by one, older ones in one record per
+    vehicle and cell.
 
-    All times are rounded to whole seconds, so that the result is the same for both kinds of
-    storage.
+    All times are rounded to whole seconds, because the records of older reports have only whole
+    seconds. The result then does not depend on the kind of storage.
     """
     kind = int(entries[entry].kind)
     pair = entries[entry].pair

@@ -88,9 +88,10 @@ class Votes(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Arrays that are filled while a batch is processed: masks of the observations left out (n,)
-    and accepted (n,), and the rows (k,) of the windows (recent observations of a cell) whose belief
-    must be computed again.
+    """Arrays that are filled while a batch of n observations is processed: a mask of the
+    observations left out (n,), a mask of the accepted ones (n,), and row numbers (k,) of windows. A
+    window contains the recent observations of a cell. The belief of the windows in these rows must
+    be computed again.
     """
 
     left_out: BoolArray
@@ -104,7 +105,7 @@ def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Vote
 
     Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
     out, because `most` observations of their vehicle already wait in the same cell. If an
-    observation affects several cells, only its own cell decides about this.
+    observation affects several cells, only the number that waits in its own cell counts.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -304,9 +305,9 @@ def commit_windows(
     due_windows: IntArray,
     before: int,
 ) -> None:
-    """Advance the checkpoint, before which observations are final, to `before` [ns] for the given
-    windows (k,), one after the other. Older observations are moved from the window into the base,
-    the cell's final state.
+    """Advance the checkpoint, before which observations are final, to `before` [ns] in the given
+    lateness windows (k,), which contain the recent observations of cells. Older observations are
+    moved from the window into the base, the cell's final state.
     """
     scratch = np.zeros((3, PADDED), np.float32)
     _commit_windows(state, weather, vehicles, due_windows, before, scratch)
@@ -315,7 +316,8 @@ def commit_windows(
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
     """Prefetch the memory that `commit_windows` will access for the lateness windows (recent
-    observations of cells) from `begin` to `end`, in the same way as `_prefetch_votes`.
+    observations of cells) from `begin` to `end`. Records whose position is known only after another
+    load come last.
     """
     live = state.live
     base = state.base

@@ -129,9 +129,9 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """Reports about n visits (passages of cells): reading z of the friction and its standard
-    deviation σ (n,), both NaN if too little grip was used to measure the friction; grip used (n,);
-    manoeuvre (n,); log-likelihood (n, 32).
+    """Reports about n visits (passages of cells): reading z of the friction (n,) and its standard
+    deviation σ (n,), grip used (n,), manoeuvre (n,), log-likelihood (n, 32). Reading and standard
+    deviation are NaN if too little grip was used to measure the friction.
     """
 
     reading: FloatArray
@@ -204,7 +204,7 @@ def reading_likelihood(
 def overconfident_likelihood(
     claim: FloatArray | float, std: float = OVERCONFIDENT_STD
 ) -> FloatArray:
-    """Return the normal log-likelihoods (n, 32) that a vehicle sends if it claims the friction
-    `claim` (n,) with the standard deviation `std`, which is smaller than its error.
+    """Return the normal log-likelihoods (n, 32) that a misbehaving vehicle sends if it claims the
+    friction `claim` (n,) with the standard deviation `std`, although its error is larger.
     """
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

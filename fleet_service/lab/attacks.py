@@ -139,8 +139,9 @@ def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def victim_cells(drive: AttackedDrive) -> IntArray:
-    """Return the numbers of the two cells that are attacked: among the cells in which enough honest
-    vehicles measured the friction, the one with the most and the one with the least friction.
+    """Return the numbers of the two cells that are attacked: the cell with the most friction and
+    the cell with the least. Only cells are candidates in which enough honest vehicles measured the
+    friction.
     """
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
@@ -209,8 +210,8 @@ VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
 
 def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
     """Return the number of cells whose alert changes if the attackers send recorded messages of the
-    first minutes again, in three forms: as they were, under an attacker's key, and with an
-    attacker's name.
+    first minutes again. They send each message in three forms: unchanged, under an attacker's Zenoh
+    key, and with an attacker's name.
     """
     sent = make_messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]

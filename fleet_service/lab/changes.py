@@ -73,9 +73,9 @@ def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
 
 
 def measure(seeds: range) -> dict[str, float]:
-    """Return medians and 95 % quantiles of the detection delays over the cells of all seeds, in
-    excited passes (with enough grip used to measure the friction), and the share of cells in which
-    the change was detected after each number of passes.
+    """Return medians and 95 % quantiles of the detection delays over the cells of all seeds. A
+    delay is counted in excited passes (with enough grip used to measure the friction). Also return
+    the share of cells in which the change was detected after each number of passes.
     """
     out: dict[str, float] = {}
     for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):

@@ -35,7 +35,9 @@ def name_of(vehicle: int) -> str:
 
 
 def clock_of(seconds: float) -> int:
-    """Return the simulated service's time [ns] at `seconds` after the start of the drive."""
+    """Return the time [ns] that the clock of the simulated service shows `seconds` [s] after the
+    start of the drive.
+    """
     return START + int(seconds * NS) + NS
 
 

@@ -138,8 +138,8 @@ def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntA
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:
-    """Return those reports that `row` (n,) selects, converted to roads with a friction that is `by`
-    (n,) times as large.
+    """Return n reports of the estimator on other roads: the reports in the rows `row` (n,),
+    converted to a road whose friction is `by` (n,) times as large.
     """
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip(

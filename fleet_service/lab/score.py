@@ -238,9 +238,9 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
     grip_raised  share of the answers about roads with grip (μ > SURE_GRIP) with a P(slippery)
                  above RAISED
 
-    The error of the worst bin is not used as a score. All cells of one simulated drive share the
-    same snow, so even a calibrated map would keep a limit on this error in only a third of the
-    evaluations.
+    The error of the worst bin is not used as a score, because it is mostly chance: all cells of one
+    simulated drive share the same snow. Even a calibrated map would stay below a limit on it in
+    only a third of the evaluations.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])

@@ -107,8 +107,9 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 def lower_excess() -> float:
     """Return the largest amount by which the lower end of the map's interval of friction exceeds
-    the level that the reports support (`bound_excess`): the maximum over all values of the grip
-    used in USED, and over all forms of the report: protobuf or JSON, as posterior or as likelihood.
+    the level that the reports support (`bound_excess`). It is the maximum over all values of the
+    grip used in USED, and over all forms of the report: protobuf or JSON, as posterior or as
+    likelihood.
     """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)

@@ -116,7 +116,7 @@ def make_observations(drive: ForeignDrive) -> Observations:
 
 def place_fixes(rng: Generator, place: IntArray) -> IntArray:
     """Return the cells (n,) that vehicles report when they are in the middle of the cells `place`
-    (n,); the position error is FIX_STD_M [m].
+    (n,); their position error has the standard deviation FIX_STD_M [m].
     """
     offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
     found = place + np.floor(offset / CELL_M).astype(np.int64)
@@ -148,9 +148,9 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
-    """Return three items at the end of a drive of an honest fleet: the scores of the map, a mask of
-    cells with an alert, and the number of visits (passages of cells) to each cell in which the
-    vehicle used enough grip to measure the friction.
+    """Return three results at the end of a drive of an honest fleet: the scores of the map, a mask
+    of cells with an alert, and a number for each cell. This is the number of visits (passages of
+    the cell) in which the vehicle used enough grip to measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)

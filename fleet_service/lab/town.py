@@ -85,7 +85,9 @@ class Town:
 
 
 def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
-    """Draw a random town. `changing` is the share of roads whose surface changes at some minute."""
+    """Return a random town. `changing` is the share of roads whose surface changes at some minute
+    of the simulated drive.
+    """
     names = list(SURFACES.values())
     share = [s[2] for s in SURFACES.values()]
     stretches = CELLS // STRETCH

@@ -20,9 +20,10 @@ MOST: Final = 100
 
 
 def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
-    """Return the areas of the map that have data (groups of neighbouring tiles), one dictionary
-    each: `name` of the nearest place (empty if no named place is near), `box` [deg], `latitude` and
-    `longitude` of its centre [deg], and the numbers of `cells` and `alerts` in it.
+    """Return the areas of the map that have data, one dictionary each; an area is a group of
+    neighbouring tiles. The keys are: `name` of the nearest place (empty if no named place is near),
+    `box` of the area [deg], `latitude` and `longitude` of the centre [deg], and the numbers of
+    `cells` and `alerts` in the area.
 
     Args:
         world: the mirrored map.

@@ -132,8 +132,8 @@ class MapMirror:
         return [tile for _, tile in sorted(late)[:most]]
 
     def touch(self, tile: int, now: float) -> None:
-        """Record that a tile was queried at time `now` [s since 1970], and that its content stays:
-        it is unchanged, or no service answered.
+        """Record that a tile was queried at time `now` [s since 1970]. The content of the tile in
+        the local copy stays, because it is unchanged or no service answered.
         """
         with self._lock:
             if tile in self._tiles:

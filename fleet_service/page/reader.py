@@ -101,8 +101,8 @@ class Reader:
         )
 
     def regions(self) -> list[dict[str, Any]]:
-        """Return the regions with cells: their box, whether a service answers for them, and, if
-        not, since when.
+        """Return the regions with cells, each with its box, with True if a service answers for it,
+        and otherwise with the time since which no service answers.
         """
         return self._regions.as_json()
 

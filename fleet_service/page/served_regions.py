@@ -69,8 +69,8 @@ class ServedRegions:
         return any(self.is_answered(region) for region in self._queriers)
 
     def as_json(self) -> list[dict[str, Any]]:
-        """Return each region in a form for JSON: its box, True if a service answers for it, and
-        otherwise the time [s since 1970] since which no service answers.
+        """Return each region in a form for JSON: its box, True if a service answers for the region,
+        and otherwise the time [s since 1970] since which no service answers.
         """
         watched = [
             {

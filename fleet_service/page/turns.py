@@ -4,8 +4,9 @@ neither for ordinary requests nor for queries about past maps.
 At most RUNNING requests of one client are computed at a time; its other requests wait.
 
 A service rebuilds one past map at a time. Therefore the page sends one query about the past at a
-time, in the order of arrival, and queues at most MOST_WAITING of one client. After each such query
-it pauses for as long as the query took, so that other readers of the service get their turn.
+time, in the order of arrival, and queues at most MOST_WAITING of one client. After each query about
+the past, the page pauses for as long as the query took, so that other readers of the service get
+their turn.
 """
 
 from __future__ import annotations

@@ -60,8 +60,9 @@ def make_application(
 def with_turns(
     turns: RequestTurns, answer: Callable[[Request], Awaitable[Response]]
 ) -> Callable[[Request], Awaitable[Response]]:
-    """Return the request handler `answer` with a limit: it runs only when `turns` allows another
-    request of the client. An invalid request is answered with the problem and the fix.
+    """Return the request handler `answer` with a limit: the handler runs only when `turns`, which
+    counts the requests of each client, allows another one. An invalid request is answered with the
+    problem and the fix.
     """
 
     async def answer_or_refuse(request: Request) -> Response:

@@ -119,8 +119,8 @@ def day_of(folder: Path) -> int:
 
 
 def partition_of(path: Path) -> Partition:
-    """Return the partition of a compacted (sorted) file, that is, its day and its zone (map square
-    of zoom 7), read from the names of the folders in which the file lies.
+    """Return the partition of a compacted (sorted) file: its day and its zone (map square of zoom
+    7). Both are read from the names of the folders in which the file lies.
     """
     return Partition(
         day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
@@ -169,9 +169,9 @@ def with_term(name: str, term: int) -> str:
 
 
 def compacted_name(name: str, term: int) -> str:
-    """Return the name of a compacted (sorted) file, made from the name of its newest segment (file
-    of new rows) and the term (lease epoch) of the compacting service; the term is 0 without a
-    lease.
+    """Return the name of a compacted (sorted) file. It is made from the name of the file's newest
+    segment (file of new rows) and the term (lease epoch) of the compacting service; the term is 0
+    without a lease.
     """
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
@@ -193,9 +193,9 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a sort key that orders the names of segments (files of new rows), or of compacted
-    (sorted) files, from old to new: epoch (number of the writer's start), number of the segment,
-    name of the service.
+    """Return a sort key for the name of a segment (file of new rows) or of a compacted (sorted)
+    file. Sorting by the key gives the order from old to new. The key consists of the epoch (number
+    of the writer's start), the number of the segment, and the name of the service.
     """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard

@@ -1,5 +1,6 @@
-"""Reading of an archive so that every row is read exactly once, from the inbox (segments, which are
-files of new rows) or from a compacted (sorted) file, even during a compaction.
+"""Reading of an archive so that every row is read exactly once, even during a compaction. A row
+comes either from the inbox (segments, which are files of new rows) or from a compacted (sorted)
+file.
 
 The inbox is read first and completely. If a compaction deletes segments meanwhile, the reader
 starts again. Then the compacted files are listed once. Rows of a segment are skipped if a listed

@@ -165,8 +165,9 @@ def _make_column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
-    """Return a mask of rows (n,): True if the row gives a value of μ and not only a lower bound,
-    because the vehicle used at least the share EXCITED_SHARE of μ. The result for NaN is False.
+    """Return a mask of rows (n,): True if the row gives a value of μ and not only a lower bound.
+    That is so if the vehicle used at least the share EXCITED_SHARE of μ. The result for NaN is
+    False.
     """
     return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 

@@ -1,6 +1,7 @@
 """Snapshots of the public map: one GeoParquet file per hour.
 
-map/date=2026-01-31/20260131T070000Z.parquet public cells with their polygons, sorted by cell
+The file `map/date=2026-01-31/20260131T070000Z.parquet` contains the public cells at that hour with
+their polygons, sorted by cell.
 """
 
 from __future__ import annotations

@@ -6,10 +6,10 @@ Their measurements are not accepted again.
     keys/2026-01.PSEUDONYM.UNTIL.erased   the same for the vehicle with this pseudonym; removed with
                                           the month's key
 
-Without the month's key, the service cannot recognise batches that it has already received, so a
-repeated batch would count twice. The same holds for a vehicle whose rows were removed. UNTIL is the
-end of the month. In the current month, UNTIL is the time of the newest measurement in the archive,
-so no clock is needed.
+Reason for the refusal: without the month's key, the service cannot recognise batches that it has
+already received, so a repeated batch would count twice. The same holds for a vehicle whose rows
+were removed. UNTIL is the end of the month. In the current month, UNTIL is the time of the newest
+measurement in the archive, so no clock is needed.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ class VehicleIds:
         self._unsynced: set[Path] = set()
 
     def id_of(self, vehicle: str, month: str, pseudonym: int) -> int:
-        """Return the permanent number of a vehicle and record it for the vehicle's pseudonym in
-        this month (2026-01). The record is durable after `sync`.
+        """Return the permanent number of a vehicle and record it for the vehicle's pseudonym in the
+        month `month` (2026-01). The record is durable after `sync`.
 
         Raises:
             OSError: the secret key can neither be read nor created, or the record cannot be

@@ -211,10 +211,11 @@ class PairRecord:
         slot, vehicle: slot and index of the vehicle; a free place of the table has slot NONE.
         last: row of the newest of the pair's entries in the window, or NONE.
         waiting: number of the pair's entries in the window.
-        std: `last_std` (see `EntryRecord`) of the last value, in units of 1/FINE.
+        std: standard deviation of the last value (`EntryRecord.last_std`), in units of 1/FINE.
         time: times [s] of the last bound and of the last value; 0 for none.
-        mean, spent: `last_mean` and `spent` (see `EntryRecord`) of the last bound and of the last
-            value, in units of 1/FINE.
+        mean, spent: mean friction that stands for the vehicle's reports in the slot
+            (`EntryRecord.last_mean`), and number of votes that the vehicle has used up there. Each
+            has two numbers, for bounds and for values, in units of 1/FINE.
     """
 
     slot: np.int32
@@ -255,7 +256,8 @@ class SourcesRecord:
 class ReportersRecord:
     """The recent reporters of a cell and heading sector: the last REPORTERS vehicles that gave a
     value, with time [s], mean, standard deviation and grip used. The record also contains the last
-    vehicles that reported ice or grip there, as in `SourcesRecord`.
+    SOURCES vehicles that reported grip there and the last that reported ice, with the times of
+    their reports [s].
     """
 
     reporter: Annotated[Int32Array, c.REPORTERS]
@@ -347,7 +349,8 @@ class State(NamedTuple):
             and kind.
         settled_keys: vehicle and kind of each settled report, (k,): four times the vehicle's index,
             plus two times the kind, plus one if the pair is active again.
-        settled_std: `std` (see `PairRecord`) of the settled reports that are values, in order.
+        settled_std: standard deviation (`PairRecord.std`) of the settled reports that are values,
+            in the order of `settled`.
         settled_begin: rows of `settled` and of `settled_std` at which the reports of each slot
             begin, (m + 1, 2). Slots from m on, which are new, have no settled pairs.
         used: (6,) counts, such as the number of free rows of `windows`; the constants from

@@ -147,9 +147,9 @@ def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> 
 @compiled
 def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
     """Delete the settled reports that are too old to be remembered at `now` [s], and those of
-    vehicles that report in the same cell again. The others move to the beginning of the arrays.
-    Return their number, and the number of values among them. `names` are the records of the
-    vehicles.
+    vehicles that report in the same cell again. The remaining reports move to the beginning of the
+    arrays. Return the number of remaining reports, and the number of friction values among them.
+    `names` are the records of the vehicles.
     """
     begins = state.settled_begin
     keys = state.settled_keys

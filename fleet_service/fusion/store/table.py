@@ -6,8 +6,8 @@ Comparing the hash parts first avoids nearly all reads of rows with another key,
 wait for memory.
 
 The first place for a key is proportional to its hash. Therefore a table may have any length. A
-longer table contains its rows in the same order, so that it can be filled from one end to the
-other.
+longer copy of a table contains the rows in the same order, so that the copy can be filled from one
+end to the other.
 
 A slot is the storage of one cell and heading sector. A pair is one slot and one vehicle; a pair
 record sums up the vehicle's reports there. Pair records are stored in the places of their hash
