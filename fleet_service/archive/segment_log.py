@@ -26,8 +26,8 @@ Upload = Callable[[Sequence[Path]], None]
 
 
 class _Load(Generic[Batch]):
-    """Rows that are written to disk together, by kind (observations or states), and the batches
-    (messages) to which they belong.
+    """Load: rows that are written to disk together, by kind (observations or states), and the
+    batches (messages with records) to which the rows belong.
     """
 
     def __init__(self) -> None:

@@ -178,7 +178,9 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @refcount_free_inlined
 def _to_parts(number: float | np.floating[Any]) -> np.uint16:
-    """Convert a number to an integer in units of 1/FINE, as records store it."""
+    """Convert a mean, a standard deviation or a number of votes to the integer that records store,
+    in units of 1/FINE.
+    """
     return np.uint16(
         min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0))
     )
@@ -186,7 +188,9 @@ def _to_parts(number: float | np.floating[Any]) -> np.uint16:
 
 @refcount_free_inlined
 def _from_parts(parts: int) -> np.float32:
-    """Convert a stored integer in units of 1/FINE to the number that it represents."""
+    """Convert an integer that a record stores in units of 1/FINE to the mean, standard deviation or
+    number of votes that it represents.
+    """
     return np.float32(parts) * np.float32(1.0 / FINE)
 
 
@@ -337,15 +341,15 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
     """Return the evidence [nat] that one observation (row `entry`) gives for ice (μ < SLIPPERY)
-    against grip (μ ≥ SLIPPERY), a log-likelihood ratio. It allows for the tyre-shape error: a
-    vehicle that uses only a part of the grip may report too low a value.
+    against grip (μ ≥ SLIPPERY), a log-likelihood ratio. The ratio allows for the tyre-shape error:
+    a vehicle that uses only a part of the grip may report too low a value.
 
     On a road of friction μ on which the vehicle used the grip u, this error has the standard
     deviation d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the error per unit of
     unused grip that alerts assume for a fleet about which nothing has been learned. Let L(r) be the
-    reported likelihood of a reading r, scaled to maximum 1, so that the likelihood of ice is 1. The
-    likelihood of grip is the maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all μ ≥ SLIPPERY and r ≤
-    μ. The result is minus its logarithm.
+    reported likelihood of a reading r, scaled to maximum 1. The likelihood of ice is taken as this
+    maximum, 1. The likelihood of grip is the maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all μ ≥
+    SLIPPERY and r ≤ μ. The result is minus the logarithm of the likelihood of grip.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED

@@ -292,7 +292,9 @@ def _recompute_beliefs(state: State, weather: Weather, stale: Int32Array, scratc
 
 
 class VehicleRecords(NamedTuple):
-    """Records of all vehicles: comparisons with other vehicles, and permanent numbers."""
+    """Records of all vehicles: each vehicle's comparisons with other vehicles (`peers`), and its
+    permanent number (`names`).
+    """
 
     peers: RecordArray
     names: RecordArray

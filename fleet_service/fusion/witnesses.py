@@ -26,7 +26,7 @@ class StretchSources(NamedTuple):
     sector), the newest first.
 
     Attributes:
-        who: index of the vehicle, (k, n).
+        who: index of each of at most n vehicles per slot, (k, n).
         when: time of the vehicle's newest report [ns], (k, n); 0 for no vehicle.
         around: mask (k,): True if such vehicles reported ice both before and behind the slot.
     """

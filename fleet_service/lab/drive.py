@@ -89,8 +89,8 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
-    """Return the indices of those deliveries of messages that the service accepts: the first
-    delivery of each visit (passage of a cell).
+    """Return the indices of the deliveries that the service accepts: the first delivery of each
+    visit (passage of a cell). It drops later deliveries of the same visit as duplicates.
     """
     streams = SequenceTrackers()
     kept = []
@@ -137,8 +137,8 @@ class AlertWatch:
 
 
 def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
-    """Yield those of the observations `o` that arrive in each of `count` minutes; `at` contains the
-    arrival times [s].
+    """Yield, for each of `count` minutes, the observations of `o` that arrive in it; `at` (n,)
+    contains the arrival times [s], ascending.
     """
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count
@@ -149,8 +149,9 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
-    """Deliver simulated visits (passages of cells) to a `Fusion` (a map's beliefs), and read the
-    map after each of `count` minutes, or only at the minutes in `asked`.
+    """Deliver simulated visits (passages of cells) to a new `Fusion` (a map's beliefs) for `count`
+    minutes. Return the map with the beliefs and alerts that were read after each minute, or only at
+    the minutes in `asked`.
     """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)

@@ -39,8 +39,8 @@ EARLIER = 20
 
 
 class Fleet(NamedTuple):
-    """One simulation of a fleet for `minutes` [min], in which a share of the vehicles always
-    reports the value `claim`.
+    """Simulation of a fleet for `minutes` [min], in which the share `share` of the vehicles always
+    reports the friction `claim`.
 
     The service judges vehicles by their earlier reports. Coverage and error are therefore measured
     from minute `begin` on, when every vehicle has about 200 visits (passages of cells), as many as

@@ -57,7 +57,7 @@ class Scores:
 
 
 def join_scores(scores: list[Scores]) -> Scores:
-    """Return the scores of the map in several runs as one object."""
+    """Return the scores of several runs as one object, which contains the answers of all runs."""
     return Scores(
         *(
             np.concatenate(columns)

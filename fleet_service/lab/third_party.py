@@ -140,7 +140,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 
 
 def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return those of the simulated visits (passages of cells) that have the given indices."""
+    """Return the simulated visits (passages of cells) with the given row numbers."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

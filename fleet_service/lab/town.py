@@ -180,7 +180,8 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return those of the simulated visits (passages of cells) that have the given indices."""
+    """Return the simulated visits (passages of cells) that `rows` (row numbers or a mask) selects.
+    """
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

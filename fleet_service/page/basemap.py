@@ -39,7 +39,7 @@ _TAG: Final = re.compile(r"<[^>]*>")
 
 
 class TileSource(Protocol):
-    """Interface of a file with tiles of a base map."""
+    """Interface of a file that contains the tiles of a base map, whatever its format."""
 
     kind: str
     zooms: tuple[int, int]
@@ -131,7 +131,7 @@ class BaseMap(NamedTuple):
         address: address of the tiles with {z}, {x} and {y}.
         zooms: smallest and largest zoom level that has tiles.
         file: file of the tiles; None for tiles from elsewhere.
-        attribution: authors of the map.
+        attribution: text that names the authors of the base map; the page shows it.
     """
 
     address: str

@@ -47,7 +47,8 @@ class BoundedProtocol(H11Protocol):
                 self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Clean up after the end of a connection that was accepted."""
+        """Release an accepted connection after its end: stop its time limit and count it no longer.
+        """
         if self._head_timer is not None:
             self._head_timer.cancel()
             super().connection_lost(exc)

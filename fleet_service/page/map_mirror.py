@@ -45,7 +45,9 @@ class _Before(NamedTuple):
 
 
 class MapMirror:
-    """Local copy of the live map: all received tiles, and the alerts as `alerts`; thread-safe."""
+    """Local copy of the live map: all received tiles, and the active alerts (attribute `alerts`);
+    thread-safe.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -61,7 +61,8 @@ class Moments:
 
     @property
     def has_archive(self) -> bool:
-        """Return True if an archive is given, which provides older maps."""
+        """Return True if the page has access to an archive, which provides maps of earlier moments.
+        """
         return self._root is not None
 
     def times(self) -> list[int]:

@@ -128,7 +128,9 @@ class FeatureRoutes:
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
 
     async def item(self, request: Request) -> Response:
-        """Return one feature (one heading in one cell) with its present values."""
+        """Return the feature (one heading in one cell) whose id the request names, with its present
+        values.
+        """
         place = request_params.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
             self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)

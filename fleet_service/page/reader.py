@@ -95,7 +95,9 @@ class Reader:
         return self._served and self.is_connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
-        """Return True if a service answers for a place [deg]."""
+        """Return True if a fleet service answers for the place at this latitude and longitude
+        [deg].
+        """
         return self._regions.is_answered(
             int(grid.region_of(int(grid.cell_of(latitude, longitude))))
         )

@@ -73,7 +73,7 @@ class TileBlock(NamedTuple):
     records: Records
 
     def encoded(self) -> bytes:
-        """Return the block (map cells of a tile) as bytes for the browser."""
+        """Return the block (map cells of a tile) as bytes: head, then columns."""
         head = HEAD.pack(
             self.tile, self.version, self.base, len(self.records), self.level, self.moment
         )

@@ -174,7 +174,9 @@ async def _serve_app(
 
 
 class _Server(uvicorn.Server):
-    """Web server of the page that leaves the handling of signals to the command."""
+    """Web server of the page. It installs no signal handlers, because the command that starts it
+    handles signals.
+    """
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -19,7 +19,9 @@ STATIC: Final = Path(__file__).with_name("static")
 
 
 class SiteRoutes:
-    """Request handlers for everything that does not depend on the map."""
+    """Request handlers for all routes that do not depend on the map: files, texts, settings, base
+    map, health.
+    """
 
     def __init__(self, sources: Sources, features: FeatureRoutes) -> None:
         self._of = sources

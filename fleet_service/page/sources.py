@@ -22,7 +22,9 @@ Handlers = dict[str, Callable[[Request], Awaitable[Response]]]  # request handle
 
 
 class Sources(NamedTuple):
-    """Data sources from which the HTTP routes of the page take their answers."""
+    """Data sources from which the HTTP routes of the page take their answers, such as the local
+    copy of the map and the Zenoh client.
+    """
 
     world: MapMirror
     reader: Reader

@@ -137,7 +137,9 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 
 
 def _time_filter(column: str, part: Extract) -> ValueRange:
-    """Return a filter for rows within the selected time range: start included, end excluded."""
+    """Return a filter that a row passes if its time lies within the selected time range: start
+    included, end excluded.
+    """
     return ValueRange(
         column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
     )

@@ -72,8 +72,8 @@ def write_table(
     *,
     named: bool = True,
 ) -> None:
-    """Write a Parquet file. It is complete and durable (synced to disk) when this returns; on
-    failure nothing changes.
+    """Write a Parquet file. The file is complete and durable (synced to disk) when the function
+    returns; on failure nothing changes.
 
     Args:
         table: rows to write.

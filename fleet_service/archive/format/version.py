@@ -71,8 +71,8 @@ def make_footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> 
 
 
 def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
-    """Return this project's key-value pairs from a file's footer. Bytes that cannot be decoded are
-    replaced; the digest then detects the damage.
+    """Return those key-value pairs of a file's footer that GripMap wrote. Bytes that cannot be
+    decoded are replaced; the digest then detects the damage.
     """
     return {
         key.decode(errors="replace"): value.decode(errors="replace")

@@ -64,7 +64,9 @@ def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
 
 
 def no_beliefs(rows: int) -> PackedArray:
-    """Return an array (rows, 32) of zeros for beliefs packed in 16 bits."""
+    """Return an array (rows, 32) of zeros for beliefs whose probabilities are stored as 16-bit
+    integers.
+    """
     return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
 
 

@@ -123,11 +123,11 @@ class EntryRecord:
             an end.
         pair: row of the pair (this slot and vehicle) in the table of pairs.
         vehicle: index of the vehicle in this service.
-        kind: BOUND or VALUE.
+        kind: BOUND (only a lower bound of friction) or VALUE (a measurement of friction).
         fresh: 1 if no earlier report of the vehicle in this cell is remembered, else 0.
         last_mean, last_std: mean and standard deviation that stand for all reports of this kind
             that the vehicle made in this cell up to this entry, in units of 1/FINE. The vehicle's
-            next report is compared with them.
+            next report is compared with these two numbers.
         spent: votes that the vehicle has used up in this cell up to this entry, in units of
             1/FINE; a report with `power` 1 uses up one vote. The number decreases with time, and a
             vehicle has at most VOTES.

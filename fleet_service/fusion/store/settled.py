@@ -199,9 +199,10 @@ def find_resting(pairs: RecordArray) -> IntArray:
 def count_settling(
     state: State, names: RecordArray, resting: IntArray, now: int
 ) -> tuple[int, int]:
-    """Return two numbers: the reports of inactive pairs (one vehicle in one slot each) that are
-    still remembered at `now` [s], and the friction values among them. `resting` (k,) are the rows
-    of the pairs. If a pair has no such report, record in its cell that the vehicle has visited it.
+    """Return two counts: the number of reports of inactive pairs (one vehicle in one slot each)
+    that are still remembered at `now` [s], and the number of friction values among them. `resting`
+    (k,) are the rows of the pairs. If a pair has no such report, record in its cell that the
+    vehicle has visited it.
     """
     bounds = 0
     values = 0

@@ -114,7 +114,9 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """Return the state of all slots (one per cell and heading sector) as columns."""
+        """Return the state of all slots (one per cell and heading sector) as columns: belief,
+        counts and times.
+        """
         return cells_of(self.state.live)
 
     @property

@@ -152,7 +152,9 @@ def assign_rows(
 
 @compiled
 def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
-    """Enter the numbers of the first `used` rows into an empty hash table."""
+    """Enter the row numbers from 0 to `used` - 1 into the empty hash table `table`, at the places
+    that the keys of these rows determine.
+    """
     for row in range(used):
         table[locate_key(table, rows, rows[row].key)] = _place_content(
             _hash_key(rows[row].key), row
