@@ -202,8 +202,8 @@ def read_observations(path: Path) -> dict[str, Any]:
 
 
 def driven_in(folder: Path) -> DrivenVisits:
-    """Read the files of a simulated drive in `folder`; return the visits (passages of cells) with
-    the vehicles' reports and the true values.
+    """Read the files of a simulated drive in `folder`. Return the visits (passages of cells) as
+    columns: the vehicles' reports, and the true values of the simulation.
     """
     truth = pq.read_table(folder / TRUTH)
     _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)

@@ -180,8 +180,7 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return the simulated visits (passages of cells) that `rows` (row numbers or a mask) selects.
-    """
+    """Return the simulated visits (passages of cells) that `rows` (numbers or a mask) selects."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports

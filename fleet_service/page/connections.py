@@ -47,7 +47,8 @@ class BoundedProtocol(H11Protocol):
                 self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Release an accepted connection after its end: stop its time limit and count it no longer.
+        """Release an accepted connection after its end: stop its time limit, and remove it from the
+        set of open connections.
         """
         if self._head_timer is not None:
             self._head_timer.cancel()

@@ -61,8 +61,7 @@ class Moments:
 
     @property
     def has_archive(self) -> bool:
-        """Return True if the page has access to an archive, which provides maps of earlier moments.
-        """
+        """Return True if the page can read an archive, which provides maps of earlier moments."""
         return self._root is not None
 
     def times(self) -> list[int]:

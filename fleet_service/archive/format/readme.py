@@ -63,8 +63,7 @@ _TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
 
 
 def page_text() -> str:
-    """Return the text of the archive's README: its folders, and every column with unit and meaning.
-    """
+    """Return the text of the archive's README: folders, and every column with unit and meaning."""
     parts = [_HEAD]
     for name, fields in _TABLES:
         parts.append(f"\n## `{name}`\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")

@@ -25,8 +25,8 @@ from schemas.runtime.records import RecordArray
 
 class Cells(NamedTuple):
     """Stored state of each slot (cell and heading sector) as columns (n,) with the fields of
-    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) is packed in
-    16 bits, see `belief.unpack_belief`.
+    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) contains the
+    probabilities as 16-bit integers, see `belief.unpack_belief`.
     """
 
     belief: PackedArray

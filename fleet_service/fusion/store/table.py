@@ -61,8 +61,8 @@ def _first_place(mixed: np.uint64, places: int) -> int:
 
 @refcount_free_inlined
 def _row_at(held: int) -> int:
-    """Return the row number that a place of a hash table contains, from the place's content `held`;
-    NONE if the place is free.
+    """Return the row number in `held`, the content of a place of a hash table; NONE if the place is
+    free.
     """
     return int(np.int32(held & _LOWER))
 
