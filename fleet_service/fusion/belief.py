@@ -205,8 +205,8 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
     Diffusion leaves a uniform belief uniform and a non-decreasing one non-decreasing. Reports of
     lower bounds alone give a non-decreasing belief. With a uniform prior, ageing therefore never
-    lowers the upper end of its interval below that of the prior. `padded` (34 or more) is scratch
-    memory.
+    lowers the upper end of the interval of such a belief below that of the prior. `padded` (34 or
+    more) is scratch memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s

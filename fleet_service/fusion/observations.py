@@ -37,9 +37,9 @@ class Observations:
     Attributes:
         time: end of the visit [ns].
         cell, sector, second: place and direction; `second` is a sector whose edge is near, or -1.
-        vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the
-            vehicle, `boot` for its start; `sequence` counts the rows of one vehicle since its start
-            in one region.
+        vehicle, boot, region, sequence: identity of the row. `vehicle` is the number of the vehicle
+            and `boot` the number of its start. `sequence` counts the rows that the vehicle has sent
+            about `region` since this start.
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.make_evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported; NaN
             for a lower bound.

@@ -193,10 +193,10 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the length (number of places) that a hash table with `entries` entries must have. With
-    25 % more entries, at most the share `most` of its places is in use. Reason: most records of a
-    vehicle in a cell are kept for an hour, and old ones are deleted only once per quarter of an
-    hour; in this time 25 % are added.
+    """Return the length (number of places) that a hash table with `entries` entries must have. Even
+    with 25 % more entries, at most the share `most` of its places is in use. The spare places are
+    needed because old entries are deleted only once per quarter of an hour. Most entries are kept
+    for an hour, so about 25 % are added between two deletions.
     """
     return max(LEAST, int(1.25 * entries / most))
 
