@@ -38,13 +38,11 @@ FREEZING_C: Final = (-4.0, 1.0)
 # [K] Assumed difference if only the air temperature is known: on a clear night radiation cools the
 # road by this much.
 AIR_ABOVE_ROAD_C: Final = 2.0
-# Precipitation around freezing: within minutes the road may have ice, slush, water or salt. With
-# this factor, the mean time between changes is 22 minutes.
+# Around freezing: within minutes the road may have ice, slush, water or salt. Dew and meltwater
+# freeze as fast as precipitation, and no gauge reports them. The mean time between changes is then
+# 22 minutes. With a smaller factor, a dry road was still called safe half an hour after black ice
+# formed, if drivers used a fifth of the grip.
 FREEZING_CHANGE: Final = 8.0
-# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge reports
-# them. With a smaller factor, a dry road was still called safe half an hour after black ice formed,
-# if drivers used a fifth of the grip.
-FROST_CHANGE: Final = 8.0
 # Warm and dry: only dirt changes a road, so beliefs last twice as long. A smaller factor would
 # trust the gauge too much, because it is not at this road.
 STEADY_CHANGE: Final = 0.5
@@ -111,8 +109,8 @@ def report_rates(reports: Reports) -> FloatArray:
     dry = reports.precipitation < WET_MM_H
     freezing = (road >= FREEZING_C[0]) & (road <= FREEZING_C[1])
     change = np.select(
-        [wet & freezing, wet, freezing, dry & (road >= STEADY_C)],
-        [FREEZING_CHANGE, WET_CHANGE, FROST_CHANGE, STEADY_CHANGE],
+        [freezing, wet, dry & (road >= STEADY_C)],
+        [FREEZING_CHANGE, WET_CHANGE, STEADY_CHANGE],
         1.0,
     )
     return np.stack([np.where(wet, WET_DRIFT, 1.0), change], axis=1)

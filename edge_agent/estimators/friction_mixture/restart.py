@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import Parameter
-from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.arrays import clear_vector
 from edge_agent.estimators.common.excitation import begin_excitation
@@ -20,7 +18,6 @@ from edge_agent.estimators.friction_mixture.report.reported_interval import find
 from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.gap import (
-    SLOWEST_M_S,
     UNKNOWN_YAW_VAR,
     YAW_STD,
     put_split_to_sleep,
@@ -28,15 +25,11 @@ from edge_agent.estimators.friction_mixture.state.gap import (
     spread_moments,
 )
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, Scratch
+from edge_agent.estimators.friction_mixture.state.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# [1] longitudinal force over load below which wheels of equal speed count as rolling freely
-FREE_FORCE = 0.05
-ALIKE = 0.03  # [1] relative difference up to which wheel speeds count as equal
-FREE_S = 0.1  # [s] time for which the wheels must agree before they reset the motion
 LOST_SPREAD_M_S = 5.0  # [m/s] standard deviation of v_x after a reset without a known speed
 # The motion is reset if it differs from the wheels by more than `diverged_x` plus two terms:
 FAR_SHARE = 0.04  # [1] share of the wheels' speed
@@ -111,52 +104,23 @@ def forget_vehicle(memory: MixtureMemory) -> None:
 
 
 @compiled
-def reset_to_wheel_speed(
-    memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
-) -> int:
-    """Reset the motion estimate if it is far from the speed of wheels that agree and roll freely;
-    return the health flags.
+def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
+    """Reset motion, vehicle states and friction if the motion estimate is far from the speed of
+    wheels that have agreed for a long time; return the health flags.
 
-    If wheels have agreed for a long time, vehicle states and friction are reset together with the
-    motion. If wheels have just begun to roll without force, after a slide, only the motion is
-    reset. Without a reset, nodes (friction hypotheses) that assume these wheels slide would not
-    recover: the tyre curve is flat there, so the measurements hardly change their velocity.
+    Without a reset, nodes (friction hypotheses) that assume these wheels slide would not recover:
+    the tyre curve is flat there, so the measurements hardly change their velocity.
     """
     rolling = memory.rolling
-    near = design.constants.diverged_x
-    if not math.isnan(rolling.ahead):
-        far = near + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.ahead_std
-        astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
-        if not math.isnan(rolling.left):
-            far = near + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.left_std
-            astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
-        if astray:
-            return _begin_anew(memory, design, rolling.ahead)
-    speed = free_speed(memory, features)
-    if memory.last.time - rolling.disagreed_time < FREE_S or math.isnan(speed):
+    if math.isnan(rolling.ahead):
         return 0
-    if abs(memory.overall_mean[NodeState.VX] - speed) > near + FAR_SHARE * speed:
-        # Friction is kept, because the slide that has ended was evidence on it.
-        restart_motion(memory, speed, FIRST_V_STD)
-    return 0
-
-
-@compiled
-def free_speed(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the common speed [m/s] of the wheels if all turn alike and without force, that is,
-    roll freely; otherwise return NaN.
-    """
-    slowest = math.inf
-    fastest = -math.inf
-    for wheel in range(4):
-        if abs(features.force[wheel]) > FREE_FORCE:
-            return math.nan
-        if not math.isnan(features.rolling[wheel]):
-            slowest = min(slowest, features.rolling[wheel])
-            fastest = max(fastest, features.rolling[wheel])
-    turning = abs(features.yaw_rate) * memory.row[Parameter.TRACK_REAR]
-    alike = fastest - slowest <= ALIKE * max(fastest, SLOWEST_M_S) + turning
-    return fastest if alike and fastest > SLOWEST_SLIP_M_S else math.nan
+    near = design.constants.diverged_x + FAR_SHARE * abs(rolling.ahead)
+    far = near + FAR_SPREADS * rolling.ahead_std
+    astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
+    if not math.isnan(rolling.left):
+        far = near + FAR_SPREADS * rolling.left_std
+        astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
+    return _begin_anew(memory, design, rolling.ahead) if astray else 0
 
 
 @compiled

@@ -111,7 +111,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     weigh_nodes(memory, design, scratch)
     share_weights(memory, scratch)
     match_moments(memory, scratch)
-    memory.health = health | reset_to_wheel_speed(memory, design, features)
+    memory.health = health | reset_to_wheel_speed(memory, design)
     ratio = scratch.actual_sum[1] / max(scratch.stated_sum, TINY)
     update_consistency(memory, design, features.duration, ratio, memory.health)
     if memory.trust.distrust > 0.0:

@@ -87,7 +87,7 @@ def test_unknown_values_change_nothing() -> None:
         [1.0, 1.0],
     ]
     # The road may be colder than the air, so 1 °C counts as a change to frost.
-    assert w.report_rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FROST_CHANGE
+    assert w.report_rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FREEZING_CHANGE
 
 
 def after_an_hour(weather: w.Reports | None) -> np.ndarray:

@@ -53,8 +53,6 @@ CALLED_BACK = 0.5
 LONGEST_PATIENCE = 600.0  # [s] longest time before the model is tried again
 RELAPSE = 4.0  # [1] factor on the time before the next trial after each further contradiction
 FORGIVEN_S = 300.0  # [s] time constant with which evidence against the model and patience fade
-# [m/s^2] a_y below which the model is tried again, because the wheels then show the motion
-STRAIGHT = 0.6
 
 
 @compiled
@@ -82,7 +80,7 @@ def update_consistency(
     )
     if trust.distrust > 0.0:
         trust.left -= duration
-        if trust.left <= 0.0 and abs(memory.last.ay) < STRAIGHT:
+        if trust.left <= 0.0:
             trust.distrust = 0.0
             trust.odd = 0.0
             trust.ratio = 0.0
