@@ -62,6 +62,11 @@ CAMPAIGNS: Final = {
     "edge": Campaign(
         "edge-agent evaluate --out .evaluation/edge", ".evaluation/edge", "edge-agent evaluate"
     ),
+    "detection": Campaign(
+        "edge-agent evaluate --only detection --out .evaluation/detection",
+        ".evaluation/detection",
+        "edge-agent evaluate --only detection",
+    ),
     "fleet": Campaign(
         "fleet-service evaluate --out .evaluation/fleet", ".evaluation/fleet", "fusion"
     ),
@@ -228,7 +233,7 @@ class Line(NamedTuple):
 
 LINES: Final = (
     Line("car: true μ inside the 90 % interval", "edge", "real_world.coverage90", "{:.0%}"),
-    Line("car: the same on ice", "edge", "real_world.coverage90.ice", "{:.0%}"),
+    Line("car: passes over ice found", "detection", "ice.passes.long.rough", "{:.0%}"),
     Line("car: false ice, share of time", "edge", "real_world.false_ice", "{:.2%}"),
     Line("map: true μ inside the 90 % interval", "fleet", "fusion.clean.coverage90", "{:.0%}"),
     Line("demo: passes over ice until the alert", "demo", "demo.alert.delay_passes", "{:.0f}"),
