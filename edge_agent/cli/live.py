@@ -91,8 +91,8 @@ class VssPart:
             self._output.report_grip(pipeline.grip)
 
     def close_part(self) -> Mapping[str, float]:
-        """Close the output of friction signals. Return an empty dictionary, because it has no
-        counts.
+        """Close the output of friction signals. Return an empty dictionary, because this
+        component counts nothing.
         """
         self._output.close()
         return {}

@@ -40,9 +40,11 @@ _FLOOR: Final = mugrid.FLOOR_STEPS
 
 
 def fused_at(time: IntArray, checkpoint: int) -> IntArray:
-    """Return the times [ns] at which late visits are fused, given their end times `time` (n,):
-    times in whole µs within one second after the checkpoint (the time before which observations are
-    final). The newest visit gets the earliest time.
+    """Return the time [ns] at which each late visit is fused, given the visits' end times `time`
+    (n,) [ns]. All returned times lie within one second after `checkpoint` [ns], because older
+    observations are final. The newest visit gets the earliest time, so that it is fused first and
+    counts fully; older visits of the same vehicle then count as repetitions. The delays after the
+    checkpoint are whole microseconds, the resolution of times in the archive.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)

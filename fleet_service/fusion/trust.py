@@ -51,11 +51,19 @@ def compare_reports(
     entries: RecordArray,
     entry: int,
 ) -> None:
-    """Compare a vehicle's value of friction with the recent values of other vehicles in the cell,
-    then store it there. The new value replaces the vehicle's earlier value, or else the oldest one.
+    """Compare a vehicle's friction value with the recent values of other vehicles in the cell, and
+    record how well each pair of vehicles agrees. Then store the value in the place of the vehicle's
+    earlier value, or else of the oldest value. Do nothing if the value is late or probably belongs
+    to another cell.
 
-    `names` (V,) are the vehicles' numbers, by index. No comparison is made if the value is late or
-    probably belongs to another cell.
+    Args:
+        reporters: recent values of each cell (`ReportersRecord`).
+        row: row of this cell in `reporters`.
+        peers: agreement of each vehicle with others (`PeersRecord`), one row per vehicle.
+        names: records with the vehicles' permanent numbers (`VehicleRecord`), in the rows of
+            `peers`.
+        entries: observations (`EntryRecord`).
+        entry: row of the new value in `entries`.
     """
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE or entries[entry].late:

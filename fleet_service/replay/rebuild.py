@@ -129,7 +129,7 @@ class Since(NamedTuple):
 
     Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
     cells. Therefore cells inside a box get the same belief (probability of each friction value) as
-    in a complete replay, if the rows of a margin around the box are read too.
+    in a complete replay, if the rows within MARGIN_DEG around the box are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.
@@ -147,8 +147,8 @@ class Since(NamedTuple):
     most: int | None = None
 
     def near(self) -> Box | None:
-        """Return the box enlarged by twice the margin [deg]; None without a box. All files of zones
-        (map squares of zoom 7) that touch the enlarged box must be read.
+        """Return `box` enlarged by 2·MARGIN_DEG on each side [deg]; None if `box` is None. A replay
+        must read the files of all zones (map squares of zoom 7) that touch the enlarged box.
         """
         if self.box is None:
             return None

@@ -26,9 +26,9 @@ _NOW = START + 10 * PERIOD_NS
 
 
 def public() -> list[Figure]:
-    """Measure the time [µs] per cell that is read, and per visit (pass of a vehicle through a cell)
-    that changes the map, for a map that shows only public cells. Also return the ratio of these
-    times to those of a map that shows every visit.
+    """Measure a map with privacy rules, which shows a cell only after LEAST vehicles have visited
+    it. Return the time [µs] to read one cell, the time [µs] to add one visit (pass of a vehicle
+    through a cell), and the ratios of both times to those of a map that shows every visit at once.
     """
     private, public = _Map(1), _Map(LEAST)
     seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))

@@ -65,8 +65,9 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
-        """Return True if the time of a service's clock is more than half a year from the true time.
-        Return True also if this clock reports such an error of the machine's wall clock.
+        """Return True if the service's time is more than half a year wrong, or if the wall clock of
+        the machine is more than half a year away from the service's time (`SteadyClock.lag`).
+        `clock` is the service's clock.
         """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 

@@ -126,8 +126,10 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood the service for half a minute (in a quick run, three seconds), and return as figures
-    how much the other vehicles' acknowledgements and the map change.
+    """Flood the service for half a minute (in a quick run, three seconds). Return the delays [s]
+    until the other vehicles' batches are acknowledged, before the flood and from its start on, and
+    the difference between the map and the reference map. Also return the rate of the flood and the
+    number of batches that were sent again.
     """
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])

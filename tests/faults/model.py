@@ -2,10 +2,10 @@
 ownership of the archive), takeover, hand-over and erasure. The model checker visits every reachable
 state up to a maximum number of leases and renewals.
 
-The whole protocol must break no invariant. Then one rule at a time is switched off (the protocols
-in BROKEN), for example the fence (list of the former owner's valid files), or the limit of half a
-lease for acknowledgements. Each of these protocols must break an invariant, which shows that the
-checker can find errors.
+The protocol with all its rules must break no invariant. Then one rule at a time is switched off
+(the variants in BROKEN), for example the fence (list of the former owner's valid files), or the
+limit of half a lease for acknowledgements. Each of these variants must break an invariant, which
+shows that the checker can find errors.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 
 
 def run(site: Site) -> list[Figure]:
-    """Check all states of the whole protocol, with equal and with different lease times of the two
-    services, and of each protocol in BROKEN. Return the figures: violations of the whole protocol,
-    broken protocols without a violation (both must be 0), and the number of states checked.
+    """Check the takeover protocol (`protocol_model`) with all its rules, once with equal and once
+    with different lease times of the two services. Then check each variant in BROKEN, which lacks
+    one rule. Return the number of checks with all rules that found a violation, the number of
+    broken variants without a violation (both must be 0), and the number of states of the protocol
+    with all rules.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

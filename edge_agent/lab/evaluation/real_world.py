@@ -10,12 +10,14 @@ Legend
                   up to .75, dry above
     missed ice    share of the excited samples on ice with P(mu < SLIPPERY_MU) of at most
                   CALLED_SHARE
-    false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the
-                  true friction
+    false grip    share of the samples on ice for which the lower end of the estimated friction
+                  interval is more than FALSE_GRIP above the true friction
     false ice     share of the samples on wet and dry road with P(mu < SLIPPERY_MU) above
-                  CALLED_SHARE. "settled": only samples at least SETTLED_S after snow and ice,
-                  because an estimator notices the end of the ice only when grip is used. "of_all":
-                  share of all samples that are false ice on a road above SURE_GRIP
+                  CALLED_SHARE
+    settled       false ice, but only of samples at least SETTLED_S after the car left snow or ice,
+                  because an estimator notices the end of the ice only when grip is used
+    of_all        number of samples with P(mu < SLIPPERY_MU) above CALLED_SHARE on a road with
+                  friction above SURE_GRIP, as a share of all samples
     below         share of all samples whose friction interval ends below the grip in use, so that
                   the interval is certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second

@@ -1,9 +1,10 @@
-"""Conversion of DENM (hazard messages) from other stations to reports of one vehicle name. The
-fusion (the computation of the map from all reports) weighs and trusts this name like a vehicle.
-Pure (no I/O).
+"""Conversion of received DENM (standard messages of vehicles and road operators about hazards) to
+friction reports. All DENM from one interchange (server that distributes such messages) are
+converted to reports of one made-up vehicle. The fusion, which computes the map from all reports,
+learns the trust in this vehicle as in a real one. Pure (no I/O).
 
-All DENM of one interchange get the same name. An alert needs two independent sources, so DENM alone
-cannot raise an alert.
+An alert needs reports of at least two vehicles, so DENM of one interchange alone cannot raise an
+alert.
 """
 
 from __future__ import annotations

@@ -110,11 +110,12 @@ class CellRecord:
 
 
 class EntryRecord:
-    """Entry of a lateness window: one observation in one slot. When an entry has become older than
-    the checkpoint, a commit applies it to the final state. The fields that a commit reads are in
-    the first of the entry's two cache lines.
+    """One observation of one slot (cell and heading sector) that is not final yet. It is kept in
+    the slot's lateness window, because earlier observations may still arrive. When the entry is
+    older than the checkpoint, a commit applies it to the slot's final belief and removes it. The
+    fields that a commit reads are in the first of the entry's two cache lines.
 
-    The strength with which an entry changes the belief is weight · power · share.
+    The entry changes the belief with the vote weight weight · power · share.
 
     Attributes:
         previous, following: rows of the neighbouring entries in the slot's window, in order of

@@ -86,9 +86,10 @@ def run_python(code: str, *words: str) -> list[str]:
 @pytest.mark.campaign
 @pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
-    """A drive must give the same estimates, records and beliefs by the shared library as by Numba,
-    bit by bit. The process that uses the library must not load the heavy modules. A library
-    compiled from other sources lies in its folder, and must not be used.
+    """The shared library and Numba must give the same estimates, records and beliefs of a drive,
+    bit by bit. The process that uses the library must not import the modules in HEAVY. The test
+    first writes an invalid library into the folder `kernels`, with the hash of other source files
+    in its name. The agent must not load this file.
     """
     write_library(tmp_path / "kernels", f"edge_agent-0123456789abcdef-{LEVEL}.so")
     t, signals = SimulatedFleet("hills", VEHICLES, 3, 100.0, rough=0.5, winter=0.5).step(2000)

@@ -1,6 +1,7 @@
-"""Tests of the map's drawing in a real browser. Unknown parts must stay visible in each square,
-neighbouring cells must leave no gap, and a route must hide no cell. Before a service answers, the
-map must be hatched.
+"""Tests of the drawn map in a real browser. When the map is zoomed out, each square stands for
+several cells, and a white part in its middle shows the share of unknown cells. This part must be
+visible in the smallest squares too. Neighbouring squares must touch without a gap, and a drawn
+route must cover no cell. Before a service answers, the map must be hatched.
 """
 
 from __future__ import annotations
