@@ -29,6 +29,7 @@ FOLDER = Path(__file__).parent
 STATES = 6
 ROWS = 3
 WHEELS = 4
+PARAMETERS = 12  # number of vehicle parameters that the C kernels read: the first of each row
 FACTOR = STATES + STATES * STATES + ROWS * 2  # index of `factor` among the struct's doubles
 # Options that let gcc vectorise square roots and selections. None of them changes a result.
 VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")

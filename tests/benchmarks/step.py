@@ -20,7 +20,7 @@ from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS, S
-from tests.benchmarks.limit import Limit, VectorLimit
+from tests.benchmarks.limit import PARAMETERS, Limit, VectorLimit
 from tests.benchmarks.measure import SEED, median_s, time_in_turn
 from tests.benchmarks.peers import PEERS, PYTHON_STEPS, Problem
 
@@ -81,7 +81,7 @@ def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> K
     """Return a bank of filters in C (one per vehicle, computed together) of the class `kind`. Each
     filter starts from the first sample of `drive`.
     """
-    rows = parameter_table([drive.vehicle] * vehicles)
+    rows = parameter_table([drive.vehicle] * vehicles)[:, :PARAMETERS]
     return kind(
         rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped_memberships(TUNED[NAME])
     )
