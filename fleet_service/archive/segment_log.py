@@ -68,21 +68,21 @@ class _Load(Generic[Batch]):
 
 
 class SegmentLog(Generic[Batch]):
-    """Segment log of one run of one service. Only one thread may use it; an internal thread writes
-    to disk.
+    """Segment log of one run of one service. An internal thread writes to disk. All methods must be
+    called from one other thread.
 
     Args:
         root: folder of the archive.
         shard: name of the service.
-        upload: function that makes segments durable in a second place; if given, a batch (message
-            with records) is durable only when it is in both places.
-        epoch: smallest number that may be used as the epoch (number of the start) in segment names;
-            the lease determines it.
+        upload: function that copies segments to a second place. If given, a batch (message with
+            records) is durable only when it is in both places.
+        epoch: smallest epoch (number of the start) for segment names, larger than those of earlier
+            owners of the archive; 0 if the archive is used without a lease.
 
     Attributes:
         on_written: called in the internal thread when a write has ended, successfully or not.
         begun_s: monotonic time [s] at which the last write with rows began.
-        write_s: duration of this write [s]; if it is still running, of the one before.
+        write_s: duration [s] of the last write with rows that has ended.
     """
 
     def __init__(

@@ -203,10 +203,9 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
     reflecting ends, then a possible sudden change of the road over `change_s` [s], which mixes in
     the `prior`.
 
-    Diffusion leaves a uniform belief uniform and a non-decreasing one non-decreasing. Reports of
-    lower bounds alone give a non-decreasing belief. With a uniform prior, ageing therefore never
-    lowers the upper end of the interval of such a belief below that of the prior. `padded` (34 or
-    more) is scratch memory.
+    Diffusion leaves a uniform belief uniform and a non-decreasing one non-decreasing. Therefore, if
+    all reports are lower bounds and the prior is uniform, ageing never lowers the upper end of the
+    interval below that of the prior. `padded` (34 or more) is scratch memory.
     """
     if drift_s > 0.0:
         whole = _DIFFUSION * drift_s
@@ -224,11 +223,13 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
 @refcount_free_inlined
 def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
-    """Mix the prior into a belief `p` in place, so that the total probability of a sudden road
-    change is at least CHANGE_LEAST·`power`. Between visits that follow each other within seconds,
-    `forget` (ageing) mixes in nearly nothing. Without this function, a firm belief would then
-    resist a real change. `forget` has already applied the change over `change_s` [s]. `power` is
-    the share of the coming vote (effect of one visit) that is new information.
+    """Mix the prior into a belief `p` in place, so that a sudden road change has at least the
+    probability CHANGE_LEAST·`power`. The part for the time `change_s` [s] was already mixed in by
+    `forget` (ageing); only the rest is added.
+
+    If visits follow each other within seconds, `forget` mixes in nearly nothing, and a firm belief
+    would resist a real change. `power` is the share of the coming vote (effect of one visit) that
+    is new information.
     """
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
@@ -315,8 +316,9 @@ def mean_of(likelihood: Bins) -> float:
 
 @refcount_free_inlined
 def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
-    """Return the standard deviation of μ around `mean` and P(slippery), both under a uniform prior,
-    for a likelihood (32) of friction whose mean over the bins is 1.
+    """Return two numbers for a likelihood of friction (32,) under a uniform prior: the standard
+    deviation of μ around `mean`, and P(slippery). The likelihood must be scaled to mean 1 over the
+    bins.
     """
     second = 0.0
     slippery = 0.0

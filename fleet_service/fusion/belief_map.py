@@ -96,20 +96,20 @@ class BeliefMap:
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
-        sector), (k, 32), at its last observation. It is more cautious than the belief for other
-        readers, as alerts require.
+        sector), (k, 32), at its last observation.
 
-        The difference is the tyre-shape slope: by how much a report may be too low if the vehicle
-        used little grip. Alerts use the upper end of the slope's range; see `shared`.
+        It is more cautious than the belief for other readers: reports of vehicles that used little
+        grip are assumed to be too low by more. The assumed error per unit of unused grip is the
+        upper end of its confidence range; see `shared`.
         """
         return self._read_for_alerts(self._shape.alarm, slots)
 
     def _read_for_alerts(self, slope: float, slots: IntArray) -> FloatArray:
         """Return the belief about the road for each slot (cell and heading sector), (k, 32), at its
-        last observation. `slope` is the assumed error of a value per unit of unused grip. Visits
-        without a friction value do not weaken the evidence of neighbouring cells here, because a
-        cell between vehicles that report ice must get an alert even if its own visitors gave no
-        value.
+        last observation. `slope` is the assumed error of a value per unit of unused grip.
+
+        Visits without a friction value do not weaken the evidence of neighbouring cells here. So a
+        cell between icy cells gets an alert even if its own visitors gave no value.
         """
         rule = ReadRule(KERNELS[shape_class(slope)], 0.0)
         rows = self.store.state.live

@@ -3,10 +3,10 @@ friction of all cells. The module is pure: it reads no clock, because time comes
 observations.
 
 T is the latest observation time, in whole epochs (minutes). The checkpoint is at T - L, where L is
-the allowed lateness (delay of an observation); older observations are final. Trust in vehicles is
-updated when the checkpoint advances. The new trust applies to observations of the epoch that begins
-at T. Therefore the weight of an observation depends on the time at which the vehicle was in the
-cell, and not on the time of its arrival.
+the allowed lateness (delay of an observation). Observations from before the checkpoint are final.
+When the checkpoint advances, trust in vehicles is updated; the new trust applies to observations of
+the epoch that begins at T. Therefore the weight of an observation depends on the time of the visit,
+and not on the time of its arrival.
 """
 
 from __future__ import annotations
@@ -81,7 +81,6 @@ class Fusion(BeliefMap):
             full weight.
 
     Attributes:
-        enrolled: True if only vehicles of an enrolment file are fused.
         reports: weather reports that a later update may still need.
     """
 

@@ -9,10 +9,10 @@ the road at the checkpoint C, given a measurement at an earlier time t, is
     L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = forgetting applied to L over C - t
 
 If no other vehicle visited the cell between t and C, the result equals that of an observation in
-time. Otherwise the late visit counts in addition to the others, as an old report about the present
-road. All late visits get times directly after the checkpoint, the newest visit first. Of several
-visits of one vehicle to a cell, the newest therefore counts fully and the older ones as
-repetitions. The order of arrival between two checkpoints does not matter.
+time. Otherwise the late visit is fused after the others, as an old report about the present road.
+All late visits get times directly after the checkpoint, the newest visit first. So of several
+visits of one vehicle to a cell, the newest counts fully and the older ones as repetitions. The
+order of arrival between two checkpoints does not matter.
 """
 
 from __future__ import annotations

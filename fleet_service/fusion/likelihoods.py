@@ -69,8 +69,8 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     bin the smaller of the reported likelihood and the likelihood of this bound.
 
     An estimator reports a flat likelihood when no friction explains its measurements. The grip that
-    its accelerometers measured is still a lower bound. Likelihood and bound come from one passage
-    of a cell, so they are not multiplied.
+    its accelerometers measured is still a lower bound. Likelihood and bound come from the same
+    measurements, so they are not multiplied.
     """
     out = steps.copy()
     _bound_rows(out, np.asarray(used, np.float64), _levelled_bounds())
@@ -105,9 +105,9 @@ def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Return likelihoods (n, 32) that claim no more grip than the grip used (n,) supports.
 
     A likelihood that is only a lower bound is made flat from the bin that contains `used` minus
-    half its standard deviation. A hundred such bounds together then raise the lower end of the
-    interval to at most .95·used + .04. A likelihood that also limits μ from above is not changed,
-    nor is a row where `used` is NaN.
+    half the standard deviation of `used`. A hundred such bounds together then raise the lower end
+    of the interval to at most .95·used + .04. A likelihood that also limits μ from above is not
+    changed, nor is a row where `used` is NaN.
     """
     out = steps.copy()
     _level_rows(out, np.asarray(used, np.float64))

@@ -38,7 +38,7 @@ Legend
     p₀     prior of an unmeasured road of the region                                      (32,)
     K      shared kernel, maps measured friction to that of the road, see `shared`        (32, 32)
     d      distance in cells; 1 to the cell of the other direction
-    v, k   weight of recent values, and number of visits, of the cell; v_n, k_n of the neighbour
+    v, k   total weight of recent values, and number of visits, of the cell; v_n, k_n of neighbour n
 """
 
 from __future__ import annotations
@@ -252,8 +252,9 @@ def _choose_message(
 @refcount_free_inlined
 def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
     """Return the cell of the neighbour number `step` (from 1) on a side of `cell`; `there` is the
-    cell of the neighbour number `step` - 1. The neighbours on the side of the road's other
-    direction are, in this order, the same cell and the cells to its left and right.
+    cell of the neighbour number `step` - 1. On the side of the road's other direction, neighbour 1
+    is the same cell (with the opposite heading), and the next two are the cells to its left and
+    right.
     """
     if side != _ACROSS:
         return next_cell(there, (sector + 2 * side) % grid.SECTORS)

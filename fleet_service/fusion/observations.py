@@ -36,15 +36,15 @@ class Observations:
 
     Attributes:
         time: end of the visit [ns].
-        cell, sector, second: place and direction; `second` is a sector whose edge is near, or -1.
-        vehicle, boot, region, sequence: identity of the row. `vehicle` is the number of the vehicle
-            and `boot` the number of its start. `sequence` counts the rows that the vehicle has sent
-            about `region` since this start.
+        cell, sector, second: cell and heading sector; `second` is the neighbouring sector if the
+            heading is near its edge, else -1.
+        vehicle, boot, region, sequence: identity of the row. `vehicle` is the vehicle's number, and
+            `boot` a random number of its agent's start. `sequence` orders the rows that it sent
+            about `region` since then.
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.make_evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported; NaN
             for a lower bound.
-        used: (n,) grip used; an estimate below EXCITED_SHARE of the value if the sender does not
-            report it.
+        used: (n,) grip used; if the sender does not report it, UNTOLD_SHARE of the value.
         manoeuvre: (n,) kind of manoeuvre, see `shared.manoeuvre_of`.
         limited: (n,) True if a slip controller intervened at so little grip used that only slippery
             road explains it.

@@ -11,7 +11,7 @@ computes from p:
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
            where μ_j < μ_i
-    σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
+    σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  elsewhere
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
     n_eff = (Σ w_k)²/Σ w_k²
 
@@ -107,10 +107,9 @@ class Shape(NamedTuple):
         """Return the slope (error of a friction value per unit of unused grip) that an alarm
         assumes: the upper end of its one-sided 95 % interval.
 
-        A new service assumes .5. A service that has compared many passages of vehicles assumes
-        little more than the slope of `reader`. Missed ice on tuning seeds: with .5 for all
-        services, .044 of the icy cell-minutes of a fleet without misbehaving vehicles had no alert;
-        with this rule .010.
+        A new service assumes .5. After comparing many passages, a service assumes little more than
+        the slope for readers. On tuning seeds without misbehaving vehicles, .010 of the icy
+        cell-minutes had no alert; with .5 for all services, .044.
         """
         return self.reader + Z_95 * self.std
 

@@ -243,8 +243,8 @@ def _update_weights(
     peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
 ) -> bool:
     """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the previous
-    weights `before`. Return True if newcomers got less weight. That is so if the service knows and
-    trusts enough vehicles, and also accepts vehicles that are not on the operator's list.
+    weights `before`. Return True if newcomers got less weight: the service knows and trusts enough
+    vehicles, and accepts vehicles that are not on the operator's list.
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0

@@ -371,8 +371,8 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
 @refcount_free_inlined
 def needs_reporters(entries: RecordArray, entry: int) -> bool:
     """Return True if the vehicle of this entry (an observation in a cell) must be stored in the
-    cell's list of recent reporters. It must if the entry is a friction value or shows grip, or if a
-    slip controller intervened.
+    cell's list of recent reporters: if the entry is a friction value or shows grip, or if a slip
+    controller intervened.
     """
     return bool(
         entries[entry].kind == VALUE

@@ -4,7 +4,7 @@ belief in this order, whatever their order of arrival. Observations older than t
 
 A slot is the storage of one cell and heading sector. Its live row contains the belief after all
 observations. A slot has a window while it has observations younger than the checkpoint. The window
-contains these observations and the base, which is a copy of the row before them. An observation
+contains these observations and the base, a copy of the row without their effect. An observation
 that is newer than all others updates the live row. An older one makes the window stale. After each
 batch, the live rows of all stale windows are computed again from their bases.
 
@@ -89,9 +89,8 @@ class Votes(NamedTuple):
 
 class Marks(NamedTuple):
     """Arrays that are filled while a batch of n observations is processed: a mask of the
-    observations left out (n,), a mask of the accepted ones (n,), and row numbers (k,) of windows. A
-    window contains the recent observations of a cell. The belief of the windows in these rows must
-    be computed again.
+    observations left out (n,), a mask of the accepted ones (n,), and the rows (k,) of windows whose
+    belief must be computed again. A window contains the recent observations of a cell.
     """
 
     left_out: BoolArray
@@ -196,11 +195,11 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch the memory that the votes from `begin` to `end` will access. Records whose position
-    is known only after another load come last.
+    """Prefetch the memory that the votes from `begin` to `end` will access. Records whose row
+    number must first be read from memory come last.
 
-    The code has no branch that waits for memory, because a processor that mispredicts a branch
-    discards its prefetches.
+    No branch waits for memory, because a processor that mispredicts a branch discards its
+    prefetches.
     """
     live = state.live
     base = state.base
@@ -318,8 +317,8 @@ def commit_windows(
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
     """Prefetch the memory that `commit_windows` will access for the lateness windows (recent
-    observations of cells) from `begin` to `end`. Records whose position is known only after another
-    load come last.
+    observations of cells) from `begin` to `end`. Records whose row number must first be read from
+    memory come last.
     """
     live = state.live
     base = state.base

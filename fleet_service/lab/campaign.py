@@ -87,9 +87,9 @@ def run(
 
 
 def _is_listed(name: str, only: str | None, found: Mapping[str, float]) -> bool:
-    """Return True if the figure `name` must appear in the table of a run. `only` is the part that
-    the run was limited to, and `found` the measured figures. The table of an end-to-end run also
-    lists end-to-end figures that were not measured.
+    """Return True if the figure `name` must appear in the table of a run. A complete run lists all
+    figures. A run of one part, `only`, lists the figures that it measured (`found`); the end-to-end
+    part lists all end-to-end figures, measured or not.
     """
     if only == END_TO_END_PART:
         return name.startswith(END_TO_END)

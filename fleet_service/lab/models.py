@@ -87,9 +87,10 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
-    """Return the figures of a fleet whose errors are those of the real estimator; `ways` are its
-    simulated drives. Return an empty dictionary if no visit (passage of a cell) of the drives, or
-    every visit, used enough grip to measure the friction.
+    """Return the figures of a fleet whose errors are those of the real estimator; `ways` are the
+    simulated drives from which its reports are drawn. Return an empty dictionary unless the drives
+    contain visits (passages of cells) both with and without enough grip used to measure the
+    friction.
     """
     if not ways.excited.any() or ways.excited.all():
         return {}

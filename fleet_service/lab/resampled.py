@@ -1,13 +1,16 @@
 """Simulated visits (passages of cells) in a town, with reports that have the errors of the real
 estimator: each report is drawn from the estimator's own reports on simulated drives. Pure (no I/O).
 
-The simulated vehicle of `agent` has the errors that the service assumes, which makes its map look
-too good. Here each vehicle of a town takes its errors from one vehicle of the drives, with all
-errors that persist in this vehicle (offsets, a tilted sensor, tyres). Each visit in the town gets
-the report of a visit that the vehicle of the drives made on a road with nearly the same friction.
-Both visits are "excited" (enough grip was used to measure the friction), or neither is:
+The errors that `agent` draws are those that the service assumes, so a map of its reports looks too
+good. Therefore this module uses real ones.
 
-    μ, μ_w   friction of the town's road, and of the road in the visit that is drawn     (n,)
+A town vehicle drives in the town; a source vehicle comes from the simulated drives. Each town
+vehicle gets the reports of one source vehicle, and so its persistent errors (offsets, a tilted
+sensor, tyres). For each town visit, a visit of the source vehicle with nearly the same friction is
+drawn; if it has none, a visit of another one. Both visits are "excited" (enough grip was used to
+measure the friction), or neither is. The report is then scaled to the town's friction:
+
+    μ, μ_w   friction of the road in the town visit, and in the source visit             (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
              forces scale with the grip; the log-likelihood ℓ(x) becomes ℓ(x/c)
 
@@ -106,8 +109,9 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
     """Return the visits (passages of cells) in a town with reports drawn from the simulated drives
-    `ways`. Each of the `vehicles` vehicles of the town takes all its reports from one vehicle of
-    the drives. If the drives have enough vehicles, no vehicle of the drives is used twice.
+    `ways`. Each of the `vehicles` vehicles of the town gets the reports of one vehicle of the
+    drives, if this has visits with similar friction. If the drives have enough vehicles, each is
+    assigned at most once.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))

@@ -3,19 +3,19 @@ map. Each rule stores a mean and a variance of the friction per cell. Pure (no I
 
 A rule gets the reports that a vehicle in a system with this rule would send: the *posterior* (m, P)
 of the vehicle's own filter, which also contains information from the previous cell. Between
-reports, the variance of each rule grows by the same drift as in the service's map. "Added" below
-means that the rule adds 1/P to its own inverse variance.
+reports, the variance of each rule grows with time. "Added" below means that the rule adds 1/P to
+its own inverse variance.
 
     newest report         the last posterior
     inverse variance      each pass sends SAMPLES equal posteriors, and all of them are added
     one per pass          each pass sends one posterior, and it is added
-    covariance inters.    one per pass, with weights in proportion to information (W. Niehsen,
-                          FUSION 2002)
-    federated reset       each pass sends a filter's result that started from the cell's estimate,
-                          so that only the reading is added (N. A. Carlson, IEEE Trans. Aerospace
-                          and Electronic Systems 26(3), 1990)
-    median                median of the vehicles' last readings of an hour; the interval contains
-                          6 % of shared error and 12 % per vehicle
+    covariance inters.    one per pass; map and posterior are averaged with weights in proportion
+                          to their inverse variances (W. Niehsen, FUSION 2002)
+    federated reset       the vehicle's filter starts each pass from the map's estimate, so that
+                          only the new reading is added (N. A. Carlson, IEEE Trans. Aerospace and
+                          Electronic Systems 26(3), 1990)
+    median                median of the vehicles' last readings of an hour; the assumed standard
+                          deviations are 6 % (shared by all vehicles) and 12 % (per vehicle)
 """
 
 from __future__ import annotations

@@ -238,9 +238,8 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
     grip_raised  share of the answers about roads with grip (μ > SURE_GRIP) with a P(slippery)
                  above RAISED
 
-    The error of the worst bin is not used as a score, because it is mostly chance: all cells of one
-    simulated drive share the same snow. Even a calibrated map would stay below a limit on it in
-    only a third of the evaluations.
+    The error of the worst bin is not used as a score. It is mostly chance, because all cells of one
+    simulated drive share the same snow.
     """
     given = np.concatenate([s.slippery for s in scores])
     truth = np.concatenate([s.truth for s in scores])

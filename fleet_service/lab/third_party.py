@@ -4,16 +4,16 @@ Pure (no I/O).
 
 Each vehicle has a gain error (constant relative error), which affects both its value of μ and the
 grip that it reports as used. Therefore the two are related in a way that is not a property of the
-road. A computation of the map that learned a correction from this relation would be wrong. The
-values have noise, whose size the vehicles state correctly. Vehicles send complete log-likelihoods
-and none of the optional columns.
+road, and a map that learned a correction from this relation would be wrong. The values have noise,
+whose size the vehicles state correctly. Vehicles send complete log-likelihoods and none of the
+optional columns.
 
 There are two drives:
 
     honest fleet   300 cells in stretches of three; 15 visits per cell in 40 minutes, half of them
                    excited (with enough grip used to measure μ)
-    change         30 cells change from μ = .85 to .15 and back, each phase 40 minutes, next to a
-                   town as above
+    change         30 cells change from μ = .85 to .15 and back, each phase 40 minutes; the fleet
+                   also visits 300 cells as above
 
 Legend
     g    gain error of a vehicle, relative, the same in value and grip used  (V,)

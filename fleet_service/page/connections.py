@@ -81,8 +81,8 @@ class BoundedProtocol(H11Protocol):
         self._head_timer = self.loop.call_later(HEAD_S, self._close_silent, self.cycle)
 
     def _close_silent(self, before: object) -> None:
-        """Close the browser's connection if no request has come within the time limit. `before` is
-        the request that was the last one when the time limit began.
+        """Close the browser's connection if no request has come since the time limit began.
+        `before` is the last request at that time.
         """
         if not self.is_silent:
             return

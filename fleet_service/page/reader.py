@@ -103,8 +103,8 @@ class Reader:
         )
 
     def regions(self) -> list[dict[str, Any]]:
-        """Return the regions with cells, each with its box, with True if a service answers for it,
-        and otherwise with the time since which no service answers.
+        """Return each region of the map: its box, True if a service answers for it, and otherwise
+        the time [s since 1970] since which no service answers.
         """
         return self._regions.as_json()
 
@@ -182,12 +182,13 @@ class Reader:
                 self._world.touch(tile, now)
 
     def _sees_services(self) -> bool:
-        """Return True if a service answers for any place. The Zenoh liveliness token of a service
-        shows this; if tokens are hidden, the service's answers show it.
+        """Return True if at least one fleet service is connected, for whatever region. The Zenoh
+        liveliness token of a service shows this.
 
-        A router matches only services that answer for all of a key expression. Therefore a service
-        of the whole world is found by any tile, and a service of a region by a region already
-        known. Before any region is known, only a reply to a query shows a service.
+        If tokens are hidden, the router is asked. It matches only services that answer for all of a
+        key expression: a service of the whole world by the expression for any tile, a service of a
+        region only by a region that the page knows. Before the page knows any tile, only a reply to
+        a query shows a service.
         """
         if self._names["shard"] or self._regions.is_any_answered:
             return True

@@ -83,8 +83,8 @@ def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
     """Parse a time parameter. Return the time [ns] from which observations are selected, and the
     time [ns] of the requested map (None for now).
 
-    The text is in the notation of RFC 3339: an instant, or an interval, one side of which may be
-    open (`..` or nothing).
+    The text is an instant or an interval in the notation of RFC 3339. An interval gives both times;
+    one side may be open (`..` or nothing). An instant gives only the time of the map.
     """
     first, is_interval, last = text.partition("/")
     begin = _parse_instant(first)

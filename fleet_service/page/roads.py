@@ -117,9 +117,8 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Group the cells of one heading by their step (number of cells) along this heading. Return,
-    for each step, the road's position across the heading; several positions if several roads are
-    parallel.
+    """Return the positions of roads across the heading, for each step (number of cells) along it. A
+    step has several positions if several roads are parallel.
 
     The error of the satellite receiver spreads one lane over neighbouring cells. Therefore cells of
     one step that are at most AHEAD apart become one position, their mean.

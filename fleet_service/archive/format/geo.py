@@ -97,8 +97,8 @@ def geojson_shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 def _read_rings(wkb: bytes, count: int, begin: int) -> list[Any]:
     """Return the rings of `count` polygons from bytes of well-known binary (WKB), starting at byte
-    `begin`. Each polygon must have one ring, and all rings the same number of corners. An item is
-    [ring], and a ring a list of corners [x, y].
+    `begin`. Each polygon must have one ring, and all rings the same number of corners. A polygon
+    is returned as [ring], and a ring is a list of corners [x, y].
     """
     corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
     rings: list[Any] = np.frombuffer(wkb, _ring_dtype(corners), count, begin)["xy"][

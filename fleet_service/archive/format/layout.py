@@ -178,12 +178,11 @@ def compacted_name(name: str, term: int) -> str:
 
 
 def term_of(name: str) -> int | None:
-    """Return the term (lease epoch) of the service that created an object of an archive's copy;
-    None if its name contains none.
+    """Return the term (lease epoch) in the name of a file of the archive's copy; None if the name
+    contains none.
 
-    Segments (files of new rows), checkpoints (saved states), weather and vehicle identities have
-    the epoch of their service. Compacted (sorted) files and their roll-ups (hourly statistics) have
-    the epoch of the compacting service.
+    It is the term of the service that wrote the file. For compacted (sorted) files and their
+    roll-ups (hourly statistics), this is the compacting service.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:

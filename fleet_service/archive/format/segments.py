@@ -57,8 +57,8 @@ class Writer:
     Args:
         root: folder of the archive.
         shard: name of the service.
-        epoch: smallest number that may be used as the epoch (number of the start) in segment names;
-            the lease determines it.
+        epoch: smallest epoch (number of the start) for segment names, larger than those of earlier
+            owners of the archive; 0 if the archive is used without a lease.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:

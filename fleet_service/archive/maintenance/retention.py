@@ -159,7 +159,7 @@ class ErasureResult(NamedTuple):
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
     """Remove the rows of one vehicle in one month, and all derived data that could reveal them.
 
-    Derived data are: lines with few vehicles in the month's snapshots (copies of the map), damaged
+    Derived data are: rows with few vehicles in the month's snapshots (copies of the map), damaged
     files that were renamed, and checkpoints (saved states). Hourly statistics are computed again.
     Measurements of the vehicle in that month, up to the newest removed row, are not accepted again.
 

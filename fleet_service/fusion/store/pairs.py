@@ -17,9 +17,9 @@ from schemas.thresholds import NS
 
 @refcount_free_inlined
 def comes_before(entries: RecordArray, a: int, b: int) -> bool:
-    """Return True if observation `a` comes before observation `b` in the order in which they change
-    the belief: by time, then by vehicle, start of the vehicle, and sequence number. Both are row
-    numbers of `entries`.
+    """Return True if observation `a` changes the belief before observation `b`. The order is by
+    time, then by number of the vehicle, random number of its agent's start, and sequence number.
+    `a` and `b` are row numbers of `entries`.
     """
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)

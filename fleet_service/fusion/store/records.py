@@ -139,8 +139,8 @@ class EntryRecord:
             reports in this cell, see `votes.discount_vote`.
         mean, std, slippery: mean and standard deviation of μ, and P(slippery), according to this
             observation alone.
-        number, boot, sequence: permanent number of the vehicle, random number of its start, and
-            number of the row in its stream; they order entries of equal times.
+        number, boot, sequence: permanent number of the vehicle, random number of its agent's start,
+            and number of the row in its stream; they order entries of equal times.
         evidence: log-likelihood of the visit on the friction grid, see
             `likelihoods.make_evidence`.
         used: grip used in the visit, in units of 1/USED.
@@ -271,18 +271,18 @@ class ReportersRecord:
 
 
 class PeersRecord:
-    """Comparisons of one vehicle's friction values with those of other vehicles and with each
-    other.
+    """Comparisons of one vehicle's friction values with those of other vehicles, and with its own
+    earlier values.
 
     Attributes:
-        other: index of the other vehicle.
-        rank: pseudo-random rank of the pair, which decides between vehicles that compete for a
-            place.
-        agreed, met: summed agreement, and number of comparisons.
-        used_squares: weighted squares of the differences in grip used between two visits of the
+        other: index of each other vehicle.
+        rank: pseudo-random number of each pair of vehicles; if two other vehicles compete for a
+            place, the one with the lower number gets it.
+        agreed, met: summed agreement, and number of comparisons, for each other vehicle.
+        used_squares: weighted sum of squared differences in grip used between two visits of the
             vehicle to one cell.
-        used_products: weighted products of these differences with the differences in reported
-            friction.
+        used_products: weighted sum of products of these differences with the differences in
+            reported friction.
         flags_confirmed, flags_contradicted: how often values of other vehicles confirmed and
             contradicted the vehicle's slip controllers.
     """
@@ -340,9 +340,8 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: the slots (one per cell and heading sector) in the state before the recent
-            observations in their windows, one row per row of `windows`; of the reporters only the
-            sources are copied.
+        base: for each row of `windows`, a copy of its slot (cell and heading sector) without the
+            effect of the recent observations; of the reporters only the sources are copied.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table that contains the records of active pairs.

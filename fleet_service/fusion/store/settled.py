@@ -108,10 +108,9 @@ def _find_first(state: State, slot: int, vehicle: int) -> int:
 @refcount_free_inlined
 def activate_reports(state: State, pair: int) -> None:
     """Copy a vehicle's last bound and last value of friction in a cell from the array
-    `State.settled` to row `pair` of `State.pairs`. `State.settled` keeps the last reports of
-    vehicles that have no recent report in the cell. The caller has just added the row for a vehicle
-    that reports there again. The copied records are marked as invalid. Do nothing if the array has
-    no report of this vehicle in this cell.
+    `State.settled` to row `pair` of `State.pairs`. The caller has just added this row, because the
+    vehicle reports there again. The records in `State.settled` are marked as invalid. Do nothing if
+    there is none for this vehicle and cell.
     """
     this = state.pairs[pair]
     slot = int(this.slot)

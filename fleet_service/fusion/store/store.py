@@ -60,11 +60,12 @@ class Store:
     """Complete state of a fusion, empty at first.
 
     Attributes:
-        state: arrays for compiled code. peers: record of each vehicle with its comparisons with
-        other vehicles. names: record of each vehicle with its permanent number; the first
-        `vehicles` are in use. size, vehicles: number of slots (one per cell and heading sector) and
-        of vehicles in use. forgotten_at: time [s] for which old records of vehicles in cells were
-        last deleted.
+        state: arrays for compiled code.
+        peers: record of each vehicle with its comparisons with other vehicles.
+        names: record of each vehicle with its permanent number; the first `vehicles` are in use.
+        size, vehicles: number of slots (one per cell and heading sector) and of vehicles in use.
+        forgotten_at: checkpoint time [s], in whole quarters of an hour, at which `forget` last
+            deleted old records.
     """
 
     def __init__(self) -> None:
@@ -220,10 +221,10 @@ class Store:
 
     def forget(self, checkpoint_s: int) -> None:
         """Delete old data, once per quarter of an hour of the checkpoint time: reports of a vehicle
-        in a cell that are not remembered (`settled.oldest_remembered`), and lists of a cell's
-        recent reporters older than an hour (`trust.compare_reports`, `Fusion.sources`). Then, and
-        whenever there are many, move pairs (vehicles in cells) without recent observations to the
-        settled pairs.
+        in a cell that no longer have an effect (`settled.oldest_remembered`), and lists of a cell's
+        recent reporters older than an hour. At these times, and whenever they are many, also move
+        pairs (vehicles in cells) without recent observations to the settled pairs, which need less
+        memory.
         """
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
         state = self.state

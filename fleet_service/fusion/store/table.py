@@ -193,10 +193,9 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
 
 
 def places_for(entries: int, most: float) -> int:
-    """Return the length (number of places) that a hash table with `entries` entries must have. Even
-    with 25 % more entries, at most the share `most` of its places is in use. The spare places are
-    needed because old entries are deleted only once per quarter of an hour. Most entries are kept
-    for an hour, so about 25 % are added between two deletions.
+    """Return the length (number of places) of a hash table for `entries` entries. Even with 25 %
+    more entries, at most the share `most` of the places is in use. Reason: most entries are kept
+    for an hour, but old ones are deleted only every quarter of an hour.
     """
     return max(LEAST, int(1.25 * entries / most))
 
