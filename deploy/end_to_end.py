@@ -1,12 +1,10 @@
-"""Simulate vehicles with the real estimator, and write their observations for the evaluation.
+"""Simulate vehicles with the default estimator, and write their observations for the evaluation.
 
     python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000]
-    [--scenario demo]
-        [--rough 0] [--winter 0]
+        [--scenario demo] [--rough 0] [--winter 0]
 
-Simulated vehicles with the default estimator drive a scenario, without a network. The observations
-that they would send are written to DIR/observations.parquet, and the true friction under them to
-DIR/truth.parquet.
+No network is used. The observations that the vehicles would send are written to
+DIR/observations.parquet, and the true friction under them to DIR/truth.parquet.
 """
 
 from __future__ import annotations

@@ -56,7 +56,8 @@ LOST: Final = 0.98  # share of the available grip at which a wheel counts as sli
 @dataclass
 class Drive:
     """Result of one simulated drive of all cars, computed with the simulator's true values. "New
-    ice" is the ice that appears during the drive. A lap is one passage of a car over the new ice.
+    ice" is the ice that appears during the drive. "Lap" means one passage of a car over the new
+    ice.
     """
 
     # (vehicle, lap) of the laps in which a wheel lost its grip on the new ice.
@@ -117,9 +118,9 @@ class ListeningTown:
         return self.drive
 
     def _check_intervals(self) -> list[bool]:
-        """Compare the map with the true friction at the end of the drive. Return a list with one
-        truth value for each cell and heading sector that several vehicles visited. It is True if
-        the friction interval of the map contains the true friction of the last visit.
+        """Return one boolean for each cell and heading sector that several vehicles visited. It is
+        True if the map's friction interval at the end of the drive contains the true friction of
+        the last visit.
         """
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -176,8 +177,8 @@ class ListeningTown:
             self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """Pass the active alerts to the cars that receive the map and, every ASKED_S seconds, all
-        map tiles too. `second` is the time since the start of the drive [s].
+        """Pass the active alerts to the listening cars. Every ASKED_S seconds, also pass all map
+        tiles. `second` is the time since the start of the drive [s].
         """
         now = self._now()
         for alert in self.alerts.standing_alerts:

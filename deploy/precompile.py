@@ -1,9 +1,9 @@
 """`python -m deploy.precompile [papers]`: compile frequently used functions once for this machine.
 
 `make setup` ends with this command, which compiles the functions of service, agent and simulated
-vehicle, so that their first start does not have to wait. With `papers`, the filters of the papers
-are compiled too, because the tests need them. A function that cannot be compiled here is compiled
-at its first use.
+vehicle, so that their first start does not have to wait. With `papers`, it instead compiles the
+filters from scientific papers, which the tests need. A function that cannot be compiled here is
+compiled at its first use.
 """
 
 from __future__ import annotations

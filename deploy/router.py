@@ -30,8 +30,8 @@ CONFIG = Path(__file__).with_name("router.json5")
 def load_configuration(
     config: Path = CONFIG, listen: str | Sequence[str] | None = None
 ) -> zenoh.Config:
-    """Return the router's configuration from a file; if given, `listen` replaces the endpoints in
-    the file on which the router listens.
+    """Return the router's configuration from the file `config`. If `listen` is given, the router
+    listens on these endpoints instead of those in the file.
 
     Raises:
         InputError: the file is not a Zenoh configuration, or the endpoint is not valid.

@@ -261,8 +261,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def moment(text: str, field: str) -> int:
-    """Convert `text`, an ISO 8601 date with or without a time of day, to nanoseconds since 1970.
-    Errors name the parameter `field`. A time without a zone is UTC.
+    """Convert `text`, an ISO 8601 date with or without a time of day, to nanoseconds since 1970. A
+    time without a zone is UTC. Error messages call the parameter `field`.
 
     Raises:
         InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.

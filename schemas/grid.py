@@ -149,8 +149,7 @@ def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArra
     counter-clockwise from the south-west.
 
     If heading sectors (n,) are given, return triangles (n, 3) instead. Each triangle is the quarter
-    of the cell on the side to which the vehicle heads; its first corner is the cell's centre. The
-    four triangles of a cell do not overlap.
+    of the cell on the side to which the vehicle heads; its first corner is the cell's centre.
     """
     west, south, east, north = bounds(cell)
     x = np.stack([west, east, east, west], axis=-1)

@@ -69,8 +69,8 @@ TOPICS: Final = {
 
 
 def chunks(quadint: int, zoom: int) -> str:
-    """Return the part of a key that names a region (zoom 10) or a tile (zoom 14): its quadkey
-    digits in chunks of 4, 3, 3 (and 4), separated by slashes.
+    """Return the quadkey digits of a region or tile as in a Zenoh key: chunks separated by slashes,
+    of 4, 3 and 3 digits for a region (zoom 10), of 4, 3, 3 and 4 for a tile (zoom 14).
     """
     digits = grid.quadkey(quadint, zoom)
     parts = []
@@ -170,9 +170,9 @@ class ServiceToken(NamedTuple):
         return self.key_under(SERVES)
 
     def key_under(self, root: str) -> str:
-        """Return the key of a token (sign that a service is alive) whose first part is `root`
-        instead of `gripmap/v1/serves`. The root CLAIMS means that the service serves or will soon
-        serve the region. The root WAITS means that it is a standby service for the region.
+        """Return the token's key with `root` as first part instead of `gripmap/v1/serves`. The root
+        CLAIMS means that the service serves or will soon serve the region. The root WAITS means
+        that it is a standby service for the region.
         """
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 

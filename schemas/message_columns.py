@@ -23,8 +23,7 @@ I64: Final = "int64"
 
 class MessageColumn(NamedTuple):
     """One column of a message. It has the attributes of `schemas.tables.Field` (name, unit, meaning
-    and others). Its `type` is a type of this module instead of an Arrow type, so that Arrow need
-    not be imported.
+    and others). Its `type` is a type of this module instead of an Arrow type.
     """
 
     name: str

@@ -29,8 +29,8 @@ class Size(NamedTuple):
     """Dimensions of a vehicle class: mass [kg], distances of the axles from the centre of gravity
     [m], track [m], height of the centre of gravity [m], wheel radius [m] and steering ratio.
 
-    `drive_front` is the share of the driving torque at the front axle; None if the class has front,
-    rear and all-wheel drive.
+    `drive_front` is the share of the driving torque at the front axle; None for a class that has
+    cars with front, rear and all-wheel drive.
     """
 
     mass: float

@@ -1,9 +1,8 @@
 """Figures of the demo: the map compared with the true friction.
 
-The true values come from the simulator. For each visit (passage of a map cell) the simulator
-records the mean friction under the wheels, and the largest share of this friction that the vehicle
-used. A visit with a share of at least 0.6 is called *excited*, because only then can the friction
-be measured.
+For each visit (passage of a map cell) the simulator records the mean friction under the wheels, and
+the largest share of this friction that the vehicle used. A visit with a share of at least 0.6 is
+called *excited*, because only then can the friction be measured.
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ LOST: Final = 0.98  # share of the available grip at which a wheel counts as sli
 def demo_works(found: Sequence[Figure]) -> bool:
     """Return True if every figure of the demo with a mandatory target meets its target.
 
-    Targets for the delay of alerts, the number of passes and the run time are not mandatory. Too
-    wide intervals are no failure either.
+    Targets for the delay of alerts, the number of passes and the run time are not mandatory.
+    Neither is the upper limit of the coverage, above which the map's intervals are too wide.
     """
 
     def breaks_promise(figure: Figure) -> bool:
@@ -173,8 +172,8 @@ def known_patches(
     visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
 ) -> list[tuple[IntArray, int]]:
     """Return a pair for each patch of ice: the grid numbers of the patch's cells, and the time [ns]
-    of the first alert for the patch. That time is NEVER without an alert. The mask `patch` selects
-    visits to patches.
+    of the first alert for the patch (NEVER if there was no alert). `patch` is a mask of the visits,
+    True for visits to a patch.
     """
     cells = np.unique(visits["cell"].to_numpy()[patch])
     label = link_cells(cells)
@@ -253,9 +252,8 @@ def demo_figures(
 
 @dataclass(frozen=True)
 class LostGrip:
-    """Table of passes over new ice, one per row. `warned` is True if the driver receives warnings,
-    and `lost` is True if a wheel lost its grip. Passes before the first alert for that patch of ice
-    are left out.
+    """Passes over new ice after the first alert for the patch of ice, one row per pass. `warned` is
+    True if the driver receives warnings, and `lost` is True if a wheel lost its grip.
 
     `cell` is the cell in which grip was lost, or the first cell of the pass.
     """

@@ -95,9 +95,9 @@ def _blob_outline(shape: tuple[float, float, float, float], seed: int) -> FloatA
 
 
 def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
-    """Yield the outlines of houses, points (n, 2) [m], along the streets, parallel to them.
-    `centres` are points (n, 2) [m] on the streets' centre lines. Houses do not touch streets, parks
-    or each other.
+    """Yield the outline of each house as points (n, 2) [m]. The houses stand along the streets and
+    parallel to them, and do not touch streets, parks or each other. `centres` are points (n, 2) [m]
+    on the streets' centre lines.
     """
     rng = np.random.default_rng(5)
     placed: list[tuple[float, float, float]] = []

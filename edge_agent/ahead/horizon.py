@@ -53,7 +53,7 @@ class Horizon(NamedTuple):
             MEASURED or BORROWED (from neighbouring places).
         slippery: True if the metre justifies a warning of slipperiness.
         alerted: True if an alert of the fleet service is active there.
-        safe_speed: speed from which the car can take the bends and stop in time [m/s]; NaN where
+        safe_speed: highest safe speed [m/s], computed by the function `safe_speed`; NaN where
             unknown.
     """
 
@@ -138,9 +138,10 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     `curvature` [1/m] and stop within SIGHT_M metres, if the friction is `mu_lower`, the lower end
     of its interval.
 
-    Before a slower place, the result falls with a comfortable deceleration, or with a smaller one
-    if cornering leaves less grip for braking. Where `mu_lower` is NaN (not measured), the result is
-    NaN, except on the braking distance before a slower place.
+    The result falls towards a slower place, so that the car can reach that place's speed by
+    comfortable braking. It falls less steeply if cornering leaves less grip for braking. Where
+    `mu_lower` is NaN (not measured), the result is NaN, except on the braking distance before a
+    slower place.
     """
     measured = np.isfinite(mu_lower)
     bend = np.abs(np.nan_to_num(curvature))
@@ -163,9 +164,8 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Return, for each metre ahead, the energy per mass (M,) [m^2/s^2] that braking can remove
-    between the car and that metre. It is half the square of the highest speed from which the car
-    can stop there.
+    """Return v^2/2 (M,) [m^2/s^2] for each metre ahead, where v is the highest speed from which the
+    car can stop there.
 
     The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road.
     The deceleration is limited to a comfortable one.

@@ -128,8 +128,9 @@ class LocalMap:
         return [alert for alert, _ in self._alerts.values()]
 
     def store_cells(self, tile: int, cells: ReceivedCells, now: int) -> None:
-        """Store the received cells of a map tile in the local map. Of each place, the map keeps the
-        values received last, unless they are HELD_S seconds old at `now` [ns UTC].
+        """Store the received cells of a map tile. Newly received values of a place replace earlier
+        ones. Earlier values that were received at least HELD_S seconds before `now` [ns UTC] are
+        removed.
         """
         before = self._tiles.pop(tile, NOTHING)
         both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])

@@ -95,8 +95,9 @@ class MapSubscriber:
         """Subscribe to alerts and send map queries along the possible paths, the most likely path
         first. The call does not wait for an answer.
 
-        The subscriptions cover the first `within` metres of the paths. If a part of these metres
-        was not requested recently, the queries cover the paths to their ends.
+        The subscriptions cover the first `within` metres of the paths. Queries are sent only if a
+        part of these metres was not requested recently. They then cover all such parts up to the
+        ends of the paths.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

@@ -94,8 +94,8 @@ class Path(NamedTuple):
 def to_plane(
     latitude: FloatArray, longitude: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray]:
-    """Return east and north coordinates [m], relative to the car, of points given by latitude and
-    longitude [deg], in their shape. Within a kilometre the error is below a centimetre.
+    """Convert latitude and longitude [deg] to east and north coordinates [m] relative to the car,
+    in the same shape. Within a kilometre of the car the error is below a centimetre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (

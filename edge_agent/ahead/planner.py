@@ -141,8 +141,8 @@ class PlannerKey:
 
     Args:
         domain: ROS domain.
-        type_hash: hash of the message type in the planner's version, e.g. RIHS01_…; rmw_zenoh
-            subscribes to exactly this hash.
+        type_hash: hash of the message type in the installed version of the planner, e.g. RIHS01_…;
+            rmw_zenoh receives only messages with this hash.
     """
 
     def __init__(self, domain: int = 0, type_hash: str = ANY_HASH) -> None:

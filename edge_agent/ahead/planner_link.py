@@ -27,7 +27,7 @@ class PlannerLink:
 
     Args:
         endpoint: Zenoh router of the planner; the session is opened on a separate thread.
-        type_hash: hash of the type VelocityLimit in the planner's version.
+        type_hash: hash of the type VelocityLimit in the installed version of the planner.
         domain: ROS domain.
     """
 

@@ -1,5 +1,5 @@
-"""The map as prior knowledge about the friction in the vehicle's current cell. The result never
-affects published records. The module is pure (no I/O).
+"""The map as prior knowledge about the friction in the vehicle's current cell. The module is pure
+(no I/O).
 
 The estimator itself does not use the map: its recursion, and the published evidence of a visit
 (passage of one cell), are bit-equal with and without a map. This module computes a second belief,
@@ -18,8 +18,8 @@ Legend
     q, p_M  belief with the map at the border, and now                  (32,)
     p       result: mixture of the beliefs with and without the map     (32,)
     β, β'   probability that the map is wrong here, before and after the measurements: β' =
-            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. β begins at SHARE, its
-            lowest value; the share KEPT of β' - SHARE passes to the next visit
+            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. β begins at
+            SHARE, its lowest value. At each border β = SHARE + KEPT·(β' - SHARE)
 
 At a border, only the filter's own belief is carried to the next cell, never the mixture p.
 Otherwise the map's belief about one cell would be counted again in the next. Averaging of

@@ -1,5 +1,5 @@
-"""Choice of the map areas to request: narrow boxes along the path ahead, so that a day of driving
-needs megabytes and not gigabytes. The module is pure (no I/O).
+"""Choice of the map areas that a car requests, so that a day of driving needs megabytes and not
+gigabytes. The module is pure (no I/O).
 
 Each second, the fleet service publishes every changed map tile completely: about 50 kB in a busy
 town. A car needs only the part along its path, and not every second, but it needs alerts

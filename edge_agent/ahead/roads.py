@@ -83,8 +83,8 @@ class _Neighbours:
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
         """Return the keys (cell·4 + sector) of the places that may follow the position `here` [m]
-        on a road, for a vehicle with the `heading` [rad]. They lie at most `cells` cell widths
-        away, the most likely first, at most one per road of a fork.
+        on a road, the most likely first. The vehicle's heading is `heading` [rad]. The places lie
+        at most `cells` cell widths away. At a fork, one place per road is returned.
         """
         reach = cells * self.side
         found = []

@@ -134,9 +134,9 @@ def _load_kernels(estimator: str, memberships: Memberships | None) -> None:
 
 
 def _fork_processes(count: int) -> ProcessPoolExecutor:
-    """Return a pool for `count` worker processes; no worker is started yet. Only on Linux are
-    workers forked from this process, because system libraries of other operating systems do not
-    support a fork.
+    """Return a pool for `count` worker processes; no worker is started yet. On Linux, the workers
+    are forked from this process. Elsewhere they start without a fork, because the system libraries
+    do not support it.
     """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
@@ -152,12 +152,11 @@ def _submit_drives(
     memberships: Memberships | None,
 ) -> list[Future[Outcome]]:
     """Submit all drives to a pool of processes, and return one future (later result) per drive.
-    Submitting starts the processes. SIGINT (Ctrl-C) is blocked until each process has installed its
-    own handler.
+    Submitting starts the processes. SIGINT (Ctrl-C) is blocked meanwhile, so that no process
+    receives it before it has installed its own handler.
 
-    Python warns if a process with several threads is forked, because a lock of another thread stays
-    locked in the new process. This warning is suppressed, because the libraries with threads
-    (OpenBLAS, Arrow) handle a fork correctly.
+    Python's warning that the forked process has several threads is suppressed, because the
+    libraries with threads (OpenBLAS, Arrow) handle a fork correctly.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -180,9 +179,9 @@ class _PoolProcess:
 
 
 def _prepare_process() -> None:
-    """Prepare a new worker process: it ends when its parent process ends, SIGTERM ends it even if
-    the parent handles SIGTERM, Arrow uses one thread in it, and Ctrl-C stops the estimation of its
-    current drive.
+    """Prepare a new worker process. It ends when its parent process ends. SIGTERM ends it even if
+    the parent handles SIGTERM, and Ctrl-C stops the estimation of its current drive. Arrow uses one
+    thread in it.
     """
     end_with_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -237,8 +236,8 @@ def backfill_on_spark(
 
 
 def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
-    """Estimate one drive and write its estimates to a temporary file, which gets its final name
-    when it is complete, even if another process estimates the same drive.
+    """Estimate one drive. Write its estimates to a temporary file, and rename this file when it is
+    complete. Another process that estimates the same drive has its own temporary file.
     """
     folder = task.out.parent
     with own_drafts(folder) as drafts:

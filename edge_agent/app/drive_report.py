@@ -102,7 +102,8 @@ def curve_of(
     table: pa.Table, panel: Panel
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the curve of one estimated quantity as four arrays (n,): times [s], values, lower and
-    upper ends of the interval, in the plot's unit. The ends are NaN without interval.
+    upper ends of the interval, in the plot's unit. Both ends are NaN for a quantity without
+    interval.
     """
     t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
     if len(panel.band) == 2:

@@ -44,9 +44,9 @@ log = logging.getLogger(__name__)
 
 
 class Known(BaseModel):
-    """Stored knowledge about a car. `passed` is True if the signal doctor (automatic check) found
-    no fault in the car's signals. `drives` contains, for each section of the car's trips, the
-    sensor errors estimated from it. `of` identifies vehicle file and profile.
+    """Stored knowledge about a car. `of` is a hash of vehicle file and profile. `passed` is True if
+    the signal doctor (automatic check) found no fault in the car's signals. `drives` contains the
+    estimated sensor errors of each section of the car's trips.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -108,8 +108,8 @@ class Trip:
         """Yield the blocks of samples of a source after correction of the known sensor errors. The
         uncorrected blocks are stored for the signal doctor (automatic check).
 
-        The function `ground` returns the speed over ground (T,) [m/s] at the samples of the last
-        block.
+        The function `ground` returns the speed over ground (T,) [m/s] at the samples of the block
+        that the source yielded last.
         """
         if not self.is_admitted():
             log.info(

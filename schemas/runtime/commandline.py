@@ -169,7 +169,7 @@ def run_guarded(run: Callable[[], int]) -> int:
 
 def out_folder(field: str, path: Path) -> Path:
     """Check that a file can be written at `path`, and return the path. A command calls this before
-    it computes anything. Errors name the option `field`.
+    it computes anything. `field` is the option's name for error messages.
 
     Raises:
         InputError: the path is a folder, or its parent folder does not exist.
@@ -202,7 +202,7 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
     """Return the ending of a file name, which selects the file format. If several of the `known`
-    endings match, return the longest. Errors name the option `field`.
+    endings match, return the longest. `field` is the option's name for error messages.
 
     Raises:
         InputError: the ending is unknown.

@@ -25,8 +25,8 @@ class Figure:
 
     Attributes:
         name, value, unit: name of the measured quantity, measured value, and its unit.
-        bar: target: a limit for the value, or two limits if `better` is "within"; None without
-            target.
+        bar: target, None if there is none: one limit for the value, or a pair of limits if `better`
+            is "within".
         better: "less" if the value must not exceed the limit, "more" if it must reach the limit,
             "within" if it must lie between two limits.
     """

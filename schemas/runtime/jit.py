@@ -91,9 +91,9 @@ def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def load_intrinsic(module: str, name: str) -> object:
-    """Return the Numba intrinsic (function whose LLVM code this project generates itself) whose
-    definition is the attribute `name` of `module`. In a process that takes its compiled functions
-    from a shared library, the intrinsic is loaded only when Numba needs it.
+    """Return the Numba intrinsic (function whose LLVM code this project generates itself) that is
+    defined by the attribute `name` of `module`. In a process with native kernels, return a
+    placeholder instead, so that Numba is not imported before it is needed.
     """
 
     def load_with_numba() -> object:

@@ -211,9 +211,8 @@ _register_comparisons()
 
 def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
     """Generate code that computes the address of one vector (LANES numbers) in an array; return
-    this pointer. The array and the place are the first two arguments of an intrinsic with the
-    signature `sig`. The place is an index, or a tuple with one index for each axis except the last
-    (the lanes).
+    this pointer. `sig` is the signature of an intrinsic. Its first two arguments are the array, and
+    the position: an index, or a tuple with one index for each axis except the last (the lanes).
     """
     kind = sig.args[0]
     held = target.make_array(kind)(target, builder, values[0])
@@ -349,9 +348,9 @@ def _constant(long: Any, value: int) -> Any:
 
 
 def _type_function(value: Any, build: Callable[[Any, Any, Any, Any], Any]) -> Any:
-    """Return the signature and the code generator of an intrinsic with one argument, a single
-    number or a vector. `build` generates the code from the LLVM builder, the argument, its LLVM
-    type, and the LLVM type of an integer or of a vector of integers.
+    """Return the signature and the code generator of an intrinsic with one argument, a number or a
+    vector. `build` generates the code from four arguments: the LLVM builder, the intrinsic's
+    argument, its LLVM type, and the LLVM integer type of equal size.
     """
     wide = isinstance(value, LanesType)
     number = LANES_TYPE if wide else types.float64

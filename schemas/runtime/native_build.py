@@ -149,8 +149,8 @@ class _Adapter:
         self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
 
     def make_function(self, *, returns: bool) -> Callable[..., Any]:
-        """Return the Python function made from the source text. It calls the kernel, stores the
-        result in word 1 if the kernel returns one, and sets word 0 to 1, the mark of completion.
+        """Return the adapter as a Python function of the row of words. It calls the kernel, stores
+        the kernel's result (if any) in word 1, and sets word 0 to 1 as mark of completion.
         """
         result = "words[1] = " if returns else ""
         text = f"def {ADAPTER}(words):\n    {result}{self._call}\n    words[0] = 1\n"
@@ -167,9 +167,9 @@ class _Adapter:
         return name
 
     def _expression(self, value: Any) -> str:
-        """Return the source text of an expression that builds one argument of the kernel, of the
-        type of `value`, from the next unused words. The words have the order in which
-        `describe_type` appends them.
+        """Return the source text of an expression that builds one argument of the kernel from the
+        next unused words of the row. The argument has the type of `value`. `describe_type`
+        determines the order of the words.
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))

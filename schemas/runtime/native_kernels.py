@@ -94,8 +94,8 @@ class NativeKernel:
 
 class NativeIntrinsic:
     """Placeholder for a Numba intrinsic (function whose LLVM code this project generates itself) in
-    a process that uses native kernels. The intrinsic is loaded only when Numba compiles a function
-    that calls it.
+    a process that uses native kernels. Because of the placeholder, such a process imports Numba
+    only when it must compile a function.
     """
 
     def __init__(self, load: Callable[[], Any]) -> None:

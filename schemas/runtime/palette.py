@@ -1,9 +1,9 @@
 """Colours of all plots and pages, distinguishable with three kinds of colour blindness and in
 greyscale.
 
-The live page, HTML reports, images and QGIS use them. `FOUR` are the colours of four classes of
-well-known friction, and `TWO` those of two classes of roughly known friction. `LITTLE` is the
-colour where too little is known for a class.
+The live page, HTML reports, images and QGIS use them. `FOUR` are the colours of four classes where
+the friction is precisely known, and `TWO` those of two classes where it is roughly known. `LITTLE`
+is the colour where too little is known for a class.
 
 The classes have an order: ice, snow, rather slippery, wet, rather not slippery, good grip. From ice
 to good grip, lightness rises on a light background and falls on a dark one. Therefore ice, the most

@@ -71,8 +71,8 @@ class PresenceTracker:
         the union of the queried tokens and the tracked tokens.
 
         Both sources are needed. A router's answer may lack a token that the router is just sending
-        to the subscription of the same session (1 of 60 answers). The subscription then delivers
-        that token before the answer ends.
+        to the subscription of the same session. The subscription then delivers that token before
+        the answer ends.
         """
         return active_tokens(session) | self.active
 

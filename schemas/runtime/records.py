@@ -6,9 +6,9 @@ NumPy number, another record class, or Annotated[FloatArray, size, ...] and its 
 other numbers. `record_type` returns the structured NumPy type of a class, and `records` an array of
 this type. Compiled code sees a row of the array as an object with the names of the fields.
 
-A tuple with one array per field would be slower: each array costs 0.1 to 0.3 µs per call, and so
-does a whole record array. The data of one vehicle are contiguous. Field sizes are constants, so
-that the compiler unrolls short loops.
+A tuple with one array per field would be slower, because passing an array costs 0.1 to 0.3 µs per
+call. For a record array this cost arises only once. The data of one vehicle are contiguous. Field
+sizes are constants, so that the compiler unrolls short loops.
 
 Annotated[LaneArray, size, ...] adds a last axis of LANES numbers, which compiled code reads as one
 vector (`lanes.py`). Such fields begin at a cache line, because a vector that crosses two lines is

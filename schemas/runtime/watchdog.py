@@ -26,9 +26,9 @@ def notify_alive() -> None:
 
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
-    """Start a thread that repeatedly notifies systemd that the process works, while the process
-    waits (a standby service, for example) and cannot call `notify_alive` regularly. The thread ends
-    at the process's first call of `notify_alive`.
+    """Start a thread that repeatedly notifies systemd that the process works. Use it while the
+    process (a standby service, for example) waits and cannot call `notify_alive` regularly. The
+    thread ends at the process's next call of `notify_alive`.
 
     Returns:
         a function that the waiting code must call repeatedly. The thread stops `most_s` seconds

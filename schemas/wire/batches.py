@@ -286,7 +286,8 @@ def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray)
     """Fill, in place, the columns that a sender of observations may leave out: leaving time, cell
     and heading sector.
 
-    `unplaced` is a mask of rows, True where a row has a finite position but no cell.
+    `unplaced` is a mask of rows, True where a row has a finite position but no cell; these rows get
+    a cell.
     """
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])

@@ -186,16 +186,15 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
 
 
 class StreamAck(NamedTuple):
-    """Acknowledged batches of one stream (batches of one vehicle, start, kind and region), given by
-    sequence numbers (`seq`).
+    """Acknowledged batches of one stream, given by sequence numbers (`seq`). A stream contains the
+    batches of one vehicle that have the same `boot`, `kind` and `region`.
 
     Attributes:
-        boot, kind, region: identity of the stream: random number of the agent's start, kind of the
-            batches, region.
+        boot, kind, region: random number that the agent draws at each start, kind of the records,
+            region.
         durable: ranges of batches that are stored safely, both ends included.
         rejected: for each refused record, its batch's sequence number, its row, and the reason.
-        late: ranges of durable batches that arrived too late for the map to use them in order of
-            time.
+        late: ranges of durable batches that arrived too late for the map's normal update.
         time: time of sending by the service's clock [ns]; 0 if unknown.
     """
 
