@@ -39,8 +39,8 @@ class LowerVertices:
     Their feet (lower corners) can be chosen, as shares of the distance between neighbouring peaks.
 
     Attributes:
-        feet: alternately how far set k extends towards peak k + 1, and set k + 1 towards peak k
-            [1]; 1 means up to the peak.
+        feet: for each pair of neighbours, how far set k extends towards peak k + 1, then how far
+            set k + 1 extends towards peak k [1]; 1 means up to the peak.
         out_feet: the same shares for the output sets (sets of the step of ln R).
         peaks: upper vertices of the sets of the mismatch [1].
         out_peaks: upper vertices of the output sets [nat].

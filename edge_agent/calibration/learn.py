@@ -179,7 +179,7 @@ def _posterior_of(
 
     `bias` is the standard deviation of errors common to all drives, and `unknown` the smallest
     standard deviation that a drive states. If `unknown` is not 0, the estimates already include the
-    prior; in that case the function does not move their median towards the prior mean again.
+    prior, so their median is not moved towards the prior mean again.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))

@@ -65,10 +65,10 @@ def axle_lateral_forces(
 def advance_velocity(
     vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
 ) -> tuple[float, float]:
-    """Return (v_x, v_y) [m/s] after `step` [s] with constant accelerations a_x, a_y and yaw rate r.
-    The solution is exact: a rotation by -r*step.
+    """Return (v_x, v_y) [m/s] after `step` [s] in which accelerations a_x, a_y and yaw rate r are
+    constant.
 
-    It replaces Euler's rule, with which the error of v_y is four times larger.
+    The solution is exact. With Euler's rule the error of v_y would be four times larger.
     """
     angle = yaw_rate * step
     cos = math.cos(angle)

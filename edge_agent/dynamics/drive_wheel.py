@@ -59,12 +59,12 @@ def drive_wheel(
 
 @compiled
 def slip_share(radius: float, omega: float, along: float) -> float:
-    """Return the weight [1] that the force of the tyre model gets in the compensated force of a
+    """Return the share [1] that the force of the tyre model gets in the compensated force of a
     wheel (`blend_forces`): 1/2 + 2^(-1/|s|), equation (33) of paper 002.
 
     s is the longitudinal slip by equation (15): the difference of `radius` [m] times `omega`
     [rad/s] and the velocity `along` [m/s] of the wheel's centre, over the larger of the two. At
-    ordinary slips (up to 0.2) the weight is about one half.
+    ordinary slips (up to 0.2) the share is about one half.
     """
     turning = radius * omega
     most = max(abs(turning), abs(along), 1e-3)

@@ -53,17 +53,16 @@ def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
 
 
 def in_the_world(name: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns the figure (number) called
-    `name` of the default estimator from the realistic evaluation (`real_world`): inaccurate cars in
-    towns, or cars that stand on a slope.
+    """Return a function that takes the campaign's results and returns one number, called `name`. It
+    is a result of the default estimator under realistic conditions (`real_world`).
     """
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def worth_of(name: str) -> Callable[[Results], float]:
     """Return a function that takes the campaign's results and returns the ratio called `name`: one
-    filter variant's interval score of friction divided by that of another. An example is the score
-    with fuzzy sets divided by the score without them.
+    filter variant's interval score of friction divided by that of another. For example, the score
+    with fuzzy sets is divided by the score without them.
     """
     return lambda results: worth.ratio(results.worth, name)
 
@@ -76,9 +75,8 @@ def mean(values: FloatArray | None) -> float:
 
 
 def false_per_hour(results: Results) -> float:
-    """Return how often per hour the default estimator falsely reports a change of friction, in
-    scenarios whose friction is constant. A false report is a stretch in which the friction interval
-    does not agree with the true friction.
+    """Return how many false changes of friction the default estimator reports per hour, in
+    scenarios with constant friction. `measures.false_changes` defines a false change.
     """
     counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
     hours = sum(float(m["hours"].sum()) for m in counted)
@@ -221,7 +219,7 @@ def unit_of(measure: str) -> str:
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
     """Return all figures (named numbers) of the evaluation. Figures with a target come first; with
-    `quick`, those that were not measured are left out. Most other figures are named
+    `quick`, only those of them that were measured. Most other figures are named
     `KIND.SCENARIO.ESTIMATOR.MEASURE` and have a standard deviation.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]

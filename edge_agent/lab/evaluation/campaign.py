@@ -50,8 +50,8 @@ class PlottedDrive:
 @dataclass
 class Results:
     """Results of the evaluation campaign. `real` (with ordinary sensors) and `ideal` (with
-    error-free sensors) hold the measures of the estimates, such as errors, per drive, by (scenario,
-    estimator).
+    error-free sensors) map (scenario, estimator) to measures such as errors, with one value per
+    drive.
     """
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
@@ -123,9 +123,8 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
 
 
 def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
-    """Return an estimator bank (one filter per drive) for drives under a paper's own conditions. If
-    the estimator does not estimate friction, it assumes the true friction at the start of the
-    drives.
+    """Return an estimator bank (one filter per drive) for drives under a paper's own conditions.
+    Estimators that need a friction value get the true one at the start of the drives.
     """
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

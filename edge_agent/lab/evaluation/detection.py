@@ -3,26 +3,26 @@ where there is no ice?
 
 Towns are drawn randomly by seed; cars are inaccurate ("rough", ROUGH_FLEET) or accurate ("plain").
 "short" drives last 120 s, and "long" ones 900 s, because some faults that stop a car's reports
-appear only after a long time. A figure (reported number) for one kind of cars pools the samples of
-all towns with such cars. A visit is the passage of one map cell, with its likelihood of friction.
+appear only after a long time. Each result for one kind of cars is computed from the samples of all
+towns with such cars. A visit is the passage of one map cell, with its likelihood of friction.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
-    value       visit: it has value if its log-likelihood at the largest friction is VALUE_NATS or
-                more below the likelihood's maximum, which is evidence against full grip
-    favoured    visit: it favours a slippery road, max ln L(μ < .4) - max ln L(μ >= .4) >=
+    value       a visit has value if it is evidence against full grip: its log-likelihood at the
+                largest friction is at least VALUE_NATS below the maximum
+    favoured    a visit favours a slippery road if max ln L(μ < .4) - max ln L(μ >= .4) >=
                 FAVOURED_NATS
-    on ice      visit: its mean friction is at most .2 and changes by less than MOVES; sample:
-                friction <= .2
-    excited     visit: some wheel uses more than EXCITED_SHARE of its grip during it
+    on ice      a visit whose mean friction is at most .2 and changes by less than MOVES; a sample
+                with friction of at most .2
+    excited     a visit during which some wheel uses more than EXCITED_SHARE of its grip
     pass        a stretch of PASS_S or longer of one car on ice, or on snow; a pass is found if
                 P(mu < .4) > CALLED_SHARE at some time during it
-    settled     not within SETTLED_S of snow and ice
+    settled     at least SETTLED_S after snow and ice
     false event a settled stretch with P(mu < .4) > CALLED_SHARE on wet or dry road; gaps up to
-                EVENT_GAP_S do not end it. Friction is the mean of the wheels, so while only the
-                front axle is on ice, a report may count as false; `.off_ice` counts only samples
-                without a wheel on snow or ice
+                EVENT_GAP_S do not end it. The road is judged by the mean friction of the wheels, so
+                one axle may be on ice; `.off_ice` counts only samples without a wheel on snow or
+                ice
     false grip  mu_lower more than FALSE_GRIP above the true friction
     stood       ice or snow appeared under the standing car; these cases are evaluated separately
                 and in no other figure
@@ -172,8 +172,8 @@ def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
 
 def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
     """Evaluate the drives of one town, and return their tally (sums and counts of the evaluation).
-    With `oracle`, also evaluate an oracle (an ideal observer that knows motion and tyre forces) on
-    the visits (passages of a map cell) on ice with high use of grip.
+    With `oracle`, also evaluate an oracle (an ideal observer that knows motion and tyre forces). It
+    gets those visits (passages of a map cell) on ice during which a wheel uses much of its grip.
     """
     tally = DetectionTally()
     _judge_samples(tally, drive)
@@ -294,8 +294,8 @@ def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
     """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins,
-    separately for slides on slippery road and for times without a slide. For both, also add the
-    time [s] in which the flag is not set. The sums go to the tally (sums of the evaluation).
+    separately for slides on slippery road and for times without a slide. For both, also sum the
+    time [s] without the flag, in which it could begin. Add all sums to the tally.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -317,9 +317,9 @@ def _judge_contradictions(
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
     """Count false reports of slippery road by car n, at least SETTLED_S [s] after snow and ice, and
-    add the counts to the tally (sums of the evaluation). There are separate counts for the
-    estimator, for its friction belief at each threshold, and for the slip flag (ordinary ABS
-    logic).
+    add the counts to the tally (sums of the evaluation). Count the reports of the estimator and of
+    the slip flag (ordinary ABS logic) separately, and both also for each threshold of the ROC
+    curve.
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)

@@ -57,8 +57,8 @@ def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Return a function that takes a tally (sums of the evaluation by name) and returns 1000 times
-    the sum of the measure named `over` divided by the sum of the measure named `under`.
+    """Return a function that takes a tally (sums of the evaluation by name) and returns 1000 *
+    `over` / `under`, each the sum of the measure with that name.
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 

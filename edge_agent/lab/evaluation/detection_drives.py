@@ -167,10 +167,10 @@ def stood_where_it_appeared(
 def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
-    """Run the estimators on one chunk (stretch of time) of the drives: times `t` (T, N) [s], and
-    signals. `closes` (T, N) is True where a visit of a map cell ends. Return the estimates, with
-    the evidence on friction if the estimator computes it, and an array (T, N) of how much [nat] the
-    friction belief favours a slippery road (NaN without belief).
+    """Run the estimators on one chunk of the drives: times `t` (T, N) [s], and signals. `closes`
+    (T, N) is True where a visit of a map cell ends. Return the estimates, and an array (T, N) that
+    states how much the friction belief favours a slippery road [nat]. The array is NaN if the
+    estimator has no belief.
     """
     if bank.beliefs() is None:
         return bank.advance(t, signals, closes), np.full(t.shape, np.nan)

@@ -160,8 +160,9 @@ def apply_fault(batch: DriveSet, case: Case) -> DriveSet:
 
 def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
     """Return the measures of a fault case, one value per drive. `finite` (1 or 0): all estimates
-    are finite and in order. `told` (1 or 0): health reports the expected flag. The others cover the
-    time from BEGINS on: coverage and width of the friction interval, and RMSE of v_x and v_y.
+    are finite, and the friction estimate lies in its interval. `told` (1 or 0): health reports the
+    expected flag. The others cover the time from BEGINS on: coverage and width of the friction
+    interval, and RMSE of v_x and v_y.
     """
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(reported.values).all(axis=-1)

@@ -102,10 +102,9 @@ def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
 
 
 def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return two measures by name, one value per drive, for drives on a road with different
-    friction left and right. Both are computed over the last LAST_S [s] of each drive: the friction
-    error on the side with less friction, and the coverage of the friction interval on the other
-    side.
+    """Return two measures for drives on a road with different friction left and right: the friction
+    error on the slippery side, and the coverage of the friction interval on the other side. Both
+    are computed over the last LAST_S [s] of each drive, one value per drive.
     """
     end = batch.last(LAST_S)
     truth = batch.mu_wheel

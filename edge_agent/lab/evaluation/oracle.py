@@ -6,7 +6,7 @@ everything that is not listed as unknown. Unknown are the quantities that the ve
 sensors' data sheet leave open. The equations are linearised around the true values, so the oracle's
 estimate is least squares with a Gaussian prior.
 
-`speed`: v_x of an accelerating sine. The oracle gets the wheel speeds without noise: W = (1 + ρ) v.
+`speed`: v_x in sine steering with acceleration. Wheel speeds have no noise here: W = (1 + ρ) v.
 
     a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)      over stretches of STRETCH_S
@@ -14,8 +14,9 @@ estimate is least squares with a Gaussian prior.
     unknown    ρ error of the radius, c ln of cornering stiffness, κ shares of gravity that roll and
                pitch add, τ lag of roll, b offsets
 
-`friction`: μ under .6 g, at the end of the drive. The oracle gets the mean of four wheels, and
-knows the force of every tyre, and the speed except for offset and gravity leak of a_x.
+`friction`: μ at the end of a drive with .6 g. The oracle gets the mean speed of the four wheels and
+the force of every tyre. It knows the vehicle's speed except for the errors that offset and gravity
+in a_x cause.
 
     R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))
     s          true slip

@@ -2,8 +2,7 @@
 slope, for every estimator.
 
 Towns (friction, hills), cars, sensors and clocks are drawn randomly by the seed; half of the cars
-have no torque signal. All figures are means over samples, so each minute has the same weight in any
-town.
+have no torque signal. Results for towns are means over the samples of all towns together.
 
 Legend
     surface       class of the mean friction of the four wheels: ice up to .2, snow up to .45, wet
@@ -249,9 +248,8 @@ def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
 
 @dataclass
 class RealWorldResults:
-    """Results of the evaluation (named numbers) by estimator and name, and one drive to plot. One
-    of the "estimators" is "baseline": the wheels' mean speed as v_x, and the prior's interval as
-    friction.
+    """Results of the evaluation by estimator and name, and one drive to plot. The entry "baseline"
+    is for comparison: v_x is the wheels' mean speed, and the friction interval is the prior's.
     """
 
     found: dict[str, dict[str, float]]

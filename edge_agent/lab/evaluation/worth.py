@@ -7,7 +7,7 @@ Legend of the filter variants (for all scores, less is better)
     sets_off     no fuzzy sets: a product of ramps decides the share of evidence, and R is not
                  adapted to the innovations; strain (deviation of states from their prior) and the
                  consistency test as in the default
-    none         without any rule, strain and consistency test (`ckf`)
+    none         no rules, no strain, no consistency test (`ckf`)
     default      all rules with untuned vertices
     random       all rules with the vertices found by random search, mean over the searches
     colony       all rules with the vertices found by the ant colony, mean over the searches; same
@@ -121,9 +121,9 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the parameter tables of the default filter for the variant without fuzzy sets. Like
-    the default, this variant still adapts the measurement noise R to strain (deviation of states
-    from their prior) and runs the consistency test.
+    """Return the parameter tables of the default filter for the variant without fuzzy sets. This
+    variant keeps two parts of the default: it adapts the measurement noise R to strain (deviation
+    of states from their prior), and runs the consistency test.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants

@@ -163,7 +163,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
 def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
     """Advance the stability control (ESC) in the vehicle's state `x` by `dt` [s], from the inputs
     `u` and the parameters `p`. Return two values: the index of the wheel that ESC brakes (-1 for
-    none), and the brake torque divided by weight times wheel radius.
+    none), and the brake torque divided by (vehicle's weight * wheel radius).
     """
     vx = x[Motion.VX]
     r = x[Motion.YAW_RATE]

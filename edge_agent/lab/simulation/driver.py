@@ -328,10 +328,9 @@ def wished_acceleration(
 def wished_force(
     p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
-    """Return the longitudinal force [N] that a driver demands from a vehicle with the parameters
-    `p` to reach an `acceleration` [m/s^2] at the speed `vx` [m/s]. `d` is the driver's state.
-    `along` [m/s^2] is the acceleration by gravity along the road. The force is limited by tyres and
-    engine.
+    """Return the longitudinal force [N] that a driver demands to reach an `acceleration` [m/s^2] at
+    the speed `vx` [m/s], limited by tyres and engine. `p` are the vehicle's parameters, and `d` is
+    the driver's state. `along` [m/s^2] is the acceleration by gravity along the road.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(

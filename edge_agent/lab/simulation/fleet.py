@@ -67,11 +67,18 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 class Truth:
     """True values of a block of T samples, shapes (T, N) or (T, N, 4).
 
-    x, y, yaw: pose [m, m, rad]; vx, vy: velocity [m/s]; mu_wheel: friction; utilisation: |F|/(μ
-    F_z); yaw_rate [rad/s]; ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise
-    of the road per metre ahead; theta: normalised slip of each wheel (a wheel slides beyond about
-    2.6); abs, tcs, esc: True while the controller acts, in vehicles with winter equipment;
-    air_temperature: outside temperature [degrees Celsius].
+    Attributes:
+        x, y, yaw: pose [m, m, rad].
+        vx, vy: velocity [m/s].
+        mu_wheel: friction at each wheel.
+        utilisation: |F|/(μ F_z) of each wheel.
+        yaw_rate: [rad/s].
+        ax, ay: acceleration that an accelerometer measures [m/s^2].
+        slope: rise of the road per metre ahead.
+        theta: normalised slip of each wheel; beyond about 2.6 the wheel slides.
+        abs, tcs, esc: True while this controller acts. Always False without winter equipment,
+            because only winter equipment includes these controllers.
+        air_temperature: outside temperature [degrees Celsius].
     """
 
     x: FloatArray
@@ -107,8 +114,8 @@ def run(
     `states` are the states of the vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4) and
     wheels (N, 8, 4); `parameters` are those of the vehicles. `ground` is the lanes, the friction
     table and the relief table. `keys` are the random keys of routes and of traffic (N,). `samples`
-    is the number of the first sample, and how many samples to simulate. `timing` is the sample
-    period [s], and the integration steps per sample.
+    is the index of the first sample, and the count of samples. `timing` is the sample period [s],
+    and the integration steps per sample.
     """
     vehicles, drivers, routes, wheels = states
     lanes, friction, relief = ground
@@ -148,18 +155,18 @@ def run(
 
 
 class SimulatedFleet:
-    """N vehicles on the roads of a scenario. A vehicle's drive depends only on scenario, seed, rate
-    and the vehicle's number.
+    """N vehicles on the roads of a scenario. A vehicle's drive depends only on its index and the
+    other arguments, not on how many vehicles there are.
 
     Args:
         scenario: a key of SCENARIOS, or a Scenario.
-        vehicles: number of vehicles; the drive of vehicle k does not depend on it.
+        vehicles: number of vehicles.
         seed: seed of all random numbers, non-negative.
         rate_hz: sampling rate [Hz].
         rough: share of the vehicles with realistic errors: ROUGH_FLEET sensors instead of
             ORDINARY ones, and drivers who stop now and then.
         winter: share of the vehicles with `winter_equipped` tyres and controllers. If half of all
-            vehicles are rough (inaccurate), so are half of the winter vehicles.
+            vehicles are rough, half of those with winter equipment are rough too.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -294,8 +301,7 @@ class SimulatedFleet:
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for rough (inaccurate) vehicles: the share `share` of all,
-    evenly distributed over the vehicle numbers. The value for vehicle k does not depend on the
-    number of vehicles.
+    evenly distributed over the indices. The value for vehicle k does not depend on N.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
@@ -304,8 +310,8 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
 def winter_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for vehicles with winter equipment.
 
-    Pairs of successive vehicles have the same equipment. Therefore, if every second vehicle is
-    rough (inaccurate), half of the winter vehicles are rough.
+    Vehicles 0 and 1 have the same equipment, and so on in pairs. Therefore, if every second vehicle
+    is rough (inaccurate), so is every second one with winter equipment.
     """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 

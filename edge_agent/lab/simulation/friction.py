@@ -91,8 +91,8 @@ def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
 @compiled
 def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
     """Return the value of `column`, MU (true friction) or LOOKS (friction that a driver expects),
-    at (x, y) [m] and t [s]. The value comes from the last patch in the table that covers the point
-    at this time and has a number in this column.
+    at (x, y) [m] and t [s]. The value comes from the last row of the table that covers the point at
+    this time and is not NaN in this column.
     """
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]

@@ -290,7 +290,7 @@ def standing(_now: Moment) -> tuple[float, float]:
 
 def stop_and_go(now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) for stop-and-go traffic: drive straight
-    for eight seconds, then brake with 2.5 m/s^2 and stand, six seconds in total, and repeat.
+    for eight seconds, brake with 2.5 m/s^2 and stand for the next six, and repeat.
     """
     go = now.t % 14.0 < 8.0
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5

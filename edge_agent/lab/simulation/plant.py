@@ -30,13 +30,13 @@ option of the vehicle, K grows with μ.
 
 A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
 that length), and controllers that work in cycles and report their activity (ABS_HZ:
-`controllers.py`). Without them slip control is smooth.
+`controllers.py`). Without controllers, slip is limited smoothly.
 
 Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
-slip is stiff. With the secant slope of the tyre in the denominator, the step of a wheel is stable
-at any speed. The tyre force is taken at the end of the step. Therefore the step includes the change
-of the ground's speed under the wheel; without that term a wheel would seem to have twice its
-inertia. Wheel order fl, fr, rl, rr; ISO 8855 signs.
+slip is stiff. The denominator of a wheel's step contains the secant slope of the tyre, so the step
+is stable at any speed. The step also contains the change of the ground's speed under the wheel;
+without it, a wheel would behave as if its inertia were twice as large. Wheel order fl, fr, rl, rr;
+ISO 8855 signs.
 """
 
 from __future__ import annotations

@@ -71,10 +71,10 @@ class Network:
     """Lanes in one table of points, with the columns of LanePoint (points, 8). Lane k has `size[k]`
     points from row `first[k]` on.
 
-    `ways[k]` (MOST_WAYS,) are the numbers of the lanes that continue from the end of lane k, -1 in
-    unused places; `spacing[k]` [m] is the distance between its points. The first `roads` lanes are
-    roads, the others connectors (lanes through junctions). `starts` (vehicles,) are the lanes at
-    whose beginnings vehicles start; None: the vehicles are distributed over the roads.
+    `ways[k]` (MOST_WAYS,) are the indices of the lanes that continue from the end of lane k, and -1
+    in unused elements; `spacing[k]` [m] is the distance between its points. The first `roads` lanes
+    are roads, the others connectors (lanes through junctions). `starts` (vehicles,) is the lane on
+    which each vehicle's drive begins; None: the vehicles are distributed over the roads.
     """
 
     points: FloatArray
@@ -227,7 +227,7 @@ def network_of(
     Args:
         lanes: equally spaced points of each lane, (n, 2) [m]; the first `roads` lanes are roads,
             the others connectors.
-        ways: for each lane, the numbers of the lanes that continue from its end; an empty list if
+        ways: for each lane, the indices of the lanes that continue from its end; an empty list if
             every drive ends on it.
         roads: number of lanes that are roads.
         allowed: limit of the speed profile v²/q [m] (squared speed over the acceleration that the

@@ -319,9 +319,8 @@ def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[flo
 def _lay_patch(
     name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
 ) -> Patch:
-    """Return a patch of road of `size` (length, width) [m] with friction `mu`. The patch lies at
-    point number `row` of the lane whose points are `points`, aligned with the lane and `left` [m]
-    to the left of the lane's centre line.
+    """Return a patch of road of `size` (length, width) [m] with friction `mu`. It lies at row `row`
+    of the lane's `points`, along the lane and `left` [m] to the left of its centre line.
     """
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])

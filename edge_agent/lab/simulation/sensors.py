@@ -252,9 +252,8 @@ def read_late(
 
 @compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
-    """Advance the slow errors `wander` (3,) of the position receiver to the next fix (determined
-    position). At the first fix, the errors are drawn at random. Their standard deviation is the
-    same at all fixes.
+    """Advance the slow errors `wander` (3,) of the position receiver to its next reading. For the
+    first reading they are drawn at random. Their standard deviation is the same for all readings.
     """
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):

@@ -13,7 +13,7 @@ vertex and chooses one position at each; its path is one vector of values.
     η       visibility: prior preference of a position  (V, K)   -
     A       positions that exist at the vertex          (V, K)   -
     ρ       evaporation per iteration                            -
-    α, θ₀   weights of pheromone and of visibility               -
+    α, θ₀   exponents of pheromone and of visibility             -
 
 Departures from the paper. The paper calls ρ = .284 the residual, but uses it as evaporation in
 (32). Here .284 is the part that remains, so ρ = .716 in (32), because the colony must learn within
@@ -40,7 +40,7 @@ HIGHEST = 1.0
 
 @dataclass(frozen=True)
 class Habits:
-    """Parameters of the ant colony: weights of pheromone (learned preference) and of visibility
+    """Parameters of the ant colony: exponents of pheromone (learned preference) and of visibility
     (prior preference), evaporation, and deposits.
 
     Raises:
@@ -103,9 +103,9 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
 
 
 def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
-    """Return the pheromone Δτ (V, K) that P paths (P, V) with weights (P,) deposit on V vertices
-    (variables) with K positions (values) each. Each path adds its weight at the position that it
-    selects at every vertex.
+    """Return the pheromone Δτ (V, K) that P paths (P, V) deposit on V vertices (variables) with K
+    positions (values) each. At every vertex, path p adds the amount weights[p] at the position that
+    it selects.
     """
     laid = np.zeros(reachable.shape)
     vertices = np.arange(reachable.shape[0])

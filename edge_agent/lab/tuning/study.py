@@ -211,8 +211,8 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. Only
-    vertices are tuned: the measurement noise R of this filter is given by the condition.
+    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. Other
+    parameters are not tuned, because the study's condition determines the measurement noise R.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 

@@ -60,9 +60,8 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships (fuzzy sets) found by each search of the kind `way`. GIVEN has
-        fuzzy sets that are given, not searched; if `way` is one of its names, return only these
-        sets.
+        """Return the memberships (fuzzy sets) found by each search of the kind `way`. If `way` is
+        the name of fuzzy sets in GIVEN, which are not searched, return only those.
         """
         if way in GIVEN:
             return [GIVEN[way]]
@@ -70,8 +69,8 @@ class Study:
 
     def best(self, way: str) -> Memberships:
         """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
-        by the objective on the drives of the search. GIVEN has fuzzy sets that are given, not
-        searched; if `way` is one of its names, return these sets.
+        by the objective on the drives of the search. If `way` is the name of fuzzy sets in GIVEN,
+        which are not searched, return those.
         """
         if way in GIVEN:
             return GIVEN[way]
@@ -183,9 +182,9 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores that the file of tuned memberships (fuzzy sets) states, for the search
-    drives and for the held-out drives. These scores are those of the best memberships found by the
-    kind of search `way`, averaged over all conditions of the measurement noise R.
+    """Return the scores of the best memberships (fuzzy sets) found by the kind of search `way`, on
+    the search drives and on the held-out drives. They are averaged over all conditions of the
+    measurement noise R. The file of tuned memberships contains them.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):

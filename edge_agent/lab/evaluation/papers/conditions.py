@@ -2,9 +2,9 @@
 manoeuvres that they drive.
 
 A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
-the paper. Only drives at constant speed have drag and rolling resistance, which the filter knows.
-Without drag and rolling resistance the tyres would have no longitudinal force there, and would give
-no information on friction.
+the paper. Only in drives at constant speed are drag and rolling resistance simulated, and the
+filter knows them. Without them the tyres would have no longitudinal force there, and so no
+information on friction.
 """
 
 from __future__ import annotations
