@@ -10,8 +10,8 @@ expected innovation variance over a window, and the rate of that mismatch. The s
 sub-filter i in the master's information follows from the size gamma_i of its predicted residuals,
 (30) to (33): beta_i = min(1, c/gamma_i) with a constant c, normalised.
 
-Friction is not a state of the filter. It is a constant set by hand (section 4.1), here to DRY (a
-dry road). The friction that the estimator reports is the prior distribution.
+The filter does not estimate friction: it assumes a constant (section 4.1), here DRY (a dry road).
+Therefore the friction that the estimator reports is the prior distribution.
 
 ELEMENTS lists each element of the paper and every departure with its reason.
 """

@@ -12,12 +12,12 @@ Tyre forces: Magic Formula (12), compensated by (33). Filter WCKF-B: states [v_x
 measurement [r, a_x, a_y] (35), (36). Both filters compute R from a weighted moving window (25), see
 `adaptation.windows`.
 
-Friction is not a state of the filters. It is a constant set by hand, here to DRY (a dry road). The
+The filters do not estimate friction: they assume a constant, here DRY (a dry road). Therefore the
 friction that the estimator reports is the prior distribution.
 
-`EstimatorBank.memory("mean")` returns the states of WCKF-A, and `memory("compensated")` the
-compensated forces, because the paper's figures compare A with B. ELEMENTS lists each element of the
-paper and every departure with its reason.
+For plots like the paper's figures, which compare both filters, `EstimatorBank.memory("mean")`
+returns the states of WCKF-A and `memory("compensated")` the compensated forces. ELEMENTS lists each
+element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations

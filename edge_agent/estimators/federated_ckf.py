@@ -9,12 +9,11 @@ Like the motion filter it has two sub-filters, with measurements [a_x, a_y, r] a
 motion filter use the estimated friction (figure 3). The information shares of the sub-filters
 follow from (54).
 
-The printed Q = I and R = 10 000 (57) are a sensible tuning where slip stiffness is proportional to
-friction; `literal.federated_friction` contains the friction filter as printed. On a real tyre
-stiffness does not depend on friction. Therefore R here is sensor noise plus model error. The
-estimate returns to the prior with the distance driven, because the road may change: a friction that
-is not observed must become as uncertain as the prior. ELEMENTS lists each element of the paper and
-every departure with its reason.
+The printed Q = I and R = 10 000 (57) suit a tyre whose slip stiffness is proportional to friction;
+`literal.federated_friction` contains the friction filter as printed. The stiffness of a real tyre
+does not depend on friction, so here R is sensor noise plus model error. The estimate returns to the
+prior with the distance driven, because the road may change. ELEMENTS lists each element of the
+paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -126,8 +125,8 @@ def share_by_information(first: float, second: float) -> float:
     """Return the information share of sub-filter 1 [1]. `first` and `second` are the traces of the
     covariances of sub-filters 1 and 2.
 
-    The sub-filter with the smaller trace gets the larger share. This is equation (54) of paper 000
-    with its ratio inverted.
+    The sub-filter with the smaller trace gets the larger share. Equation (54) of paper 000 as
+    printed does the opposite, so its ratio is inverted here.
     """
     return min(max(second / (first + second), LEAST_BETA), 1.0 - LEAST_BETA)
 

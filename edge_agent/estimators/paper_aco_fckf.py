@@ -1,4 +1,4 @@
-"""Estimator `paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004 as printed, with errata
+"""Estimator `paper-aco-fckf`: the fuzzy cubature Kalman filter of paper 004, with its errata
 corrected. Numbers in brackets are the paper's equations.
 
 Xiong, Liu, Zhang, Zhu, Liu, "An accurate vehicle and road condition estimation algorithm for

@@ -42,7 +42,7 @@ def check_arrays(
 
 def in_shares(work: Callable[[int, int, int], None], count: int, threads: int) -> None:
     """Call work(share, first, last) concurrently for `threads` ranges [first, last) of vehicles.
-    `share` is the number of the range. Together the ranges cover 0 to `count`.
+    `share` is the index of the range. Together the ranges cover 0 to `count`.
 
     Raises:
         InputError: threads is below 1.

@@ -318,9 +318,9 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
     """Return smoothed times (n,) [s] of a periodic signal whose time stamps come in bursts, and the
     standard deviation of the stamps' error [s].
 
-    Plotted over the number of the reading, the time stamps scatter around a straight line. A
-    running mean over SMOOTH readings to either side follows slow variations. Times that are not
-    periodic (off by more than a period), or that are already even, are returned unchanged.
+    As a function of the reading's index, the time stamps scatter around a straight line. A running
+    mean over SMOOTH readings to either side follows slow variations. Times that are not periodic
+    (off by more than a period), or that are already even, are returned unchanged.
     """
     if len(t) < FEWEST:
         return t, 0.0

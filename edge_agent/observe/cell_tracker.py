@@ -73,11 +73,13 @@ class ReceiverSample:
 class Located(NamedTuple):
     """Cells visited by N vehicles at T samples; each array has the shape (T, N).
 
-    closes: True where the previous visit (passage of a cell) has ended: at the first sample in a
-    new cell or sector, or in no cell. inside, outside: True where a position fix of this sample
-    lies inside or outside the visited cell. cell, sector: number of the cell (quadint, zoom 21) and
-    heading sector, -1 when in no cell. latitude, longitude [deg], yaw [rad]: as last received, NaN
-    when too old.
+    Attributes:
+        closes: True at the first sample after the end of a visit (passage of a cell). At this
+            sample the vehicle is in a new cell or sector, or in no cell.
+        inside, outside: True where a position fix of this sample lies inside or outside the visited
+            cell.
+        cell, sector: cell (quadint, zoom 21) and heading sector, -1 when in no cell.
+        latitude, longitude, yaw: as last received [deg], [deg], [rad]; NaN when too old.
     """
 
     closes: BoolArray

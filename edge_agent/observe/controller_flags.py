@@ -1,17 +1,17 @@
 """Filter for implausible flags of controllers (ABS, ESC, traction control), such as a lamp that is
 always on or a wrongly decoded bit. Such a flag counts as unknown.
 
-A flag is implausible
+A flag is implausible in three cases:
 
-- until it was read as off for OFF_S in this trip: a flag that is never off carries no information;
-- while the vehicle has stood for STANDING_S with the flag on: no controller acts on wheels that do
-  not turn;
-- while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S
-  of them.
+- It is on, and has not yet been off for OFF_S in this trip. A flag that is never off carries no
+  information.
+- It has been on for STANDING_S while the vehicle stood. No controller acts on wheels that do not
+  turn. This case ends when the flag has been off for OFF_S.
+- In about the last MEMORY_S it was on for at least LEAST_ACTIVE_S, and for more than the share
+  MOST_ACTIVE of the time. This case ends when the share falls again.
 
-The second condition ends when the flag was off for OFF_S. The third ends when the share of active
-time falls again. The module is pure (no I/O). A `FlagRecord` per vehicle and flag is kept between
-blocks, so that any division of the samples into blocks gives the same result.
+The module is pure (no I/O). A `FlagRecord` per vehicle and flag is kept between blocks, so that any
+division of the samples into blocks gives the same result.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (
 
 
 class Doubt(IntEnum):
-    """Reason why a controller flag is implausible. The numbers of several reasons are added."""
+    """Reason why a controller flag is implausible, as a bit value. Several reasons are added."""
 
     NEVER_OFF = 1
     STANDING = 2

@@ -122,8 +122,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class OpenVisits:
-    """Open visits (passages of a map cell) of all vehicles as records (N,), and the number of the
-    time slot (reporting interval) of each vehicle's last published state (N,).
+    """Open visits (passages of a map cell) of all vehicles as records (N,), and `slot` (N,), the
+    index of the time slot (reporting interval) of each vehicle's last sample.
     """
 
     visits: RecordArray
@@ -184,10 +184,10 @@ def build_records(
 class SampleNotes(NamedTuple):
     """Additional data per sample for the visits (passages of a map cell).
 
-    `row` (T, N): index of a row of `told` at a sample where friction changed within a visit, else
-    -1. `told` (k, 32): evidence (log-likelihood of friction) from the part of the visit before that
-    change. `context` (T, N, len(CONTEXT)): flags of controllers, air temperature and wiper; empty
-    if unknown. `position_std`: standard deviation of the position [m].
+    `row` (T, N): at a sample where friction changed within a visit, the index of a row of `told`;
+    -1 at all other samples. `told` (k, 32): evidence (log-likelihood of friction) from the part of
+    the visit before that change. `context` (T, N, len(CONTEXT)): flags of controllers, air
+    temperature and wiper; empty if unknown. `position_std`: standard deviation of the position [m].
     """
 
     row: IntArray
@@ -477,9 +477,9 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states (position, motion and friction) to publish: for each vehicle and time slot
-    (reporting interval), the first sample with a known position. The function stores the number of
-    each vehicle's last slot in `after.slot`.
+    """Return the states (position, motion and friction) to publish: for each vehicle, the first
+    sample of each time slot (reporting interval), if its position is known. The function stores the
+    index of each vehicle's last slot in `after.slot`.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

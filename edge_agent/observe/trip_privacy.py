@@ -1,12 +1,11 @@
 """Privacy of trip ends: records (observations and states of motion) from near the beginning and the
 end of a trip are not published.
 
-A parking place identifies the vehicle's owner. Therefore a record is published only under two
-conditions. The beginning of the trip must be at least `metres` and `seconds` before the record, and
-the vehicle's present position at least as far after it. Until then the record waits. Records that
-still wait at the end of the trip are never published. A trip lasts as long as the pipeline object
-(one run of the agent). If both limits are zero, every record is published immediately. The module
-is pure (no I/O).
+A parking place identifies the vehicle's owner. Therefore a record is published only if it lies at
+least `metres` and `seconds` after the beginning of the trip. The record then waits until the
+vehicle has driven on for `metres` and `seconds`. Records that still wait at the end of the trip are
+never published. A trip lasts as long as the pipeline object (one run of the agent). If both limits
+are zero, every record is published immediately. The module is pure (no I/O).
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ UNNUMBERED: Final = 0  # placeholder until the outbox stores and numbers the bat
 @dataclass(frozen=True)
 class Draft:
     """Batch of records that has no sequence number yet. `encode(seq, first_held)` returns its
-    payload with the sequence number `seq`, and with `first_held`, the oldest number still in the
-    outbox.
+    payload with its sequence number `seq`, and with `first_held`, the lowest number of its stream
+    that is still in the outbox.
     """
 
     vehicle: str

@@ -1,6 +1,6 @@
 """In-memory index of the batches in an outbox (store on disk), without their payloads. A batch is
-found by its key (row number in the file), by its stream (vehicle, start, kind, region), or in order
-of age. The module is pure (no I/O).
+found by its key (row number in the file), by its stream (vehicle, agent run, kind, region), or in
+order of age. The module is pure (no I/O).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ LEAST_OLDEST: Final = 1000  # number of keys before the list is searched for rem
 
 class Stream(NamedTuple):
     """Identity of a stream of batches, whose sequence numbers count from 1. A stream has all
-    batches of one vehicle, one start of the agent (`boot`), one kind of record and one region (z10
-    quadint).
+    batches of one vehicle, one run of the agent (`boot`, a random number), one kind of record and
+    one region (quadint, zoom 10).
     """
 
     vehicle: str
@@ -48,8 +48,8 @@ class HeldBatch:
 
 @dataclass
 class _Sequence:
-    """Sequence numbers of one stream (vehicle, start, kind, region): the next free number, and the
-    key of each of its batches in the outbox (store on disk) by sequence number.
+    """Sequence numbers of one stream (vehicle, agent run, kind, region): the next free number, and
+    the key of each of its batches in the outbox (store on disk) by sequence number.
     """
 
     stream: Stream
@@ -125,7 +125,7 @@ class HeldBatches:
 
     def remove_all(self) -> None:
         """Remove all batches (messages not yet answered) from the index. The streams (vehicle,
-        kind, region) of the present start of the agent keep their next sequence numbers.
+        kind, region) of the present run of the agent keep their next sequence numbers.
         """
         own = {
             stream: sequence
@@ -140,14 +140,14 @@ class HeldBatches:
         self.bytes = 0
 
     def has_stream(self, stream: Stream) -> bool:
-        """Return True if the index knows the stream (vehicle, start, kind, region). That is the
-        case if the stream had batches since this start of the agent, or if batches of an earlier
-        start are still in the outbox (store on disk).
+        """Return True if the index knows the stream (vehicle, agent run, kind, region): it had
+        batches in this run of the agent, or batches of an earlier run are still in the outbox
+        (store on disk).
         """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
-        """Return two sequence numbers of a stream (vehicle, start, kind, region): the next free
+        """Return two sequence numbers of a stream (vehicle, agent run, kind, region): the next free
         number, and the lowest number of a batch in the outbox (store on disk).
         """
         known = self._streams.get(stream) or _Sequence(stream)
@@ -155,7 +155,7 @@ class HeldBatches:
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
         """Return the keys of the batches in the outbox (store on disk) that belong to a stream
-        (vehicle, start, kind, region) and whose sequence numbers lie in one of the inclusive
+        (vehicle, agent run, kind, region) and whose sequence numbers lie in one of the inclusive
         `ranges`.
         """
         sequence = self._streams.get(stream)
@@ -178,8 +178,9 @@ class HeldBatches:
 
     def is_passed_over(self, batch: HeldBatch) -> bool:
         """Return True if the service seems to ignore this batch. That is the case if the batch is
-        the oldest one of its stream (vehicle, start, kind, region) in the outbox, and PASSED_OVER
-        later batches of the stream were settled (acknowledged or refused by the service).
+        the oldest one of its stream (vehicle, agent run, kind, region) in the outbox, and
+        PASSED_OVER later batches of the stream were settled (acknowledged or refused by the
+        service).
         """
         sequence = self._streams[batch.stream]
         later = sequence.next - batch.seq - len(sequence.held)

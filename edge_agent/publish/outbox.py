@@ -4,8 +4,8 @@ report is lost or counted twice.
 A batch is committed here before it is sent. It is removed only after the service has settled it
 (stored or refused it for good). A batch is identified by its stream (vehicle, boot, kind, region)
 and its sequence number `seq`, which counts from 1 without gaps in each stream. `boot` is a random
-number per start. Therefore a restarted agent opens new streams and never reuses an identifier.
-Batches of an earlier start are sent again under their old identifier.
+number per run of the agent. Therefore a restarted agent opens new streams and never reuses an
+identifier. Batches of an earlier run are sent again under their old identifier.
 
 The size is limited: when the payloads exceed the capacity, the oldest states (regular reports of
 motion) are dropped first, then the oldest observations, and both are counted. SQLite runs in WAL
@@ -102,7 +102,7 @@ class Outbox:
 
     def _load_batches(self) -> None:
         """Load the batches (messages with records) that the outbox's file contains from an earlier
-        start; all are due at once.
+        run; all are due at once.
         """
         for key, (vehicle, boot, kind, region, seq, records), size in self._file.list_batches():
             stream = Stream(vehicle, boot, Kind(kind), region)
@@ -162,7 +162,7 @@ class Outbox:
         self, draft: Draft, ahead: dict[Stream, int]
     ) -> tuple[int, Stream, int, Draft, bytes]:
         """Insert a batch without number (`draft`) into the file. Return its key (row number), its
-        stream (vehicle, start, kind, region), its sequence number, the draft and the payload.
+        stream (vehicle, agent run, kind, region), its sequence number, the draft and the payload.
 
         `ahead` maps each stream to its next sequence number within the present transaction; it is
         updated.

@@ -119,9 +119,9 @@ class Pacer:
             self._stale = self.flying
 
     def record_timeout(self, now: float, jitter: float) -> None:
-        """Record that a batch in flight (sent, not answered) was not answered in time. Halve the
-        window (limit of batches in flight), or enter the silent state, in which only single batches
-        are sent as probes.
+        """Record that a batch in flight (sent, not answered) was not answered in time. After
+        SILENT_S without an answer, enter the silent state, in which only single batches are sent as
+        probes. Before that, halve the window (limit of batches in flight).
         """
         self.flying -= 1
         if self.silent:

@@ -98,7 +98,7 @@ class PublisherStatus:
     def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of records of one kind, or of all kinds, that no service has settled
         (acknowledged or refused). They are in the outbox (store on disk), where some may come from
-        an earlier start of the agent, or they are not stored yet.
+        an earlier run of the agent, or they are not stored yet.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

@@ -110,9 +110,9 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def expire_batches(self, now: float) -> Iterator[int]:
-        """Queue the batches that were not answered before `now` [s], so that they are sent again.
-        If the service seems to ignore a batch (see `HeldBatches.is_passed_over`), yield its key
-        instead. The caller must then remove this batch before it continues.
+        """Queue the batches that were not answered before `now` [s], so that they are sent again. A
+        batch that the service seems to ignore (`HeldBatches.is_passed_over`) is not queued. Its key
+        is yielded, and the caller must remove it before it continues.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)

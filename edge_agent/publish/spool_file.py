@@ -88,8 +88,8 @@ class SpoolFile:
 
     def list_batches(self) -> Iterator[tuple[int, tuple[str, int, str, int, int, int], int]]:
         """Yield each batch as (key, identifier, size of the payload [bytes]), oldest first. The
-        identifier has the columns NAME (vehicle, start, kind, region, sequence number, number of
-        records).
+        identifier has the columns NAME (vehicle, agent run, kind, region, sequence number, number
+        of records).
         """
         rows = self._database.execute(f"SELECT id, {NAME}, LENGTH(payload) FROM batch ORDER BY id")
         for key, *name, size in rows:

@@ -135,11 +135,10 @@ def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
 
 @compiled
 def _grip_used(track: InputTrack, row: FloatArray) -> float:
-    """Return the largest grip (force over load) [1] that any wheel uses at this sample.
+    """Return the grip in use at this sample, sqrt(x^2 + y^2) [1], of the wheel that uses most.
 
-    It is the root of the sum of two squares. The first is that of the longitudinal force over load,
-    which is torque over radius and load, for the wheel with the largest value. The second is that
-    of the lateral acceleration in g.
+    x is the longitudinal force over load, torque/(radius*load), of this wheel. y is the lateral
+    acceleration in g.
     """
     use = track.inputs
     loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])

@@ -62,9 +62,9 @@ def write_states(output: FloatArray, mean: FloatArray, root: FloatArray, yaw_rat
 def write_quality(
     output: FloatArray, utilised: float, nis: float, adaptation: float, log_likelihood: float
 ) -> None:
-    """Write four quality figures of a sample to `output`: grip in use `utilised`, normalised
-    squared innovation `nis` (of measurement minus prediction), `adaptation` (largest factor on the
-    measurement noise R), and log-likelihood of the measurements.
+    """Write four quality figures of a sample to `output`: `utilised` (grip in use), `nis`
+    (normalised squared difference of measurement and prediction), `adaptation` (largest factor on
+    the measurement noise R), and the log-likelihood of the measurements.
     """
     output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
     output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood

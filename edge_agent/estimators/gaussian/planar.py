@@ -58,8 +58,8 @@ class HeunInputs(NamedTuple):
 
 
 class PlanarStep(NamedTuple):
-    """Length `dt` [s] of a step of the process model, and the source of the longitudinal tyre
-    forces. `by_torque`: the wheels' torques; `by_motor`: one motor per axle; neither: the slip.
+    """Length `dt` [s] of a step of the process model, and source of the longitudinal tyre forces:
+    the wheels' torques (`by_torque`), one motor per axle (`by_motor`), or else the slip.
     """
 
     dt: float
@@ -88,12 +88,14 @@ def propagate_points(
     cubature point, and is changed in place.
 
     Inputs change linearly from the previous sample to the current sample. `step` selects the source
-    of the longitudinal forces. With `by_torque`, longitudinal forces come from the wheels' torque,
-    the last state z is the yaw acceleration, and friction (4,) is given. The velocity is then
-    integrated from the states a_x and a_y alone; the measurements correct these states for drag and
-    slopes. Without `by_torque`, forces come from slip and z is the friction of all wheels. With
-    `by_motor`, longitudinal forces come from the torque of each axle's motor, half to each wheel; z
-    is still friction.
+    of the longitudinal forces:
+
+    - `by_torque`: the wheels' torques. The last state z is the yaw acceleration, and friction (4,)
+      is given. The velocity is integrated from the states a_x and a_y alone; the measurements
+      correct these states for drag and slopes.
+    - `by_motor`: the torque of each axle's motor, half to each wheel; z is the friction of all
+      wheels.
+    - neither: the slip; z is the friction of all wheels.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):

@@ -151,11 +151,11 @@ def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _square_root_step(
     model: _Model, k: int, mean: FloatArray, covariance: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
-    """Run one step of the friction filter in square-root form. This form does not use `covariance`
-    and returns it unchanged.
+    """Run one step of the friction filter in square-root form. Return (mean, covariance, root,
+    False).
 
-    Return (mean, covariance, root, False). The last item is True if a Cholesky factor was missing,
-    which never happens in this form.
+    This form does not use `covariance` and returns it unchanged. False states that no Cholesky
+    factor was missing; this form needs none.
     """
     axes, sizes = _root_of(np.concatenate([root, model.process_root], axis=1))
     points = model.sigma_points(mean, axes * sizes)

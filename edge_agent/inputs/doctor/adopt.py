@@ -137,8 +137,8 @@ def align_devices(t: FloatArray, signals: FloatArray, delays: Mapping[str, float
 
 def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: bool) -> FloatArray:
     """Return the readings (T,) of one channel moved earlier by `seconds`, interpolated between the
-    times t (T,) [s]. Missing readings stay missing. If `angle` is True, the nearest reading is used
-    instead of an interpolated one.
+    times t (T,) [s]. Missing readings stay missing. If `angle` is True, the nearest reading is
+    used, because averages of angles near ±π would be wrong.
     """
     at = t + seconds
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)

@@ -53,9 +53,9 @@ def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the delay [s] of each device (wheel speeds, steering, inertial unit). It follows from
     the lags in `diagnosis`, which were measured in the turns of a drive.
 
-    If wheels and steering are both ahead of the yaw rate by about the same time, the delay is
-    attributed to the inertial unit. In that case, if the unit's accelerometer is not late compared
-    with the wheels, the delay is attributed to the gyroscope alone.
+    If wheels and steering differ from the yaw rate by about the same time, the delay is attributed
+    to the inertial unit. It is attributed to the gyroscope alone if the unit's accelerometer is not
+    late compared with the wheels.
     """
     wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):

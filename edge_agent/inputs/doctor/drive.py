@@ -230,8 +230,8 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
     """Return a mask (n,) that is True where all wheels spin or lock together. There the ratio of
     the wheels' speed `v` (n,) to the speed over ground `v_ground` (n,) differs from its usual value
-    in this drive, so that the unit of `v` does not matter. `fast` is a high speed of the car in
-    this drive, in the unit of `v`.
+    in this drive. Only this difference counts, so the unit of `v` does not matter. `fast` is a high
+    speed of the car in this drive, in the unit of `v`.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:

@@ -183,12 +183,12 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Add a finding (fault) to the diagnosis for each wheel speed whose upper bits are status bits.
-    When such a bit is set, the reading jumps away from the other three wheels, and later jumps
-    back.
+    """Add a finding (fault) to the diagnosis for each wheel speed that seems to contain status
+    bits, and set its wrong readings to NaN.
 
-    A wheel that spins or locks also differs from the others, but gradually and by any amount. A
-    status bit changes completely from one reading to the next, and adds the same amount each time.
+    A status bit makes the reading jump away from the other three wheels and later back, each time
+    by the same amount. A wheel that spins or locks also differs from the others, but gradually and
+    by any amount.
     """
     wheels = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(wheels).all(axis=1)
@@ -276,9 +276,11 @@ def _holds_throughout(
     quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None
 ) -> bool:
     """Return True if the fault of `quantity` in `verdict`, the result of the search for faults,
-    explains the signals in most parts of the drive. In such a part, the gain of an identity (ratio
-    of two quantities that are equal by physics) must have the value that the fault predicts. In a
-    slide the gain is not constant, so that a slide is not reported as a fault.
+    explains the signals in most parts of the drive.
+
+    In such a part, the gain of an identity (ratio of two quantities that are equal by physics) has
+    the value that the fault predicts. In a slide the gain varies, so a slide is not reported as a
+    fault.
     """
     fault = verdict.faults[quantity]
     if (

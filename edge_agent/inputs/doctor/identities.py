@@ -83,11 +83,11 @@ class Relation(NamedTuple):
     """Terms of an identity (two sides that are equal by physics): left = gain · right + offset + Σ
     k · term. Each side and each further term is an array (n,).
 
-    If `per` is given, the offset is multiplied by it and therefore not constant. If `bend` (n,) is
-    given, the left side also contains an unknown share of right · bend (understeer). This share has
-    a prior distribution, because at a single speed understeer cannot be separated from a gain of
-    the steering. `loose` are prior standard deviations of the gains k of the last terms, because
-    these gains are also hard to separate from the main gain.
+    `per` (n,), if given, is the factor of the offset. `bend` (n,), if given, adds the term gain ·
+    share · right · bend (understeer). The share is unknown; it has a prior distribution, because at
+    a single speed understeer cannot be separated from a gain of the steering. `loose` are prior
+    standard deviations of the gains k of the last terms, which are also hard to separate from the
+    main gain.
     """
 
     left: FloatArray
@@ -257,13 +257,12 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Return (share of `bend`, the understeer term, in the right side x; standard deviation of the
-    ln gain that follows from the uncertainty of this share). y is the left side, and `constant` the
-    term of the offset, (n,) each.
+    """Fit the understeer share s in y = gain · x · (1 + s · bend) + offset, where x and y are the
+    right and left side of an identity, (n,) each. Return s, and the standard deviation of ln gain
+    that follows from the uncertainty of s. `constant` (n,) is the term of the offset.
 
-    The share is the posterior mean over the candidate values BENDS. The cost of a candidate is -2
-    times its log posterior. It consists of the residual of the left side over `count` independent
-    moments and the squared deviation of the candidate from the share on usual cars.
+    s is the posterior mean over the candidate values BENDS. The prior is the share on usual cars,
+    and the likelihood follows from the residual over `count` independent moments.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))

@@ -78,8 +78,8 @@ def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float
 
 
 def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axle whose left and right wheels are exchanged, as a list with (name, indices of
-    its two wheels). An axle is found only if the wheels of the other axle are not exchanged.
+    """Return a list with the axle whose left and right wheels are exchanged, as (name, indices of
+    its two wheels); an empty list if no such axle is found.
 
     If the sides are exchanged on both axles, the axles agree with each other, and this test finds
     nothing. The comparison of the wheels' yaw rate with the gyroscope then shows the fault.

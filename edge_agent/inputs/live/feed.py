@@ -1,12 +1,12 @@
 """Base of a live source: a thread that listens, reopens a lost connection, and stores the received
 messages.
 
-Times are those of the host (this computer): seconds since the start of its clock, which is
-monotonic. If the time stamps of a source are at most BELIEVED_S old on arrival, the clocks of
-source and host are assumed to agree, and the stamps are used unchanged. For any other source, the
-difference between the two clocks is estimated. The message with the smallest delay within the last
-WHILE_S to 2 WHILE_S is assumed to have arrived without delay (minimum of the delays, as in
-Cristian, Distrib. Comput. 3 (1989)).
+Times are seconds on the monotonic clock of the host (this computer). If the time stamps of a source
+are at most BELIEVED_S old on arrival, its clock is assumed to agree with the host's, and the stamps
+are used unchanged. For any other source, the difference between its clock and the host's is
+estimated: of the messages in the present and the previous period of WHILE_S, the one with the
+smallest delay is assumed to have arrived without delay (minimum of the delays, as in Cristian,
+Distrib. Comput. 3 (1989)).
 """
 
 from __future__ import annotations

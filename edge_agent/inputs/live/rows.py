@@ -3,11 +3,11 @@ second at a time. The profile (assignment of signals to channels) and the mergin
 the importer of recordings.
 
 A row is built DELAY_S after its time, so that readings before and after it have arrived. If an
-active source is delayed because its host is busy, the row waits for up to PATIENCE_S. Readings that
-arrive later are treated as missing, and counted. The host's clock determines the rows: while all
-sources are silent the rows are empty, and the estimator's uncertainty grows. A position that
-arrives after its row was sent is moved along its own course to the first row that has not been
-sent.
+active source is late, for example on a busy computer, the row waits for up to PATIENCE_S longer.
+Readings that arrive later are treated as missing, and counted. Rows follow the clock of this
+computer: while all sources are silent the rows are empty, and the estimator's uncertainty grows. A
+position that arrives after its row was sent is moved along its own course to the first row that has
+not been sent.
 """
 
 from __future__ import annotations

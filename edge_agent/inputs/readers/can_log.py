@@ -3,8 +3,8 @@ to series.
 
 A frame's time is that of its arrival. It is counted from the log's first frame in whole
 microseconds, so that a drive has the same times in every format. Buses are numbered as python-can
-does. If several buses carry a message, the frames of the bus named in the profile are used;
-otherwise those of the bus with the most frames of the wanted messages.
+does. If several buses carry a message, the frames of the bus named in the profile are used; if it
+names none, those of the bus with the most frames of the wanted messages.
 """
 
 from __future__ import annotations

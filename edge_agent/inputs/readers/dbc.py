@@ -3,9 +3,9 @@ time.
 
 Only `BO_` and `SG_` lines are read. Therefore names with blanks, duplicate messages and unknown
 attributes, on which strict parsers fail, cause no error. Multiplexed signals are decoded only in
-frames whose multiplexer value selects them. Bit numbers are those of a DBC. A little-endian signal
-counts up from the start bit. A big-endian signal starts at its most significant bit and counts down
-within a byte, then continues in the next byte.
+frames whose multiplexer value selects them. A little-endian signal counts up from the start bit. A
+big-endian signal starts at its most significant bit and counts down within a byte, then continues
+in the next byte.
 """
 
 from __future__ import annotations

@@ -342,7 +342,7 @@ def wheel_speed_jump(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int
 ) -> float:
     """Return the absolute difference [m/s] between the car's speed according to one wheel and the
-    smoothed value of this speed; 0 where unknown.
+    smoothed value of this speed; 0 where unknown. The noise of sudden slip is computed from it.
 
     Before the comparison, the smoothed value is advanced by the car's acceleration. If a wheel
     spins up or locks, the difference lasts for several blocks (of 0.05 s). At a bump in the road it

@@ -92,7 +92,7 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def _put_moments(memory: MixtureMemory, node: int) -> None:
-    """Set mean and covariance of the node (filter of one friction hypothesis) with number `node` to
+    """Set mean and covariance of the node (filter of one friction hypothesis) with index `node` to
     those of the whole mixture.
     """
     group = node // LANES
@@ -143,16 +143,16 @@ def apply_road_change(
 @compiled
 def carried_degree(memory: MixtureMemory, constants: Constants, demand: float) -> float:
     """Return the fuzzy degree, 0 to 1, to which the tyres carry as much force as the slippery road
-    allows.
+    of a slide allows.
 
-    A wheel that grips again after a slide proves that the road has changed only if it carries such
-    a force. If the driver has released the brake or the accelerator, the wheel grips on the
-    slippery road too.
+    After a slide, a wheel grips again either because the road has changed, or because the driver
+    has released the brake or the accelerator. If the tyres still carry such a force, the road has
+    changed.
 
     Args:
-        memory: state of the filter; its friction is that of the road before.
-        constants: contain `carried_share`, the share of the slippery road's friction up to which
-            the degree is 0; it is 1 from twice this share.
+        memory: state of the filter; its friction is still that of the slippery road.
+        constants: contain `carried_share`, the share of that friction up to which the degree is 0;
+            it is 1 from twice this share.
         demand: larger force over load of the two axles [1].
     """
     slippery = min(memory.friction_left.median, memory.friction_right.median)
@@ -222,7 +222,7 @@ def reset_diverged(
     memory: MixtureMemory, scratch: Scratch, weight: FloatArray, constants: Constants
 ) -> None:
     """Reset diverged nodes (filters of one friction hypothesis): each gets the state of the most
-    probable node, and a weight of almost zero. A node has diverged if its velocity after the
+    probable node, and a probability of almost zero. A node has diverged if its velocity after the
     measurements, scratch.updated, is far from that of the most probable node.
     """
     best = int(np.argmax(weight))

@@ -18,9 +18,10 @@ reaches the threshold `odd_least`, the filter draws no conclusions. The friction
 vehicle states then return to their prior, and the axles do not affect the motion. The test leaves
 out slides, slippery road and walking pace (`unexplained_ratio`).
 
-While the filter draws no conclusions, the model cannot be tested. After `patience` [s] the filter
-uses the model again. Each further contradiction makes that time four times as long, because sensors
-do not repair themselves. A motion reset by the wheel speeds counts as half a contradiction.
+While the filter draws no conclusions, the model cannot be tested. Therefore the filter uses the
+model again after `patience` [s]. Each further contradiction makes this time four times as long,
+because sensors do not repair themselves. A reset of the motion to the wheel speeds counts as half a
+contradiction.
 """
 
 from __future__ import annotations
@@ -169,9 +170,9 @@ def degrees_of_freedom(covariance: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def nominal_agreement(trust: Trust, constants: Constants) -> float:
-    """Return the degree, 0 to 1, to which the car agrees with its vehicle file. It decreases
-    linearly with the strain (deviation of the states from their prior). It is 1 without strain, and
-    0 if the strain has its usual value or more.
+    """Return the degree, 0 to 1, to which the car agrees with its vehicle file. It is 1 without
+    strain (deviation of the states from their prior), decreases linearly with the strain, and is 0
+    from the strain `strain_usual` on.
     """
     return max(1.0 - trust.strain / constants.strain_usual, 0.0)
 

@@ -172,8 +172,8 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
     never exceeds the amount charged before.
 
     Reason: tempered (weakened) evidence contains only a part of this cost, although the measurement
-    changed the states in full. Without the charge, a low friction would remain probable on drives
-    with little grip demand, with a stiffness or an offset three standard deviations from the prior.
+    changed the states in full. Without the charge, on drives with little grip demand, a low
+    friction would remain probable if combined with an improbable stiffness or sensor offset.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
@@ -182,10 +182,10 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
 @compiled
 def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the weight, 0 to 1, of the evidence from slip. At low speed the weight is small,
-    because slip is then a quotient of small numbers.
+    """Return the factor, 0 to 1, with which the evidence from slip counts. It is small at low
+    speed, because slip is then a quotient of small numbers.
 
-    The speed is `vx` [m/s], or that of the fastest wheel if this is larger. The weight is 0 up to
+    The speed is `vx` [m/s], or that of the fastest wheel if this is larger. The factor is 0 up to
     SLOWEST_M_S, 1 from twice that speed, and linear between them.
     """
     fastest = abs(vx)

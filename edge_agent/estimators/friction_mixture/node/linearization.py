@@ -237,11 +237,11 @@ def slip_noise_correction(slope: float) -> float:
     """Return the amount by which the noise variance of a residual must be reduced where the tyre
     curve has the slope `slope`. It is given as a share of the slip noise variance.
 
-    A residual is the distance normal to the curve. On a line of slope k, the share k^2/(1 + k^2) of
-    the slip noise enters it (errors in variables). features.noise_std contains one half, the share
-    at slope 1; the result is one half minus the actual share.
+    A residual is the distance normal to the curve. At slope k, the share k^2/(1 + k^2) of the slip
+    noise enters it (errors in variables). features.noise_std contains one half, the share at slope
+    1, so the result is one half minus the actual share.
 
-    Without the correction, the noise would be too large on the flat part of the curve, where hardly
-    any slip noise enters. This would favour nodes (friction hypotheses) by which the wheels slide.
+    Without the correction, the noise would be too large on the flat part of the curve. This would
+    favour nodes (friction hypotheses) by which the wheels slide.
     """
     return 0.5 - slope * slope * inverse_of(1.0 + slope * slope)

@@ -328,7 +328,7 @@ def take_rows(
 
 @inlined
 def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
-    """Condition the measurements after number r on measurement r, whose innovation variance is
+    """Condition the measurements after measurement r on measurement r, whose innovation variance is
     1/per: update their innovations, their covariances with each other, and their covariances with
     the states.
     """

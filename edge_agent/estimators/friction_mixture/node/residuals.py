@@ -61,8 +61,8 @@ FLATTEST = 0.03
 
 @inlined
 def is_measured(features: BlockFeatures, r: int) -> bool:
-    """Return True if the readings that residual number r needs are known. Residuals 0 to 3 belong
-    to the wheels, 4 and 5 to the axles.
+    """Return True if the readings that residual r needs are known. Residuals 0 to 3 belong to the
+    wheels, 4 and 5 to the axles.
     """
     reading = features.rolling[r] if r < 4 else features.side[r - 4]
     return not math.isnan(reading)

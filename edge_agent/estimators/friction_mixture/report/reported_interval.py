@@ -9,7 +9,7 @@ of the node probabilities from the prior (Kullback and Leibler 1951). It decreas
 car behaves as its vehicle file predicts (`trust.nominal_agreement`).
 
 P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
-to that of the prior.
+to its prior value.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ class Constants(NamedTuple):
 
     Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
     (separable CMA-ES) on drives of two simulators. It minimised the interval score and the missed
-    and false reports of ice. It had four conditions. Delayed steering signals still count as a
-    contradiction of the model. Tilted sensors count as strain (deviation from the prior). Split
+    and false reports of ice under four conditions: delayed steering signals still count as a
+    contradiction of the model, tilted sensors count as strain (deviation from the prior), split
     roads are covered, and logs of real cars pass. Values with which less ice was found on long
     drives in towns were not adopted. For a study, `Constants(name=value)` replaces one value.
     """

@@ -34,10 +34,9 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RoadChange(NamedTuple):
-    """Probabilities that the friction changes within a step. `hazard` is the probability of a
-    change from any node (friction hypothesis) to any friction. `leaving` is an additional
-    probability of such a change for nodes without neighbours. `drift` is approximately the
-    probability of a change to a neighbouring node.
+    """Probabilities that the friction changes within a step. `hazard`: a change from any node
+    (friction hypothesis) to any friction. `leaving`: additional probability of such a change, for
+    nodes without neighbours. `drift`: approximate probability of a change to a neighbouring node.
     """
 
     hazard: float
@@ -56,9 +55,9 @@ def change_road(
     """Compute the probabilities `out` (K,) of K nodes (friction hypotheses) after a possible road
     change; before it they were `w`.
 
-    Only the first `chain` nodes have neighbours: they exchange probability with them
-    (`change.drift`). The other nodes lose the share `change.leaving`, which goes to all nodes. The
-    exchange keeps probabilities that equal the prior unchanged.
+    The first `chain` nodes exchange probability with their neighbours (`change.drift`). The
+    exchange does not change probabilities that equal the prior. The other nodes have no neighbours;
+    they lose the share `change.leaving`, which goes to all nodes.
     """
     hazard, leaving, drift = change
     count = w.shape[0]
