@@ -70,8 +70,9 @@ class QueryEngine:
                 self.connection.raw_sql("SET enable_progress_bar = true")
 
     def files(self, table: str) -> list[Path]:
-        """Return the archive files of a table that may contain rows of the selected part. A
-        snapshot of the map is included if its day, or the day after it, is selected.
+        """Return the archive files of a table that may contain rows of the selected part. Files of
+        map snapshots are also returned for the day before, because values are compared with earlier
+        snapshots.
         """
         before = 1 if table == "map" else 0
         first = self.part.since // layout.DAY_NS - before
@@ -136,9 +137,9 @@ class QueryEngine:
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of the given files with one additional column, whose name is the argument
-        `seconds`. It contains the time column `moment` in whole seconds since 1970. Queries use
-        this column instead of `moment`, because DuckDB and Spark convert times differently.
+        """Return a table of the given files with one more column: the time column `moment`, in
+        whole seconds since 1970. The argument `seconds` is the name of this column. Queries use it
+        instead of `moment`, because DuckDB and Spark convert times differently.
         """
         texts = [str(path) for path in paths]
         if self._spark is None:
@@ -165,8 +166,7 @@ def has_value(t: Table) -> Any:  # noqa: ANN401 a boolean column of Ibis
     lower bound. A row has a value if the vehicle used at least the share EXCITED_SHARE of the
     friction mu that it reports (the rule is in `schemas/README.md`).
 
-    Rows with NaN are excluded explicitly, because both engines treat NaN as larger than any number,
-    so that a comparison alone would accept it.
+    Rows with NaN are excluded explicitly, because both engines treat NaN as larger than any number.
     """
     share = ibis.literal(EXCITED_SHARE - _NEARLY, "float64")
     enough = t.mu_utilised.cast("float64") >= share * t.mu.cast("float64")

@@ -17,8 +17,8 @@ class Options:
         least_vehicles: minimum number of vehicles that must have measured a slippery stretch, a
             slippery period, or a road link, for it to be listed or judged.
         step_s: time between the frames of an animated replay [s]; None for one map.
-        lateness_s: setting of the service whose map is replayed: how late a report may arrive and
-            still be used in order of time [s].
+        lateness_s: setting of the service whose map is replayed: maximum delay of reports that are
+            used in order of time [s].
         roads: table made by `fleet-service roads`.
         level: minimum friction that a maintenance contract requires.
         within_s: time within which this friction must be restored [s].

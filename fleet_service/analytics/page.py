@@ -20,7 +20,7 @@ Value = float | None
 
 @dataclass(frozen=True)
 class Scale:
-    """Colour scale of the map: which values the colours stand for.
+    """Colour scale of the map.
 
     Attributes:
         label: label of the scale, with its unit.
@@ -51,7 +51,7 @@ class DrawnCells:
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
-        part: row number of each square; None if every row has one square.
+        part: for each square, the index of its row; None if every row has one square.
         sector: heading sector of each row: 0 east, 1 north, 2 west, 3 south.
         panels: for each panel (map), its name and one value per row; None means 'not measured'.
         names, rows: labels of the texts that are shown for each row, and these texts.

@@ -302,8 +302,8 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
 
 
 def _first_two(figure: Figure, table: pa.Table) -> None:
-    """Plot the first two numeric columns of an answer against each other; used for questions that
-    plug-ins (installed extensions) add, which have no plot of their own.
+    """Plot the first two numeric columns of an answer against each other. This is for questions
+    that plug-ins (installed extensions) add, because they have no plot of their own.
     """
     numbers = [
         f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)

@@ -6,10 +6,9 @@ this machine or on Spark. The archive is processed zone by zone (a zone is a map
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  statistics, one file per
                                                                      compacted file, all days
 
-Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
-cells. A zone therefore needs only its own rows and those of a margin around it, and gives the same
-result as a replay of the whole archive. Both engines run the same function for each zone and write
-the same bytes.
+Once the trust in each vehicle is known, a cell does not depend on distant cells. A zone therefore
+needs only its own rows and those of a margin around it, and gives the same result as a replay of
+the whole archive. Both engines run the same function for each zone and write the same bytes.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """Task of a rebuild: archive, output folder, time of the map [ns], and how late a report may
-    arrive and still be used in order of time [s].
+    """Task of a rebuild: archive, output folder, time of the map [ns], and maximum delay of reports
+    that are used in order of time [s].
     """
 
     root: Path

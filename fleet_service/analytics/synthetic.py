@@ -181,8 +181,9 @@ def _draw_positions(
 
 
 def night_factor(seconds: FloatArray) -> FloatArray:
-    """Return the degree of night cold at each time `seconds` (n,), from 0 to 1: 1 at four in the
-    morning, falling to 0 at ten in the evening and at ten in the morning, and 0 by day.
+    """Return the degree of night cold at each time `seconds` (n,), from 0 to 1. It rises from 0 at
+    ten in the evening to 1 at four in the morning, falls to 0 at ten in the morning, and is 0 by
+    day.
     """
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 

@@ -3,9 +3,9 @@ makes the service lose or refuse data.
 
 A wall clock may jump: a time server corrects it, a machine wakes up, or a person sets it. The
 service therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS
-only if the reports of most current vehicles agree with the wall clock. Until then, a report whose
-time agrees with only one of the two clocks is not refused. It is not acknowledged either, so its
-sender keeps it and sends it again.
+only if the reports of most current vehicles agree with the wall clock. Until then, a report that
+agrees with the wall clock or with the service's time is not refused. If it is later than the
+service's time, it is not acknowledged either, so its sender keeps it and sends it again.
 """
 
 from __future__ import annotations
@@ -31,13 +31,12 @@ class TimeNow(NamedTuple):
 
     Attributes:
         now: time of the service.
-        slack: how much later than `now` the time of a report may be, because the archive already
-            contains reports with such times.
-        doubt: how much later than `now` + `slack` the time of a report may be without rejection.
-            Such a report is ignored for now; its sender repeats it.
+        slack: accepted reports may be this much later than `now`; above 0 if the archive contained
+            later reports at the start.
+        doubt: reports that are later than `now` + `slack`, by at most this much, are ignored but
+            not rejected; their senders repeat them.
         least: lower bound of the true time.
-        sure: True if active alerts may end only because time has passed; False while the clock may
-            be wrong.
+        sure: True if the passing of time alone may end alerts; False while the clock may be wrong.
     """
 
     now: int
@@ -51,8 +50,7 @@ class SteadyClock:
     """Clock of the service [ns UTC], which follows no jumps of the wall clock.
 
     Args:
-        seen: latest time in a report that the archive contained at this start of the service; 0 if
-            there was none.
+        seen: latest time of the reports in the archive when the service started; 0 without reports.
         wall, steady: functions that return the system's clocks [ns]; `steady` never jumps, and its
             zero is arbitrary.
     """

@@ -10,9 +10,9 @@ the service.)
 
 Checkpoints, snapshots of the map, retention (removal of old rows) and compaction (merging of files)
 run in the same thread, so none of them sees an incomplete erasure. Other processes wait for the
-compaction lock. Messages wait for as long as a start from a checkpoint takes. If the service dies
-during the erasure, its next start finds the request, and no checkpoint contains the vehicle. Later
-measurements of the vehicle are accepted as new.
+compaction lock. During step 3, messages wait as long as a start from a checkpoint takes. If the
+service dies during the erasure, its next start finds the request, and no checkpoint contains the
+vehicle. Later measurements of the vehicle are accepted as new.
 """
 
 from __future__ import annotations

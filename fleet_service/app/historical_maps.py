@@ -50,9 +50,9 @@ class PastQuery(NamedTuple):
     Attributes:
         query: parameters of the query.
         at: the moment [ns].
-        lateness_s: time by which a report may be late and still be used in order of time [s].
+        lateness_s: maximum delay of reports that are used in order of time [s].
         only: the only selected tile; None for any.
-        public: smallest number of recent vehicles with which readers may see a cell.
+        public: minimum number of recent vehicles of a cell that readers may see.
     """
 
     query: MapQuery

@@ -170,10 +170,9 @@ class Service:
                 raise
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over the archive. The lease in the bucket, which
-        names the owner, shows this. While the bucket does not answer, `came` shows it: a function
-        that returns True if Zenoh liveliness tokens of another service for the same regions have
-        appeared.
+        """Return True if another service has taken over the archive. Normally the lease in the
+        bucket shows this. While the bucket does not answer, the function `came` shows it: it
+        returns True if liveliness tokens of another service for the same regions have appeared.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():

@@ -34,7 +34,7 @@ class Costs(NamedTuple):
             a vehicle and a cell that it visited lately.
         waiting_bytes: memory per observation in the lateness window, the last minutes in which late
             reports are still used in order of time.
-        window_bytes: memory per cell and sector with such observations, in addition.
+        window_bytes: additional memory per cell and sector with such observations.
         service_s: processor time of a service per observation [s].
         router_s: processor time of a router per message [s].
         wire_bytes: bytes of an observation on the network.
@@ -101,9 +101,9 @@ class PlannedFleet(NamedTuple):
 
 
 class DeploymentSize(NamedTuple):
-    """Size of a deployment. `services` is the number of services for which each uses at most 60 %
-    of a core. `memory_bytes` is the memory of all services together, and `parts_bytes` is its share
-    for each kind of content.
+    """Size of a deployment. `services` is the number of services that are needed so that each uses
+    at most 60 % of a core. `memory_bytes` is the memory of all services together, and `parts_bytes`
+    is its share for each kind of content.
     """
 
     observations_per_s: float
@@ -118,7 +118,7 @@ class DeploymentSize(NamedTuple):
 
 def estimate_size(fleet: PlannedFleet, costs: Costs = COSTS) -> DeploymentSize:
     """Return the size of a deployment for a fleet. The estimate assumes that no vehicle visits a
-    cell twice within hours, so the number of pairs is an upper limit.
+    cell twice within hours. Its number of pairs of vehicle and cell is therefore an upper limit.
     """
     rate = fleet.vehicles * fleet.rate_hz
     pairs = remembered_pairs(rate, costs.values)

@@ -103,7 +103,7 @@ class SharedState:
 
     Args:
         state: state loaded from the archive.
-        public_vehicles: smallest number of vehicles with which readers may see a cell.
+        public_vehicles: minimum number of vehicles of a cell that readers may see.
 
     Attributes:
         guard: lock that is held while the map is changed or read.

@@ -1,7 +1,7 @@
 """`fleet-service cits`: exchange hazard messages with cooperative ITS until a signal arrives.
 
-Alerts are sent as DENM (Decentralized Environmental Notification Messages) to an AMQP 1.0
-interchange. DENM from others count as reports of one vehicle. Messages are not signed here; the
+Alerts are sent as DENM (Decentralized Environmental Notification Messages) to an AMQP 1.0 server
+("interchange"). DENM from others count as reports of one vehicle. Messages are not signed here; the
 operator's own gateway must sign them.
 """
 

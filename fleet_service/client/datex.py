@@ -264,9 +264,10 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the id of the situation (hazard) in the previous publication that has a cell in common
-    with the stretch of road of `alert`; None if there is none. Cells are compared instead of names,
-    because a client gives the same stretch another name after a restart.
+    """Return the id of a situation (hazard) in the previous publication that has a cell in common
+    with the stretch of road of `alert`, has not ended, and is not in `written`; None if there is
+    none. Cells are compared instead of names, because a client gives a stretch another name after a
+    restart.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

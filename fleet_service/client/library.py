@@ -28,7 +28,7 @@ def ask_map(
         bbox: west, south, east, north [deg].
         route: points (longitude, latitude) [deg]; the result has the cells along the route in
             driving order.
-        min_vehicles: minimum number of vehicles of a cell.
+        min_vehicles: minimum number of vehicles that have visited a cell.
         at: moment of the map; without a zone it is UTC.
 
     Raises:

@@ -171,14 +171,14 @@ def served_table(answer: Answer) -> pa.Table:
 
 
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
-    """Return True if any service answers for the queried part of the map. This distinguishes an
-    empty map from a missing service.
+    """Return True if there is any sign of a service for the queried part of the map. This
+    distinguishes an empty map from a missing service.
 
-    There are three signs of a service. First, a service answers for the tile at the start of the
-    route or at a corner of the box (or at an arbitrary place). Second, if no place is queried, a
-    service replies to a query of the whole map. Third, a service's liveliness token is visible,
-    which not every reader may see. A router matches only services that answer for all of a key
-    expression, so one sign alone is not enough.
+    Any of three signs is sufficient. First, a service answers for one tile: at the start of the
+    route, at a corner of the box, or anywhere. Second, if no place is queried, a service replies to
+    a query of the whole map. Third, a service's liveliness token is visible. Each sign may be
+    absent: a router matches only services that answer for all of a key expression, and not every
+    reader may see tokens.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):

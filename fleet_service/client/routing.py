@@ -184,7 +184,7 @@ def _find_cost_runs(
     cost: FloatArray, latitude: FloatArray, longitude: FloatArray
 ) -> list[CostLine]:
     """Return the parts of a road in which the cost factor (`cost`, one per point) is the same and
-    above 1. A part that is too short is extended at both ends.
+    above 1. A part shorter than SHORTEST_M is extended at both ends.
     """
     ends = np.flatnonzero(np.r_[True, np.diff(cost) != 0.0, True])
     out = []

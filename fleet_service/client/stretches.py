@@ -297,7 +297,7 @@ def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
 
 def _walk_tree(tree: list[list[tuple[int, float]]], start: int) -> tuple[FloatArray, list[int]]:
     """Return, for each place in a spanning tree of cells, its distance from `start` along the tree
-    (-1 if it is not connected) and the previous place on the path.
+    (-1 if no path leads there) and the previous place on the path from `start`.
     """
     length = np.full(len(tree), -1.0)
     before = [start] * len(tree)

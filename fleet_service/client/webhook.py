@@ -1,10 +1,10 @@
 """Webhook for alerts of road stretches, in the format of Alertmanager's webhook receivers (version
 4).
 
-Every receiver of Alertmanager webhooks accepts this format: paging services, chat bridges, scripts.
-Delivery is at least once and in order. A message is removed from the queue only after a 2xx answer
-within TIMEOUT_S. Redirects are not followed, because a POST would become an empty GET. Messages
-that cannot be delivered are counted and reported.
+Paging services, chat bridges and scripts accept this format. Delivery is at least once and in
+order. A message is removed from the queue only after a 2xx answer within TIMEOUT_S. Redirects are
+not followed, because a POST would become an empty GET. Messages that cannot be delivered are
+counted and reported.
 """
 
 from __future__ import annotations

@@ -100,8 +100,8 @@ def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
 
     Zenoh counts messages per session and rule, and cannot distinguish a vehicle from a router. A
     session of another router carries the messages of many vehicles and must not be limited. Routers
-    reach each other over TLS only. Therefore QUIC is limited everywhere. TLS is limited where no
-    other router connects: on the interfaces named for vehicles, and if there is only one router.
+    reach each other over TLS only. Therefore QUIC is always limited. TLS is limited everywhere if
+    there is only one router, else only on the interfaces named for vehicles.
     """
     router = fleet.routers[name]
     caps = [_rate_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []

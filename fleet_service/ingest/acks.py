@@ -41,8 +41,7 @@ class Acks:
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
         """Record that batches (messages with records) arrived too late for the map to use them in
-        order of time. Their senders learn this from the acknowledgement which states that the
-        batches are durable.
+        order of time. Their senders learn this from the acknowledgement of the batches.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)

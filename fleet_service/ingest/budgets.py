@@ -64,9 +64,9 @@ class NewCells:
         self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
     def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
-        """Return a mask of the rows (n,) of reports: True if the row is beyond its vehicle's limit
-        on new cells. All given rows must be in cells that no vehicle has visited before. Rows
-        within the limit reduce the vehicle's remaining allowance. `now` is the time [s].
+        """Return a mask of rows (n,): True if the row is beyond its vehicle's limit on new cells at
+        the time `now` [s]. All given rows must be in new cells, that is, cells that no vehicle has
+        visited before. Each new cell within the limit reduces the vehicle's remaining allowance.
         """
         out = np.zeros(len(vehicle), bool)
         order = np.lexsort((cell, vehicle))

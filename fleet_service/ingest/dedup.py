@@ -61,8 +61,8 @@ class SequenceTracker:
 
     def accept(self, seq: int, time: int = 0) -> bool:
         """Record the sequence number of an accepted batch (message with records), and the newest
-        time of the batch's records [ns]. Return False and record nothing if too many sequence
-        numbers are missing before it.
+        time of the batch's records [ns]. Return False and record nothing if an earlier number is
+        missing and MAX_GAPS later ones are already recorded.
         """
         if seq == self.low + 1:
             self.low = seq

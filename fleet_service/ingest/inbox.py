@@ -261,11 +261,11 @@ class BatchIntake:
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
-        """Drop streams (batches of one vehicle, start and region) that are too old to matter, and
-        cached stream names of days from which hardly any data arrive now.
+        """Drop streams (batches of one vehicle, start and region) that are too old to matter. Also
+        drop cached stream names of days before yesterday, because hardly any such data arrive.
 
-        Active streams are kept in place. If they were allocated again, they would be scattered
-        between other objects, and the process would grow by some megabytes each time.
+        Active streams are not copied, because scattered copies would enlarge the process by some
+        megabytes each time.
         """
         self._forgot = clock.now
         self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
@@ -336,8 +336,8 @@ class BatchIntake:
     ) -> SequenceTracker | None:
         """Return the stream of a (vehicle, start, region, day): the record of its accepted batches
         (messages with records). Return None if the key for the vehicle's pseudonym cannot be read,
-        or if the vehicle opens too many streams. The vehicle then keeps its batch until the disk
-        works again, or until the next hour.
+        or if the vehicle opens too many streams. The vehicle then keeps its batch and sends it
+        again; it is accepted when the disk works again, or in the next hour.
         """
         vehicle, boot, region, _ = name
         try:

@@ -160,8 +160,8 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
 @compiled
 def _least_needed(anchors: IntArray) -> int:
     """Return the index of the path's anchor (time and place) that can be dropped with the least
-    loss, given the anchors' times (ANCHORS,) [ns]. It is the inner anchor with the smallest gap
-    between its neighbours, relative to its age.
+    loss, given the anchors' times (ANCHORS,) [ns]. It is the anchor with the shortest time between
+    its two neighbours, relative to its age. The first and the last anchor stay.
     """
     newest = anchors[-1]
     best = 1

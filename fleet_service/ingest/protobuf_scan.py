@@ -43,14 +43,14 @@ _COLUMN: Final = _TEXT + len(TEXTS)
 
 
 class ScannedFields(NamedTuple):
-    """Positions of the fields of k messages in their bytes.
+    """Fields of k messages: values, or positions in the bytes of all messages.
 
     Attributes:
         understood: mask (k,), True if the other attributes are valid for the message.
         numbers: values of the fields NUMBERS of each message, (k, 4).
         texts: begin and end of the fields TEXTS, (k, 2, 2).
         begins: begin of each column, (k, columns).
-        counts: number of elements of each column, (k, columns); bytes for the likelihood.
+        counts: number of elements of each column, (k, columns); for the likelihood, of bytes.
         sizes: number of records of each message, (k,).
     """
 

@@ -2,8 +2,8 @@
 
 A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage.
 Messages beyond the limit are dropped, counted and not acknowledged: the sender keeps them and sends
-them again. This is not a rejection. The vehicle's name is the last chunk of the key; routers with
-an access list guarantee that it is the sender's own name.
+them again. The vehicle's name is the last chunk of the key; routers with an access list guarantee
+that it is the sender's own name.
 """
 
 from __future__ import annotations
@@ -77,9 +77,9 @@ class RateLimiter:
         return len(self._buckets)
 
     def _forget(self, now: float) -> bool:
-        """Drop the token buckets (allowances) that are full, that is, those of vehicles that have
-        not sent recently, at most once per refill time. Return True if there is room for another
-        bucket.
+        """Drop the token buckets (allowances) that are full again, because their vehicles have not
+        sent recently. Do this at most once per refill time. Return True if there is room for
+        another bucket.
         """
         rate = self._rate
         burst = self._burst

@@ -7,7 +7,7 @@ Three checks are made in this order, cheap ones first:
     rows       is every value finite, in range, in its region and in time?         all rows at once
 
 One invalid row refuses its batch, with row number and reason, and the batch need not be sent again.
-Rules are tables; the reason that a sender reads is the text of the rule.
+The reason that a sender reads is the text of the broken rule.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Clock(NamedTuple):
         ahead: how much later than `now` the time of an accepted record may be.
         oldest: how much earlier than `now` (or `least`, if that is earlier) the time of an accepted
             record may be.
-        doubt: how much later than `now` + `ahead` the time of a record may be without refusal. Such
-            a record is neither accepted nor refused; its sender repeats it.
+        doubt: records that are later than `now` + `ahead`, by at most this much, are neither
+            accepted nor refused; their senders repeat them.
         least: lower bound of the true time; None if it is `now`.
     """
 

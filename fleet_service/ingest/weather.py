@@ -7,9 +7,9 @@ A file is written whenever reports arrive. `join_daily_files` joins the files of
 restart, or the computation of a past map, reads only one file per day. After a power loss a report
 may be stored twice; the copies are identical and change nothing.
 
-A report takes effect at a time (`acts_from`) from which no observation has been fused yet, and it
-is durable before that. Therefore a replay of the archive finds the same weather and gives the same
-map.
+A report takes effect from the time `acts_from`. No observation from this time on has been fused
+when the report arrives, and the report is durable before it takes effect. Therefore a replay of the
+archive finds the same weather and gives the same map.
 """
 
 from __future__ import annotations
@@ -201,8 +201,8 @@ def weather_files(root: Path) -> list[Path]:
 
 
 def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
-    """Join the weather reports of each day into one file; return by how many the number of files
-    was reduced.
+    """Join the weather reports of each day into one file; return the reduction in the number of
+    files.
 
     Raises:
         InputError: a file has a newer major version.

@@ -41,8 +41,8 @@ def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
 
 
 def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
-    """Return the values of a list column as a NumPy array. Numbers are a view of the same memory.
-    Arrow's own conversion is not used, because it would import another library.
+    """Return the values of a list column as a NumPy array. Numbers are not copied. Arrow's own
+    conversion is not used, because it would import another library.
     """
     # `combine_chunks` copies the chunks into one piece of memory.
     whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()

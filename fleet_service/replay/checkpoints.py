@@ -8,9 +8,8 @@ of new rows); a restart replays only later segments.
 
 A folder appears only when it is complete. Compiled code uses row numbers from a checkpoint without
 checks, so all digests are verified before use. If a service died several times shortly after
-starting from a checkpoint, the checkpoint is not used again. The archived rows remain the
-authority: a checkpoint that is missing, damaged or of another version only costs the time of a
-replay.
+starting from a checkpoint, the checkpoint is not used again. A checkpoint that is missing, damaged
+or of another version only costs the time of a replay.
 """
 
 from __future__ import annotations

@@ -127,14 +127,14 @@ def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntAr
 class Since(NamedTuple):
     """Selection of rows for a replay.
 
-    Once the vehicles' weights (trust in each vehicle) are known, a cell does not depend on distant
-    cells. Therefore cells inside a box get the same belief (probability of each friction value) as
-    in a complete replay, if the rows within MARGIN_DEG around the box are read too.
+    Once the trust in each vehicle is known, a cell does not depend on distant cells. Therefore
+    cells inside a box get the same belief (probability of each friction value) as in a complete
+    replay, if the rows within MARGIN_DEG around the box are read too.
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of the batches (messages with records) before the start. Their rows are left
-            out, because a compacted (sorted) file may also contain older batches.
+        known: record of the batches (messages with records) that are already included at the start.
+            Their rows are left out; a compacted (sorted) file may contain them too.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
         most: maximum number of rows; if there are more, an error is raised.
@@ -212,8 +212,8 @@ def past_fusion(
     """Return the fusion (beliefs about the friction of the cells) after everything that was
     received until the time `until` [ns], near a box (west, south, east, north [deg]).
 
-    `listener` is called with the fusion. It returns a context in which each group of observations
-    is fused, so that the listener can follow the fusion.
+    `listener` is called with the fusion, to follow it. It returns a function that gives the context
+    in which each group of observations is fused.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -250,8 +250,8 @@ def replay(
     damaged: Damaged = skip_damaged,
     heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time, with the vote weights (trust in vehicles)
-    that the service used at first. Yield once per epoch (minute) of the fusion.
+    """Replay the archive into `fusion` in order of time. It uses the trust in vehicles that the
+    service recorded when it first processed the rows. Yield once per epoch (minute) of the fusion.
 
     One day is read at a time, a large day in parts, so that memory does not grow with the archive.
 
@@ -292,8 +292,8 @@ def replay(
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:
-    """Return two arrays (n,) for archived rows: lateness (True if late) and vote weight (trust in
-    the vehicle), as the service recorded them when it first processed these rows.
+    """Return what the service recorded for archived rows (n,) when it first processed them: True
+    for a late row, the row's delay [ns], and the trust in its vehicle.
     """
     return RecordedResult(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
@@ -351,8 +351,9 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
     """Yield the rows of the archive files in `listing` in chunks of about CHUNK_ROWS, in order of
     time. A chunk ends between two epochs (minutes).
 
-    A file is read once, or once per part of a day with more than PART_ROWS. Vehicles are given as
-    numbers. If the number of rows is not limited, a part is read while the previous one is used.
+    A file is read once. If a day has more than PART_ROWS rows, its files are read once per part of
+    the day. Vehicles are given as numbers. If the number of rows is not limited, a part is read
+    while the previous one is used.
 
     Raises:
         InputError: there are more than `most` rows.

@@ -60,10 +60,10 @@ class FencedBucket:
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def raise_fence(self, term: Term, names: Iterable[str]) -> None:
-        """Write a fence (list of valid objects) for this `term` of ownership. The list contains
-        those of the archive's files `names` that have an older epoch (number in file names).
-        Objects that appear later are valid only if their names contain the epoch of this term or a
-        later one. Delete objects in the bucket that are not valid.
+        """Write the fence (list of valid objects) of this `term` of ownership, and delete all
+        invalid objects. The list contains those of the archive's files `names` whose epoch (number
+        in the file name) is older than that of the term. Objects that appear later are valid only
+        if their epoch is that of the term or a later one.
         """
         older = [name for name in names if (layout.term_of(name) or term.epoch) < term.epoch]
         fence = Fence(term.epoch, frozenset(older))

@@ -137,9 +137,9 @@ def acquire_archive(
         root: folder of the archive.
         stop: event that ends the wait.
         say: called with a line of text whenever the reason for waiting changes.
-        signs: three functions of a standby service: return True if a router is reachable, return
-            True if the service of a name is alive, and a function that is called at each check.
-            None if this service is no standby.
+        signs: three functions of a standby service; None if this service is no standby. The first
+            returns True if a router is reachable, the second if the service of a name is alive. The
+            third is called at each check of the lease.
 
     Raises:
         InputError: another service has the folder or the copy, or the copy cannot be used with
@@ -261,8 +261,8 @@ class _BusyError(Exception):
 
 
 def _wait_for_compaction(root: Path) -> BinaryIO:
-    """Lock the compacted (merged) files of the archive's folder. A compaction that the folder's
-    former service started may still be running, and may have read rows that are no longer valid.
+    """Lock the compacted (merged) files of the archive's folder. This fails while a compaction by
+    the folder's former service is running, because it may have read rows that are no longer valid.
 
     Raises:
         _BusyError: such a compaction is running; try again later.

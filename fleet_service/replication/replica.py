@@ -4,8 +4,8 @@ Files on which an acknowledgement depends are segments (files of new rows), keys
 identities. They are uploaded before the acknowledgement (`upload_segments`). All other files follow
 later (`sync`). Uploads come first and deletions last, so that the bucket contains every row at
 least once at any time. At start (`sync_without_lease`), files that only the bucket has are
-downloaded (all files, if the disk is empty), and files that only the folder has are uploaded. An
-object is deleted only if the upload journal (list of own uploads) contains it.
+downloaded , and files that only the folder has are uploaded. An object is deleted only if the
+upload journal (list of own uploads) contains it.
 """
 
 from __future__ import annotations
@@ -131,18 +131,19 @@ class BucketReplica:
         return max(largest_epoch(self._slow.list_sizes()), largest_epoch(self._files.list_files()))
 
     def prefetch(self) -> None:
-        """Download files in advance, for a standby (waiting service): those that a later
-        `sync_under_lease` will need. Another service still owns the bucket.
+        """Download files that a later `sync_under_lease` will need. A standby (waiting service)
+        calls this in advance, while another service still owns the bucket.
 
         Raises:
-            CopyError, OSError: the download is incomplete, because the owner's compaction may
-                remove files meanwhile.
+            CopyError, OSError: the download is incomplete, for example because the owner's
+                compaction has removed files meanwhile.
         """
         self._transfer.download_missing(self.bucket.list_valid())
 
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
-        """Remove the archive's files that differ from the valid objects `there` (names and sizes),
-        and the entries in the journal (list of uploaded files) of files that do not exist.
+        """Remove the archive's files that are not among the valid objects `there` (names and sizes)
+        or differ in size. Also remove the entries in the journal (list of uploaded files) of files
+        that do not exist.
         """
         for name, stamp in self._files.list_files().items():
             if there.get(name) != stamp.size:

@@ -5,7 +5,8 @@ time at the upload.
                         for each deleted file, [name]
 
 A line that is lost in a power failure is harmless: a file is uploaded once more, or a file that was
-deleted locally is downloaded and deleted again. No file is deleted because of a lost line.
+deleted locally is downloaded and deleted again. No file that is still needed is deleted because of
+a lost line.
 """
 
 from __future__ import annotations

@@ -122,9 +122,9 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return True if an alert may be raised under the limit for idle roads (roads that no third
-        vehicle has reported). On such a road an alert may not be raised if the vehicles that report
-        the ice have recently supported alerts in too many other places.
+        """Return True if the limit for idle roads (roads that no third vehicle has reported)
+        permits an alert. On other roads there is no limit. On an idle road, enough vehicles must
+        report the ice that have not recently supported alerts in too many other places.
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -135,13 +135,13 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots (one per cell and heading sector) in which an alert must be raised. A
-        "source" is a vehicle whose report supports the alert. Candidates are the updated slots (k,)
-        that have a source, and all slots on the same stretches of slippery road.
+        """Return the slots (one per cell and heading sector) that are candidates for a new alert. A
+        "source" is a vehicle whose report supports the alert. The updated `slots` (k,) that have a
+        source are checked, and all slots on the same stretches of slippery road.
 
-        Two conditions must hold. First, enough vehicles are sources, in the cell itself or on the
-        stretch. Second, the cell has a source of its own and is probably slippery by its own
-        reports, or it lies between two cells with sources.
+        Two conditions must hold. First, enough vehicles are sources, in the slot itself or on the
+        stretch. Second, the slot has a source of its own and is probably slippery by its own
+        reports, or it lies between two slots with sources.
         """
         fusion = self._fusion
         slots = slots[self._own_sources(slots, Side.ICE)[:, 0] > 0]
@@ -161,8 +161,8 @@ class Alerts:
 
     def _own_sources(self, slots: IntArray, side: Side) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
-        each slot (cell and heading sector), (k, SOURCES). Only reports within the hour before the
-        slot's last report count.
+        each slot (cell and heading sector), (k, SOURCES); 0 means no vehicle. Only reports within
+        the hour before the slot's last report count.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
 

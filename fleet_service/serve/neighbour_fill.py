@@ -29,14 +29,15 @@ KEPT: Final = 0.8
 def impute_cells(
     source: Readable, tile: int, known: IntArray, route: IntArray | None, now: int
 ) -> CellView:
-    """Return a view (copy of the state) of unvisited cells of a tile, with beliefs about their
-    friction estimated from visited neighbours. These are the cells next to the visited cells in
-    `known`, in the same heading sector; if a `route` is given, the cells along it.
+    """Return unvisited cells of a tile, with beliefs about their friction that are estimated from
+    visited neighbours. Without a `route`, these are the cells next to the visited slots `known`
+    (one per cell and heading sector), in the same sector. With a `route`, only cells along it are
+    returned.
 
     A belief is half the prior (belief before any measurement) and half the mean of the visited
-    neighbours; at greater distance, the share of the neighbours is smaller. `vehicles` is the
-    minimum over these neighbours, so that an estimated value is never more public than its sources.
-    `first` and `last` are the oldest and the newest time of the neighbours.
+    neighbours; the farther the neighbours along a route, the larger the share of the prior.
+    `vehicles` is the minimum over these neighbours, so that an estimated value is never more public
+    than its sources. `first` and `last` are the oldest and the newest time of the neighbours.
     """
     live = source.live
     slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
@@ -87,12 +88,12 @@ def impute_cells(
 def _route_gaps(
     source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return three arrays (k,) for the unvisited parts of a route in a tile: the keys (cell and
-    heading sector), the slots of the nearest visited keys before or behind each, and the share of
-    this visited neighbour in the estimate, [0, 1].
+    """Return three arrays (k,) about the unvisited cells of a route in a tile: the key of the cell
+    (cell and heading sector), the slot of the nearest visited cell before or behind it, and the
+    share of this visited cell in the estimate, [0, 1].
 
-    A key appears once for each side on which a visited key is within REACH. Directly adjacent keys
-    are excluded, because they are handled as neighbours.
+    A key appears once for each side with a visited cell at most REACH cells away. A visited cell
+    directly next to it is excluded, because `impute_cells` handles it as a neighbour.
     """
     slots = source.slots_of(route // grid.SECTORS, route % grid.SECTORS)
     slots = np.where(np.isin(slots, known), slots, -1)

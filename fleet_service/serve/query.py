@@ -121,9 +121,9 @@ def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     """Return the rows of the tile's cells, as a slice or a mask, that enough vehicles have visited
     and that touch the query's box.
 
-    Usually this is a complete tile, or a contiguous part of it. Each step that releases the
-    interpreter lock may wait ten times as long as the step takes, so cells are compared one by one
-    only if necessary.
+    Usually this is a complete tile, or a contiguous part of it. Cells are compared one by one only
+    if necessary, because each such step releases the interpreter lock, and may wait for it ten
+    times as long as the step takes.
     """
     columns = shown.columns
     run = slice(0, len(shown.cells))

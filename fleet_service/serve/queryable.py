@@ -96,8 +96,8 @@ class _QueuedQuery:
 
 @dataclass
 class _Answered:
-    """Result of one step in which a query is answered: `whole` is True if the answer is complete
-    after this step, and False if more replies follow in a later step.
+    """Result of one step of an answer to a query: `whole` is True if the answer is complete, and
+    False if more replies follow in a later step.
     """
 
     whole: bool = True

@@ -41,10 +41,10 @@ class ShownTile(NamedTuple):
         columns: the columns by which a query selects cells (SELECTED_BY), as arrays (k,).
         payload: all cells as an Arrow stream, from south to north, which shares memory with
             `cells`; empty if the cells have another order and are used for one query only.
-        least: smallest number of vehicles that visited any of the cells.
-        common: box (west, south, east, north) [deg]. If the box of a query touches it, this query's
-            box overlaps all cells in longitude. It is used only if the cells are ordered from south
-            to north.
+        least: number of vehicles of the cell that the fewest vehicles visited.
+        common: test in the form of a box (west, south, east, north) [deg]: a query's box that
+            touches it overlaps all cells in longitude. If the cells are not ordered from south to
+            north, no box touches it.
         made: time at which this tile was made [ns].
         change: number of the newest change of the map that this tile includes.
     """
@@ -64,7 +64,7 @@ class TileCache:
     Args:
         state: the map.
         guard: lock that is held while the map is read, but not while Arrow data are written.
-        least: minimum number of vehicles that must ever have visited a public cell.
+        least: minimum number of vehicles that have ever visited a public cell.
         public: public copy of the cells if persons are kept private; None to show everything.
     """
 

@@ -3,9 +3,9 @@ the service's main loop, so that acknowledgements never wait.
 
 A round publishes all tiles that changed since the last round. Rounds begin at fixed times,
 `every_s` apart. If the last round is not complete at such a time, the time is skipped and counted,
-and the changes go to the next round. A tile is therefore published once a second if there is enough
-time, and in turn otherwise. The offset of the fixed times is random and secret, so that the time of
-a publication does not reveal when a vehicle passed.
+and the changes go to the next round. A changed tile is therefore published in every round if there
+is enough time, and in a later round otherwise. The offset of the fixed times is random and secret,
+so that the time of a publication does not reveal when a vehicle passed.
 """
 
 from __future__ import annotations

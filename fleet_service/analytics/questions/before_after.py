@@ -27,10 +27,10 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return a table with one row, from which the difference and its standard deviation are
-    computed. Its columns are the numbers of cells, vehicles and values, and four sums. The sums are
-    those of the cells' weights, of their weighted means before and after the given time, and of the
-    vehicles' squared influences.
+    """Return a table with one row: the numbers of cells, vehicles and values, and four sums, from
+    which the difference and its standard deviation are computed. Three sums are over cells: the
+    weights, and the weighted means before and after the given time. The fourth is over vehicles:
+    their squared influences.
     """
     t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))

@@ -20,10 +20,10 @@ _HOUR_S: Final = 3600
 
 
 def expression(t: Table, maps: Table) -> Table:
-    """Return a table with two shares. `held` is the share of the values that lie inside the map's
-    interval. `compatible` is the share of the values whose own interval overlaps the map's
-    interval. The table has one row for each basis (measured, estimated from neighbouring cells, or
-    only a lower bound) and each number of hours between snapshot and value.
+    """Return a table with one row for each basis of the map's interval (measured, estimated from
+    neighbouring cells, or only a lower bound) and each number of hours between snapshot and value.
+    `held` is the share of the values that lie inside the map's interval. `compatible` is the share
+    of the values whose own interval overlaps it.
     """
     t = t.filter(has_value(t)).select(
         "cell",

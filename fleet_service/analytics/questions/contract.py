@@ -7,8 +7,8 @@ vehicle first, so that a car that passes ten times counts once. A slot is certai
 required level if the 90 % interval of its mean lies below the level. The level is certainly kept if
 this interval lies above the level. A breach begins with a slot below the level and ends with the
 next slot that is not below the level. `least_s` is the duration of the longest certain breach.
-`most_s` is the longest possible breach: from a slot that was certainly kept to the next such slot.
-Unmeasured time is unknown, and never counts as kept.
+`most_s` is the longest possible breach: from a slot in which the level was certainly kept to the
+next such slot. Unmeasured time is unknown, and never counts as kept.
 """
 
 from __future__ import annotations

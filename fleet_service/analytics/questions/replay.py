@@ -72,8 +72,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
-    """Return the time of the first frame [ns]: the begin of the selected part, or the last full
-    step before the first row (`first` [ns]) if that is later.
+    """Return the time of the first frame [ns]: the begin of the selected part, or the time of the
+    first row (`first` [ns]) rounded down to a multiple of `step` [ns], whichever is later.
 
     Raises:
         InputError: there would be too many frames.

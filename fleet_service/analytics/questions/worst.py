@@ -23,8 +23,8 @@ SHARE: Final = 0.1
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Return a table of those cells and heading sectors in which at least the share SHARE of the
-    values is slippery, if at least `least_vehicles` vehicles reported them.
+    """Return a table of the cells and heading sectors in which at least the share SHARE of the
+    values is slippery, and at least `least_vehicles` vehicles reported slippery values.
     """
     reported = has_value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
@@ -93,9 +93,9 @@ def join_stretches(cells: pa.Table) -> pa.Table:
 
 
 def wilson_lower(hits: FloatArray, of: FloatArray) -> FloatArray:
-    """Return the lower 95 % confidence bound (Wilson 1927) of a share. The share is `hits` / `of`,
-    (n,) each: `of` is the number of observations, and `hits` the number of them that count as hits,
-    for example slippery ones.
+    """Return the lower 95 % confidence bound (Wilson 1927) of the share `hits` / `of`, (n,) each.
+    `of` is a number of observations, and `hits` the number of those with some property, for example
+    slippery.
     """
     n = np.maximum(of, 1.0)
     p = hits / n

@@ -80,7 +80,7 @@ class _Joined(NamedTuple):
         distance: distance from the cell's centre to this mark [m].
         ambiguous: by how much another link fits worse than the best one, as additional distance
             [m]; NaN if there is no other link.
-        second: True if the cell also belongs to a link that fits better and adjoins this link.
+        second: True if this link is the second one of the cell: a link that adjoins it fits better.
     """
 
     cell: IntArray
@@ -229,7 +229,7 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
     """Return the numbers (n,) of the cells that may lie on a road link: all cells within REACH_M
-    metres of a mark (point on a link), and some further ones.
+    metres of a mark (point on a link), and some others.
     """
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))
@@ -239,9 +239,9 @@ def _nearby_cells(marks: _Marks, side: float) -> IntArray:
 
 
 def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
-    """Return, for each group of elements, the index of its first element in `order`. `order`
-    contains the indices of all elements, sorted by group. Two elements belong to the same group if
-    they have equal numbers in all arrays `groups`.
+    """Return, for each group of elements, the index of the element that comes first in `order`.
+    Elements belong to the same group if their numbers are equal in all arrays `groups`. `order`
+    contains the indices of all elements, sorted by group.
     """
     new = np.zeros(len(order), np.bool_)
     new[:1] = True

@@ -104,8 +104,7 @@ class Denm:
 def encode_denm(denm: Denm) -> bytes:
     """Return the bytes of a DENM (hazard message), encoded directly from the record.
 
-    The layout is that of `denm.asn`. This function exists because a general encoder takes three
-    times as long.
+    The layout is that of `denm.asn`. A general encoder would take three times as long.
 
     Raises:
         OverflowError: a number does not fit into the bits of its field.
@@ -223,9 +222,8 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
     """Return the offsets of points from `origin` in the encoding of a DENM (hazard message). Each
-    point has the offsets to the north and to the east, both encoded with the same number of bits,
-    and a height that is marked as unavailable. Points that are too far away for these bits are left
-    out.
+    number contains the offsets to the north and to the east, and a height marked as unavailable.
+    Points too far away for the encoding are left out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]

@@ -30,7 +30,7 @@ TERMINATED_NS: Final = VALID_NS
 
 @dataclass(frozen=True)
 class OpenEvent:
-    """Event (hazard) that has been sent to the interchange.
+    """Event (hazard) that has been sent to receivers.
 
     Attributes:
         name: id of the stretch of road.

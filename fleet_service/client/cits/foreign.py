@@ -82,9 +82,9 @@ def encode_reports(
 def _headings(denm: Denm) -> tuple[float, ...]:
     """Return the headings [deg from north] of the traffic that a DENM (hazard message) concerns.
 
-    If the DENM states no heading, both directions of the road are concerned. Then the nearest other
-    point of a trace or of the history gives the road's axis. If there is no such point, return all
-    four quarters.
+    If the DENM states no heading, return both directions of the road. The road's axis is the line
+    from the event to the first other point of a trace or of the history. If there is no such point,
+    return north, east, south and west.
     """
     if denm.heading is not None:
         return (denm.heading, denm.heading + 180.0) if denm.both_ways else (denm.heading,)

@@ -41,7 +41,7 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Settings for receiving DENM (hazard messages): address at the interchange, filter on the
+    """Settings for receiving DENM (hazard messages): address at the AMQP server, filter on the
     messages, and the vehicle name under which reports are made from received DENM.
     """
 

@@ -1,5 +1,5 @@
-"""Output of alerts as DENM (hazard messages) to an interchange. Each message is saved to a file
-before it is sent, and stays in the file until the interchange accepts it.
+"""Output of alerts as DENM (hazard messages) to an AMQP server ("interchange"). Each message is
+saved to a file before it is sent, and stays in the file until the server accepts it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CHECK_S: Final = 10.0  # [s] period of the checks for events whose validity must
 
 
 class DenmOutput:
-    """Output that sends the active alerts to an interchange and keeps them up to date there.
+    """Output that sends the active alerts to an AMQP server and keeps them up to date there.
 
     Args:
         station: identifier of the originating station.

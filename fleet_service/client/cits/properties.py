@@ -18,7 +18,7 @@ PROTOCOL: Final = "DENM:1.3.1"
 
 @dataclass(frozen=True)
 class Originator:
-    """Publisher of messages at an interchange.
+    """Publisher of messages at an interchange (AMQP server for hazard messages).
 
     Attributes:
         country: two letters, ISO 3166.
@@ -52,8 +52,7 @@ def message_properties(denm: Denm, originator: Originator) -> dict[str, Any]:
     """Return the properties by which subscribers select messages.
 
     The property `quadTree` contains the quadkeys of all points of the event, each between commas.
-    So `quadTree LIKE '%,120002%'` selects all events within a square. The digits are the same as in
-    this project's cells and regions.
+    So `quadTree LIKE '%,120002%'` selects all events within a square.
     """
     return {
         "messageType": "DENM",
