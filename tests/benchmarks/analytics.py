@@ -1,9 +1,9 @@
-"""`make analytics-bench`: archive and analytics with ten million synthetic observations, and all
-figures of this area in one file.
+"""`make analytics-bench`: benchmark of the archive and of analytic queries on ten million synthetic
+observations; `--rows` sets a smaller number.
 
-Writes `.analytics/figures.json` and prints the table; `--rows` sets a smaller number. Durations are
-wall times on two threads, medians of ROUNDS. The figure of the compaction (sorting of rows into
-files by cell) counts rows per CPU second.
+Writes `.analytics/figures.json` and prints the table. Durations are wall times on two threads,
+medians of ROUNDS. The figure of the compaction (sorting of rows into files by cell) counts rows per
+CPU second.
 """
 
 from __future__ import annotations
@@ -173,9 +173,9 @@ def write_small_archive(root: Path) -> dict[int, pa.Table]:
 
 
 def measure_agreement(root: Path, readings: Path) -> list[Figure]:
-    """Test with how many programs and in how many ways the archive can be read. Return three counts
-    as figures: files that a validator refuses, programs that cannot read the archive, and queries
-    to which the query engines DuckDB and Spark give different answers.
+    """Test that other programs can read the archive. Return three counts as figures: files that a
+    validator refuses, programs that cannot read the archive, and queries to which the query engines
+    DuckDB and Spark give different answers.
     """
     invalid = sum(bool(_find_refusals(path)) for path in _geo_files(root))
     expected = sum(table.num_rows for table in reading.read_tables(root, Kind.OBSERVATION, ["seq"]))

@@ -1,6 +1,6 @@
-"""`make batch-bench`: benchmark of work on many files at once. On Spark, drives are estimated and a
-map is rebuilt, and the results are compared with those of one process. Iceberg tables are compared
-with the archive's files. Writes `.batch/figures.json`.
+"""`make batch-bench`: benchmark of work on many files at once. Spark estimates the friction of
+recorded drives and rebuilds a map; the results are compared with those of one process. Iceberg
+tables are compared with the archive's files. Writes `.batch/figures.json`.
 """
 
 from __future__ import annotations

@@ -129,8 +129,8 @@ def corner_of_region(east: int) -> tuple[int, int]:
 def make_messages(
     count: int, records: int, now: int, vehicles: int = VEHICLES, begin: int = 0, east: int = 0
 ) -> list[Message]:
-    """Return `count` messages with `records` visits (passes through map cells) each, the last of
-    which end at `now` [ns], in one region or in a region `east` regions further east.
+    """Return `count` messages with `records` visits (passes through map cells) each. The last
+    visits end at `now` [ns]. All visits lie in one region, `east` regions east of the usual one.
 
     Vehicles and sequence numbers continue after the first `begin` messages, which an earlier call
     has returned. Each vehicle drives to and fro on a straight road, so that the service accepts its

@@ -175,9 +175,9 @@ class VectorLimit:
         )
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
-        """Rearrange `values` (..., N, numbers) of N vehicles to (..., N/lanes, numbers, lanes), so
-        that one SIMD vector contains the same number of `lanes` vehicles. The returned array is
-        aligned in memory to such vectors.
+        """Rearrange an array (..., N, K) of K values for each of N vehicles to (..., N/L, K, L),
+        where L is the number of lanes of a SIMD vector. Each vector then holds one of the K values
+        for L vehicles. Align the memory of the returned array to vectors.
         """
         *rest, vehicles, numbers = values.shape
         turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(
@@ -188,9 +188,9 @@ class VectorLimit:
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Run all filters over T successive readings, which are `gone` seconds apart and have the
-        layout of `side_by_side`. Return the mean of each filter's state after each reading, (T,
-        N/lanes, 6, lanes).
+        """Run all filters over T successive readings, which are `gone` seconds apart and arranged
+        by `side_by_side`. Return the mean of each filter's state after each reading, (T, N/L, 6,
+        L).
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

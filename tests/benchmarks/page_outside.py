@@ -93,12 +93,13 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Make STEPS DATEX II publications of simulated alerts, and check each with the function
-    `valid`. Return the number of invalid publications, and the number of situations whose end was
-    not published although their alert was over.
+    """Make STEPS DATEX II publications of simulated alerts that begin and end at random, and check
+    each with the function `valid`. Return the number of invalid publications, and the difference
+    between the numbers of open situations and of stretches with an active alert, summed over all
+    publications.
 
-    The alerts of cells on a road begin and end at random. Both counts are NaN if hardly any alert
-    ended; the first one is also NaN if `valid` is None, because the schema is not installed.
+    Both are NaN if fewer than LEAST_ENDED situations ended. The first is also NaN if `valid` is
+    None, because the schema is not installed.
     """
     rng = np.random.default_rng(SEED)
     stretches = Stretches()

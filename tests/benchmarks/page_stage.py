@@ -52,9 +52,9 @@ class Town:
         self.marker = next(iter(self.tiles))
 
     def local_marker(self, tile: int) -> int:
-        """Return the index of the marker cell within a map tile. The vehicle count of the marker
-        cell is the number of the publication. A test that reads the tile thereby knows which
-        publication it has received.
+        """Return the index of the marker cell within a map tile. The vehicle count of this cell is
+        the number of the publication, so a test that reads the tile knows which publication it
+        received.
         """
         return int(self.tiles[tile]["cell"][0]) & 0x3FFF
 

@@ -88,8 +88,8 @@ def make_limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> K
 
 
 def same_filter(drive: Drive) -> float:
-    """Check that the filter in C and the filter in Python give the same estimates. Return the speed
-    at the first sample [m/s].
+    """Check that the filters in C and in Python give the same estimates. Return the speed [m/s] at
+    the first sample, with which the filter in C starts.
 
     Raises:
         ArithmeticError: the estimates differ.

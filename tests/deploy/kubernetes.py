@@ -4,10 +4,11 @@ Kubernetes' schemas, and the commands of their pods are started.
     python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid,
                                              kube.commands_failed
 
-A pod is simulated by processes, one per container, with the command, environment and mounts of the
-manifest. Each mounted path lies in a folder of the pod, and pod names and ports are replaced by
-addresses of this machine. Nothing is applied to a cluster. Objects that only a cluster has (kinds
-of volumes, policies, load balancers) are only checked in the text.
+A pod is simulated on this machine by processes, one per container, with the command and the
+environment of the manifest. The container's mounts are folders in the pod's temporary folder, and
+pod names and ports are replaced by addresses of this machine. Nothing is applied to a cluster.
+Objects that only a cluster has (kinds of volumes, policies, load balancers) are only checked in the
+text.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the demo's figures and pictures, on small made-up drives and maps: each figure follows
-its definition, and the demo fails only if a promise is broken.
+"""Tests of the demo's figures and pictures, on small made-up drives and maps. Each figure must
+follow its definition, and the demo must fail only if a mandatory target is missed.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the shipped units, compose file and configurations: they are checked by their own tools,
-and their commands are started.
+"""Tests of the shipped systemd units, compose file and configurations. Tools of systemd and others
+check them, and their commands are started.
 
 The files' texts are used without change, except for folders and ports.
 """

@@ -1,5 +1,5 @@
-"""Tests of the demo's town with cars that receive the map: such a car does not publish the reports
-of others that it received, and its figures are correct.
+"""Tests of the demo's town with cars that receive the map: such a car must not publish the
+received map as its own measurement, and the figures about these cars must be correct.
 """
 
 from __future__ import annotations

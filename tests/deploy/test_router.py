@@ -1,5 +1,5 @@
-"""Tests that the router runs in a process of Python alone, and that the shipped configurations can
-be read and contain only settings that Zenoh knows.
+"""Tests that the router runs in Python without another program, and that the shipped configurations
+can be read and contain only settings that Zenoh knows.
 """
 
 from __future__ import annotations

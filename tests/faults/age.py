@@ -136,9 +136,9 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
 
 
 def _last_day(root: Path, to: Path, old: int) -> Path:
-    """Create an archive in the folder `to` from links to the files of the archive `root`, and
-    return `to`. The new archive contains the last day. If `old` is not 0, it also contains the
-    other days, moved back by `old` times MAP_DAYS so that they are expired.
+    """Create an archive in the folder `to` whose files are links to files of the archive `root`,
+    and return `to`. It has the last day of `root`. If `old` is not 0, it also has the other days,
+    moved into the past by `old` times MAP_DAYS, so that they are expired.
     """
     shutil.copytree(root / "keys", to / "keys") if (root / "keys").exists() else None
     days = sorted({folder.name for folder in root.glob("observations/date=*")})

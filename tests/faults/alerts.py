@@ -1,9 +1,9 @@
 """Campaign on a restarted router: a client that watches alerts through this router (the watcher)
 must receive every active alert soon after its session is back.
 
-The service is connected to the first router, the watcher to the second. The watcher's router is
+The service is connected to the first router, the watcher to the second. The second router is
 killed, alerts are raised, and the router is started again. The watcher must then receive these
-alerts, and nothing while its router is down.
+alerts, but none before.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def run(site: Site) -> list[Figure]:
     """Restart the watcher's router eight times, and raise twenty more alerts during each outage (in
     a quick run: one outage, ten alerts).
 
-    Return three figures (named numbers) over all outages. The first two are the number of active
-    alerts that the watcher did not receive within SOON_S after it was connected again, and the
-    number that it should have received. The third is the longest time [s] until it received one.
+    Return three figures over all outages: the number of active alerts that the watcher did not
+    receive within SOON_S after it was connected again, the number that it should have received, and
+    the longest time [s] from the new connection to a received alert.
     """
     each = site.choose_amount(20, 10)
     missing = 0
@@ -85,8 +85,9 @@ def run(site: Site) -> list[Figure]:
 
 
 def _make_second_router(there: Stage) -> Part:
-    """Return a second router, connected to the first and started. It keeps its port over restarts;
-    clients of the first router do not know this port.
+    """Start and return a second router, which is connected to the first and keeps its port over
+    restarts. Clients of the first router do not learn this port, so they cannot connect to the
+    second.
     """
     config = Path(there.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
@@ -113,7 +114,7 @@ def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:
     """Return batches of observations that report ice in `places` cells. Each cell is reported by as
-    many vehicles as an alert needs. Each value of `turn` stands for another set of cells.
+    many vehicles as an alert needs. Another `turn` gives other cells.
     """
     latitude = LATITUDE + APART * turn
     longitudes = [LONGITUDE + APART * place for place in range(places)]

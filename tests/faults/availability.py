@@ -1,10 +1,10 @@
-"""Availability of the page and the service for another reader during attacks: share of that
-reader's requests that are answered.
+"""Availability of the page and the service during attacks: share of an honest reader's requests
+that are answered.
 
-Only one attack runs at a time. The attacker has an address of its own. Meanwhile the other reader
-sends requests, one after the other, which need the same resource (such as threads or connections)
-as the attack. A request counts as failed if it is refused or not answered within PATIENCE_S. Page,
-service and router run in separate processes.
+One attack runs at a time, from an address of its own. Meanwhile the honest reader sends requests,
+one after the other. They need the same resource (such as threads or connections) as the attack. A
+request fails if it is refused or not answered within PATIENCE_S. Page, service and router run in
+separate processes.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Target(NamedTuple):
 
 
 def run(site: Site) -> list[Figure]:
-    """Send twenty requests of another reader during each attack (in a quick run, six). Return as a
-    figure the share of these requests that are answered during the worst attack.
+    """Send twenty requests of an honest reader during each attack (in a quick run, six). Return as
+    a figure the share of them that are answered during the worst attack.
     """
     asked = site.choose_amount(20, 6)
     served = {}

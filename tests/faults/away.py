@@ -3,11 +3,10 @@ the service returns with a limited rate.
 
 The cars' outboxes (stores of unacknowledged messages) and the service's engine (the service without
 its network) are real. Network and time are simulated, so that an hour takes a minute. The simulated
-service puts messages into a queue and drops those that do not fit. It acknowledges rows on disk
-twice a second. Its capacity is that of a service for a thousand cars, scaled to the number of cars:
-20 batches a second and 20 places in the queue per car. Every second each car enters a cell that no
-car visited before. At the end all these cells must be on the map, including those that were visited
-during the outage.
+service has an input queue, and drops messages that do not fit. Twice a second it writes rows to
+disk and acknowledges them. Per car, its rate (20 batches a second) and its queue (20 batches) are
+those of a service for a thousand cars. Every second each car enters a cell that no car visited
+before. At the end all these cells must be on the map.
 """
 
 from __future__ import annotations

@@ -100,8 +100,9 @@ def _flip_bit(path: Path, random_: random.Random) -> int:
 
 
 def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
-    """Start a service from the archive `root`. If this is a damaged copy of `whole`, send every
-    batch again. Return the service's map, its rows, and the number of damages that it counted.
+    """Start a service from the archive `root`. If `root` is not `whole`, it is a damaged copy: then
+    send every batch again, because rows may be lost. Return the service's map, its rows, and the
+    number of damages counted.
     """
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):

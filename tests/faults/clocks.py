@@ -1,10 +1,10 @@
 """Campaign on a service's clock that is years ahead or behind for a minute, while the service runs
 or at its start. Meanwhile vehicles drive on, some of them on ice.
 
-The service's own clock runs unchanged, but it reads simulated clocks instead of those of the
-machine. Messages, engine, archive, checkpoint (saved state), retention and restart are those of a
-real service. In each case vehicles report ice, the clock jumps, the vehicles go on and send some
-batches again, and the service is restarted.
+The machine's clocks are simulated; everything else is the code of a real service: its own clock
+(which reads those of the machine), engine, archive, checkpoint (saved state), retention and
+restart. In each case vehicles report ice, the machine's clock jumps, the vehicles go on and send
+some batches again, and the service is restarted.
 """
 
 from __future__ import annotations
@@ -65,9 +65,8 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def has_jumped(self, clock: SteadyClock) -> bool:
-        """Return True if the service's time is more than half a year wrong, or if the wall clock of
-        the machine is more than half a year away from the service's time (`SteadyClock.lag`).
-        `clock` is the service's clock.
+        """Return True if the service's clock `clock` differs by more than half a year from the true
+        time or from the machine's wall clock (`SteadyClock.lag`).
         """
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 

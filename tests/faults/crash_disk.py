@@ -39,7 +39,7 @@ class CrashDisk:
         live: folder of the disk's files; it is empty or was written by `write_image`.
         random_: random generator that chooses which unsynced data survives.
         power: number of operations until power is lost; None for no power loss.
-        full: numbers of the operations that fail because the disk is full.
+        full: operations that fail because the disk is full, counted from 1.
     """
 
     def __init__(self, live: Path, random_: random.Random, power: int | None, full: range) -> None:

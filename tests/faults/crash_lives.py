@@ -17,13 +17,12 @@ BatchType = TypeVar("BatchType")
 
 
 class Lives(ABC, Generic[BatchType]):
-    """One history, identified by its number, in an empty folder.
+    """One history in an empty folder. Its number is the seed of all random choices.
 
     Attributes:
         lives: number of lives.
-        operations: upper limit of the number of operations until power loss.
-        full_after: upper limit of the number of operations until the disk may be full for a
-            short time.
+        operations: largest number of operations before the power loss.
+        full_after: largest number of operations before the disk is full for a short time.
         acknowledged: batches that were acknowledged.
         at_stake: number of batches that were acknowledged before a power loss and might therefore
             have been lost.

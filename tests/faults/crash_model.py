@@ -193,8 +193,7 @@ def _run_log(number: int) -> tuple[list[str], int]:
 
 def _run_outbox(number: int) -> tuple[list[str], int]:
     """Return the violations (broken promises) found in one simulated history of the outbox (store
-    of unacknowledged messages), and 0 for the number of acknowledged batches, which an outbox does
-    not have.
+    of unacknowledged messages), and 0, because an outbox acknowledges no batches.
     """
     return spool_history(number), 0
 

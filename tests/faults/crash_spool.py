@@ -2,9 +2,9 @@
 SQLite had not yet synced.
 
 SQLite writes its files itself, so the files are read before and after each commit. When a commit
-has returned, its bytes are synced. Power loss during the next commit leaves the old files with a
-part of the new log. If SQLite was copying the log into the database, power loss leaves any mixture
-of old and new pages, with the old log.
+has returned, its bytes are synced. Power loss during the next commit leaves the old files and a
+part of the new write-ahead log. If SQLite was copying this log into the database, power loss leaves
+any mixture of old and new database pages, with the old log.
 """
 
 from __future__ import annotations

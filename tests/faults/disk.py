@@ -1,12 +1,12 @@
 """Campaign on a full disk: a service and an agent's outbox on a small file system that is full for
 a while under load.
 
-If this process may mount, the file system is a real tmpfs of some megabytes. Otherwise every system
-call by which log, maintenance jobs and outbox create or rename a file fails with ENOSPC. While the
+If this process may mount, the file system is a real tmpfs of some megabytes. Otherwise the system
+calls by which log, maintenance jobs and outbox create or rename files fail with ENOSPC. While the
 disk is full, only stored rows may be acknowledged, and jobs must still be tried. When there is
-space again, everything must be acknowledged and nothing may hang. Finally the disk is full with
-days that retention would remove, but whose roll-ups (hourly statistics) must be computed first: the
-reserved space must be enough for them.
+space again, everything must be acknowledged and nothing may hang. Finally the disk is full while
+the archive has expired days. Retention may delete these only after it has written their roll-ups
+(hourly statistics), for which the space that the service reserves must be enough.
 """
 
 from __future__ import annotations
@@ -109,9 +109,9 @@ def _refuse_writes(*names: str) -> Iterator[None]:
 
 
 def run(site: Site) -> list[Figure]:
-    """Fill the disk several times, at different stages of the background jobs. Return the figures:
-    rows acknowledged without being stored, and parts that do not continue when the disk has space
-    again.
+    """Fill the disk several times, at different stages of the background jobs. Return figures, such
+    as rows acknowledged without being stored, and parts that do not continue when the disk has
+    space again.
     """
     false = 0
     stuck = 0

@@ -1,10 +1,9 @@
-"""Campaign on one vehicle that sends as fast as it can: its effect on the acknowledgement times of
-the others and on the map.
+"""Campaign on one vehicle that sends as fast as it can: its effect on the map and on the
+acknowledgement times of other vehicles.
 
-Its reports are true, so the flooding vehicle should count like a vehicle that sends once a second.
-The resulting map is compared with a reference map. An engine (service without network) makes the
-reference from the same batches of the honest vehicles and one report per second of the flooding
-vehicle.
+Its reports are true, so they should change the map only as much as one report per second. The map
+is therefore compared with a reference map. An engine (service without network) makes the reference
+from the same batches of the honest vehicles and one report per second of the flooding vehicle.
 """
 
 from __future__ import annotations
@@ -126,10 +125,10 @@ class Honest:
 
 
 def run(site: Site) -> list[Figure]:
-    """Flood the service for half a minute (in a quick run, three seconds). Return the delays [s]
-    until the other vehicles' batches are acknowledged, before the flood and from its start on, and
-    the difference between the map and the reference map. Also return the rate of the flood and the
-    number of batches that were sent again.
+    """Flood the service for half a minute (in a quick run, three seconds). Return figures: delays
+    [s] until honest vehicles' batches are acknowledged, before the flood and during it; the
+    difference between the map and the reference map; the rate of the flood; and the number of
+    batches that honest vehicles sent again.
     """
     seconds = site.choose_amount(30, 3)
     fleet = make_enrolment(vehicles=[*HONEST, FLOODER])

@@ -4,9 +4,9 @@ ten honest cars on the same road.
 The insider (the car that attacks) sends as much as its rate limit allows. It reports visits to
 cells all over a region and over the world, and ice on a road that only it drives. It uses a new
 boot (identifier of an agent's start) for each batch, JSON, and batches whose rows lie in two
-months. It also sends its own reports again, unchanged and under other numbers. Engine, limits and
-archive are real; only time is simulated. One figure counts the insider's actions. The campaign
-`queries` measures the cost of queries.
+months. It also sends its own batches again, unchanged and under other sequence numbers. Engine,
+limits and archive are real; only time is simulated. The insider's messages are counted, because too
+few of them would be no attack.
 """
 
 from __future__ import annotations

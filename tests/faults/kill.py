@@ -192,8 +192,8 @@ def _run_round(
     """Run one round of kills. Return the counts of batches and rows (census), and the load from the
     start of all processes until the end.
 
-    The kills go on, up to three times as many, until the service has compacted (sorted) rows and
-    written a checkpoint (saved state).
+    There are `kills` kills, or up to three times as many if the service has not yet compacted
+    (sorted) rows and written a checkpoint (saved state).
     """
     for number in range(agents):
         there.make_load([f"sim-{number:03}"], RATE, seed=number).start()

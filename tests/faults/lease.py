@@ -50,18 +50,17 @@ def judge_seeds(seeds: Iterable[int]) -> Judged:
 
 
 def judge_without_comparison(seeds: Iterable[int]) -> Judged:
-    """Check simulated histories of a deliberately broken lease protocol, in which a service does
-    not compare its lease time with that of the others. A lease is the exclusive ownership of an
-    archive.
+    """Check simulated histories of a broken lease protocol (lease: exclusive ownership of an
+    archive), in which a service does not compare its lease time with that of the others.
     """
     with patch.object(lease_module, "_check_settings", lambda *_: None):
         return judge_seeds(seeds)
 
 
 def judge_without_expiry(seeds: Iterable[int]) -> Judged:
-    """Check simulated histories of a deliberately broken lease protocol, in which a holder
-    acknowledges until it notices its successor, even after its lease has expired. A lease is the
-    exclusive ownership of an archive.
+    """Check simulated histories of a broken lease protocol (lease: exclusive ownership of an
+    archive), in which a holder acknowledges until it notices its successor, even after its lease
+    has expired.
     """
     fresh = property(lambda lease: not lease.lost)
     with patch.object(Lease, "may_acknowledge", fresh):

@@ -42,9 +42,9 @@ _SILENT: Final = logging.Logger("silent", logging.CRITICAL + 1)
 
 class Event(NamedTuple):
     """Event of the simulated history of several services. There are three kinds. `serves`: a
-    service with a lease (ownership of the archive) of some number begins to serve and knows some
-    batches. `acknowledges`: a service acknowledges batches. `reads`: at the end, a reader finds the
-    batches that count.
+    service that holds lease `number` (ownership of the archive) begins to serve; the event lists
+    the batches that it knows. `acknowledges`: a service acknowledges batches. `reads`: at the end,
+    a reader finds the batches that count.
     """
 
     kind: str
@@ -65,8 +65,8 @@ class Verdict(NamedTuple):
 def judge_history(events: list[Event]) -> Verdict:
     """Check a simulated history of services that share an archive. Return the number of
     acknowledgements by a holder of the lease (ownership of the archive) after its successor began
-    to serve. Return also the batches that break a promise: acknowledged but unknown to a later
-    owner or to the reader, or counted twice.
+    to serve. Also return the number of batches that were acknowledged but unknown to a later owner
+    or to the reader, or that were counted twice.
     """
     served = 0
     by_two = 0

@@ -67,8 +67,8 @@ class Direction:
     def accept_packet(
         self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
     ) -> None:
-        """Queue an IP packet for delivery at the other end of the link. Drop it at random, if the
-        queue is full, or if the link blocks UDP.
+        """Queue an IP packet for delivery at the other end of the link. Drop it if the link blocks
+        UDP and it is UDP, at random with the loss rate, or if the queue is full.
         """
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return

@@ -19,9 +19,8 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 def run(site: Site) -> list[Figure]:
     """Check the takeover protocol (`protocol_model`) with all its rules, once with equal and once
     with different lease times of the two services. Then check each variant in BROKEN, which lacks
-    one rule. Return the number of checks with all rules that found a violation, the number of
-    broken variants without a violation (both must be 0), and the number of states of the protocol
-    with all rules.
+    one rule. Return as figures the checks of the whole protocol that found a violation and the
+    variants without a violation (both must be 0), and the number of states of the whole protocol.
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

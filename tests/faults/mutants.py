@@ -179,8 +179,8 @@ def _make_states() -> Any:  # noqa: ANN401
 
 
 def _shift_columns(place: int, rows: int) -> dict[str, Any]:
-    """Return the position and cell columns of a batch of `rows` rows. All rows have the same
-    position, which lies `place` times 2e-4 degrees east of the start.
+    """Return the position and cell columns of `rows` rows. All rows have the same position, which
+    lies `place` times 2e-4 degrees east of (LATITUDE, LONGITUDE).
     """
     longitude = LONGITUDE + 2e-4 * place
     return {

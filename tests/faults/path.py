@@ -1,11 +1,13 @@
 """Campaign on impossible positions: vehicles that report places where they cannot be, and two
 vehicles that report ice on roads where nobody else drives.
 
-Teleports: each car drives honestly, but also reports one distant place. The report of this place is
-in the same batch or in another one, before or after the car's other reports. It can have another
-boot (start of the agent) or region, or follow many short leaps. Whether a report is impossible
-follows from its distance to the car's own path. Two cars: both report ice at 210 places along 400
-km. They report either in leaps, or all at once afterwards, or live at a plausible 65 m/s.
+Teleports: each car drives honestly, but also reports one place that is too far from its path to be
+possible. This report is in the same batch as the true ones or in another batch, before, between or
+after them. It can have another boot (start of the agent) or region, or be reached by many short
+leaps.
+
+Two cars: both report ice at 210 places along 400 km. They report either in leaps, or live at a
+plausible 65 m/s, or the same drive all at once afterwards.
 """
 
 from __future__ import annotations
@@ -178,7 +180,8 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
 
 def _two_cars(site: Site, way: str) -> int:
     """Let two cars report ice on a road where nobody else drives, and return the number of places
-    at which they raise an alert. `way` is how they report: in "leaps", "live", or afterwards.
+    at which they raise an alert. `way` is how they report: in "leaps", "live", or afterwards
+    ("backlog").
     """
     start = time.time_ns() - 9000 * SECOND
     raised = set[int]()

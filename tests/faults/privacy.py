@@ -1,15 +1,15 @@
 """Campaign on privacy: a reader of the map tries to follow a lone car at night, with the shipped
 secure settings.
 
-Five side streets with STREETS households join a main road. All cars leave twice by day. One car
-leaves alone at night, and its agent cuts the beginning of the trip. The reader stores the tiles of
-every publication. After each publication it takes the cell that is new, or whose interval, times or
-counts changed most, as the place of the car. From the first such places it takes the nearest street
-as the car's street. A reader that sees no change guesses at random; such a guess counts by its
-probability of being right.
+Five side streets, each with as many households as STREETS states, join a main road. Each
+household's car leaves twice by day. One car leaves alone at night, and its agent does not publish
+the beginning of the trip. The reader stores the tiles of every publication. After each publication
+it takes a cell as the car's place: the one that is new, or whose interval, times or counts changed
+most. The street nearest to the first such places is its guess of the car's street. A reader that
+sees no change guesses at random; such a guess counts by its probability of being right.
 
-As a control, a map that shows every visit (pass through a cell) at once is also tested. There the
-reader must find the car.
+As a control, the same is done with a map that shows every visit (pass through a cell) at once.
+There the reader must find the car.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Explicit-state model of acknowledgement, lease (exclusive ownership of an archive), takeover,
 hand-over and erasure; `explore_states` visits every reachable state.
 
-Two services share a bucket; a vehicle has BATCHES. Time passes in ticks. In each tick a service's
-clock advances by one, but the clock of a lease holder may stand still in every second tick. No step
-is compulsory: a service that does nothing for a while models a frozen or disconnected one. Uploads
-and renewals take effect in the bucket at any time after they began.
+Two services share a bucket (object store). A vehicle sends the batches in BATCHES. Time passes in
+ticks. In each tick a service's clock advances by one, but the clock of a lease holder may stand
+still in every second tick. No step is compulsory: a service that does nothing for a while models a
+frozen or disconnected one. Uploads and renewals take effect in the bucket at any time after they
+began.
 
     renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal counts
              from its beginning; a renewal that was given up may still write its turn (counter of

@@ -2,10 +2,10 @@
 may crash their sender.
 
 The process reads one line of JSON: settings, name, keys to subscribe to, messages to publish. It
-prints a line when the messages are sent. After the next line of input it queries the map, because
-the answer arrives after all expected messages, and prints the keys of the received messages. It
-ends without closing the session, because a Zenoh session in router mode may abort its process when
-it closes.
+prints a line when the messages are sent. After the next line of input it prints the keys of the
+messages that it received. Before that it queries the map: when the answer arrives, all earlier
+messages have arrived too. It ends without closing the session, because closing a session in router
+mode may abort the process.
 """
 
 from __future__ import annotations

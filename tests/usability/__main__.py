@@ -68,9 +68,9 @@ class House:
         mistakes.prepare_files(folder)
 
     def follow_readme(self) -> dict[str, Any]:
-        """Run the commands of the README and of the tutorials in a separate network namespace, at
-        the first call only. Return the failed commands, and for each map whether it was populated.
-        The result is empty if the run itself failed.
+        """Run the commands of the README and of the tutorials in a separate network namespace.
+        Later calls return the result of the first. Return the failed commands, and for each map
+        whether it was populated, or an empty result if the run itself failed.
         """
         if self._readme is None:
             folder = self.folder / "readme"
@@ -182,9 +182,8 @@ def service_ready_s(house: House) -> float:
 
 
 def bound_painted(house: House) -> float:
-    """Return the number of outputs of the map with the following error: for a cell of which only a
-    lower bound of the friction is known, the output gives a value of friction that could be shown
-    as a colour.
+    """Return the number of map outputs with this error: they give a value of friction, which could
+    be shown as a colour, for a cell of which only a lower bound is known.
     """
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,17 +1,16 @@
 """Evaluation of the warnings that a car gives its driver. It measures how many simulated cars that
 approach a slippery stretch of road are warned in time, and how many warnings are false.
 
-The drivers are simulated; the warning code is that of the agent. The simulated connection never
-fails, and the map contains all roads, with errors of standard deviation SPREAD (see `known_town`).
-The test evaluates the warnings that a car computes from this map, with the position errors of its
-receiver.
+The drivers are simulated; the warning code is that of the agent. The connection never fails, and
+the map contains all roads, with errors of standard deviation SPREAD (see `known_town`). The
+positions have the errors of the car's receiver.
 
-An approach starts on road that is not slippery; a car that drives from snow onto ice is already on
-slippery road. A warning is in time if the car could stop before the stretch from the place of the
-warning, and if the warning is still active on arrival. Stopping takes 1.5 s of reaction, then
-braking at 3 m/s², or less if the true friction of the road before the stretch allows only less. A
-warning is false if nothing slippery lies within a lane's width of the path that the car then drove.
-The limit is not narrower, because the map's cells are not finer than a lane.
+An approach starts on road that is not slippery, so a drive from snow onto ice does not count. A
+warning is in time if the car could stop before the stretch from the place of the warning, and if
+the warning is still active on arrival. Stopping takes 1.5 s of reaction, then braking at 3 m/s², or
+less if the friction before the stretch allows only less. A warning is false if nothing slippery
+lies within a lane's width of the path that the car then drove. A narrower limit would be
+meaningless, because map cells are no narrower than a lane.
 """
 
 from __future__ import annotations

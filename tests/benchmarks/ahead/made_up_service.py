@@ -68,8 +68,8 @@ class MadeUpService:
     """Simulated service with places of known friction (`mu` by cell·4 + heading sector) and active
     alerts; it records the queries.
 
-    All places were observed at the time `now` [ns]. An answer states how old these observations
-    are. If `kept` is True, this age never grows, as in a store that repeats old messages.
+    All places were observed at the time `now` [ns]. An answer states the age of these observations.
+    If `kept` is True, the stated age does not grow, as if a store repeated old answers.
     """
 
     settings: ZenohSettings

@@ -225,8 +225,8 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return, for each process in `parts` except the last (the sender), the smallest memory [MB]
-    seen so far. This is the smaller one of its value in `before` and its memory now.
+    """Return, for each process in `parts` except the last (the sender), the smaller of two memory
+    sizes [MB]: the smallest one so far, `before`, and the one now.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 

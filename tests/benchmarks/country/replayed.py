@@ -1,10 +1,10 @@
 """Country made of copies of one town: positions of its vehicles, and the reports of each over time.
 
     regions    17, 17 and 16 in three zones (map squares of zoom 7) side by side, one service per
-               zone
-    towns      four in a region; regions have different sizes, proportional to 1/sqrt(rank)
+               zone; the r-th region of a zone has a number of vehicles proportional to 1/sqrt(r)
+    towns      four in a region
     vehicles   each repeats a part of the drive of one vehicle of the city, shifted by whole tiles;
-               vehicles of one town with the same drive are spread evenly over it
+               those that share a drive in one town are spread evenly over it
     reports    each vehicle sends ROWS visits (passes through map cells) every PERIOD_S, and these
                visits last PERIOD_S, as in slow traffic
 
@@ -47,12 +47,12 @@ class Chunk(NamedTuple):
     batch.
 
     Attributes:
-        message: the batch without vehicle, place and time.
+        message: the batch; vehicle, place and time are filled in when it is sent.
         x, y: column and row of each position, counted in cells from the north-western tile of the
             town, with fractions.
         cell_x, cell_y: column and row of the reported cells, counted from the same tile.
-        enter, leave: begin and end of each visit, as the time until the end of the last visit
-            divided by the duration of all visits.
+        enter, leave: time from each visit's begin and end to the end of the last visit, divided by
+            the duration of all visits.
     """
 
     message: Any

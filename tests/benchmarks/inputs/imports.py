@@ -39,8 +39,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
     """Decode CAN frames with this project's code and with cantools. Return (number of values that
     differ, number of compared values).
 
-    The frames have random bytes, for every shipped profile with a CAN database. The frames of the
-    log `recorded` are added if it is given.
+    For every shipped profile with a CAN database, frames of random bytes are decoded, and also the
+    frames of the log `recorded` if it is given.
     """
     wrong = compared = 0
     rng = np.random.default_rng(seed)

@@ -1,5 +1,6 @@
-"""Benchmark of DENM (hazard messages) for many events through an interchange: validity checked by a
-second decoder, constant event numbers after restarts, and message rate.
+"""Benchmark of many DENM (hazard messages), sent through a message broker (interchange). A second
+decoder checks each message, event numbers must survive restarts of the sender, and the message rate
+is measured.
 """
 
 from __future__ import annotations
@@ -176,9 +177,9 @@ def _encode_speedup(bodies: list[bytes]) -> float:
 
 
 def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
-    """Test the filter `quadTree LIKE '%,DIGITS%'` by which a receiver at the interchange selects
-    events in a square; DIGITS is the number of the square. Return the number of its errors: events
-    that it selects outside the square, or omits inside.
+    """Test the filter `quadTree LIKE '%,DIGITS%'` by which a receiver selects the events in a map
+    square; DIGITS is the number of the square. Return the number of errors: events outside the
+    square that it selects, or events inside that it omits.
     """
     wrong = 0
     squares = set[tuple[int, int]]()

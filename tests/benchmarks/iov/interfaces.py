@@ -85,8 +85,8 @@ def _alerted(
 
     Args:
         places: latitude and longitude [deg].
-        own: one entry per enrolled vehicle at each place: the friction values that it reports.
-        foreign: True if a publisher warns of ice at all places.
+        own: friction values that enrolled vehicles report at every place, one entry per vehicle.
+        foreign: True if a foreign publisher warns of ice at all places.
     """
     under_alert = set[int]()
     cells = [int(grid.cell_of(*place)) for place in places]
