@@ -31,8 +31,8 @@ def read_commands() -> list[str]:
 
 
 def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
-    """Publish the recorded minute of driving once under each of several vehicle names, to a new
-    router and service. Return the cells of the map and the keys of the alerts.
+    """Start a new router and service. Publish the recorded minute of driving once under each of
+    several vehicle names. Return the cells of the map and the keys of the alerts.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:

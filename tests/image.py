@@ -1,9 +1,9 @@
 """`make image`: runs the steps of deploy/Dockerfile as a script, without a container engine.
 
-Folders of the image become folders below another root. Nothing is installed by apt-get: the tools
-are those of this machine. The Python version that FROM names is taken from this machine, in a fresh
-environment. The user of the USER instruction is only checked. Then a router and a service of the
-image are started; the service must be ready without compiling anything.
+Folders of the image become folders below another root. Calls of apt-get do nothing: the tools are
+those of this machine. The Python version that FROM names is taken from this machine, in a fresh
+environment. The USER instruction is checked, but the user is not changed. Then a router and a
+service of the image are started; the service must be ready without compiling anything.
 """
 
 from __future__ import annotations

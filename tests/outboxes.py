@@ -1,4 +1,4 @@
-"""Helper of tests that look into the outbox of an agent (file of unsettled batches)."""
+"""Helper of tests that look into an agent's outbox (store of unacknowledged messages)."""
 
 from __future__ import annotations
 

@@ -275,7 +275,8 @@ def keep_figures(name: str, source: Path) -> str:
     """Store the figures of a campaign's last complete run. Figures that this run did not measure
     stay as they are.
 
-    Each fault campaign is complete in itself, so runs with `--only NAME` are accepted for `faults`.
+    The campaign `faults` may be run in parts (`--only NAME`), because each fault is complete in
+    itself.
 
     Args:
         name: key in CAMPAIGNS.

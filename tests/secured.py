@@ -83,13 +83,15 @@ def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:
 
 @dataclass
 class Network:
-    """Two routers, each in a separate process; the second one connects to the first.
+    """Two routers, each in a separate process; the second one connects to the first over TLS. In
+    one process, Zenoh may abort when one of two connected routers is closed.
 
-    `protocol` is the transport of sessions; the routers connect to each other over TLS. If `capped`
-    is False, the routers do not limit message rates, so that an earlier attack in a test does not
-    hide a later one. If `guarded` is False, they check no certificates, as a control. The routers
-    run in processes of their own because Zenoh may abort a process that closes one of two connected
-    routers.
+    Attributes:
+        guarded: False if the routers check no certificates and no access list, as a control of the
+            tests.
+        protocol: transport of sessions.
+        capped: True if the routers limit message rates. Without limits, an earlier attack in a test
+            does not hide a later one.
     """
 
     folder: Path

@@ -22,8 +22,8 @@ def test_no_output_draws_known_ice_as_unknown(tmp_path: Path) -> None:
 
 def test_an_older_snapshot_shows_known_ice_on_page_and_in_qgis(tmp_path: Path) -> None:
     """A stored map (snapshot) of an older version states known ice as a lower bound and without μ.
-    The page and QGIS must show it as ice. Tables cannot show it, and the test must count it as
-    hidden there. This proves that the test finds hidden ice.
+    The page and QGIS must still show it as ice. Tables cannot show it, so the search for hidden ice
+    must find it there. This proves that the search works.
     """
     ice = KnownIce(tmp_path, is_older=True)
     found = find_hidden(ice)

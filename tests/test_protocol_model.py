@@ -1,6 +1,6 @@
 """Exhaustive check of the protocol by which services take over an archive. Every reachable state of
-its model must keep the promises. Without any one of the protocol's rules, some state must break a
-promise.
+its model must keep the promises. If any one rule of the protocol is removed, some state must break
+a promise.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> No
 
 
 def matched(asker: zenoh.Publisher | zenoh.Querier) -> None:
-    """Wait until `asker` has a partner: a publisher a subscriber, a querier a queryable (handler of
-    its queries).
+    """Wait until `asker` has a partner: for a publisher a subscriber, for a querier a queryable
+    (handler of queries).
     """
     # The stubs declare `matching` as a bool.
     until(lambda: asker.matching_status.matching)  # type: ignore[attr-defined]

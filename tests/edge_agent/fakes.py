@@ -114,11 +114,13 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """State of several simulated vehicles between one block of samples and the next.
+    """State of several simulated vehicles, kept from one block of samples to the next.
 
-    Attributes: tracks: for each vehicle the cell in which it is (state of the cell tracking). open:
-    for each vehicle the visit that has not ended. A visit is the passage of a map cell; it ends
-    when the vehicle leaves the cell. config: settings of the agent.
+    Attributes:
+        tracks: state of the cell tracking: the cell of each vehicle.
+        open: for each vehicle its present visit. A visit is the passage of a map cell; it ends when
+            the vehicle leaves the cell.
+        config: settings of the agent.
     """
 
     tracks: RecordArray

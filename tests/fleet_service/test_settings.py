@@ -36,9 +36,9 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine (service without network) with the setting under test, after four reports of
-    three cars. Two are one second and ten minutes old, one is dated a minute ahead. The last, of
-    the first car again, is five minutes old.
+    """Yield an engine (service without network) with the setting under test, after four reports.
+    The first car's reports are one second and five minutes old; the older one arrives last. The
+    second car's is ten minutes old, the third car's dated a minute ahead.
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()

@@ -1,6 +1,6 @@
-"""Tests of two adaptation rules. At the peaks of the fuzzy sets, the rule table of paper 001 must
-give its entries. The noise estimate of paper 002 must find the variance of white noise. It weights
-the last innovations (measurement minus prediction) by their size.
+"""Tests of two adaptation rules. Paper 001: at the peaks of the fuzzy sets, the rule table must
+give its entries. Paper 002: the noise estimate, computed from the last innovations (measurement
+minus prediction), must find the variance of white noise.
 """
 
 from __future__ import annotations

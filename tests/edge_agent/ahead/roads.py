@@ -34,8 +34,8 @@ def line(
 
 
 def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
-    """Return the keys (cell · 4 + heading sector), (n,), of the cells along the road that `line`
-    returns. Each key occurs once; the keys are in driving order.
+    """Return the keys (n,) of the cells along the road that `line` returns. A key is 4 · cell
+    number + heading sector. Each key occurs once; the keys are in driving order.
     """
     key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
     return key[np.sort(np.unique(key, return_index=True)[1])]

@@ -1,6 +1,6 @@
 """Tests of the speed limit for a planner. A car that keeps the limit must be able to stop on ice
-within sight. The limit must fall at once and rise only after a while, and a ROS decoder must read
-the message.
+within sight. A lower limit must apply at once, a higher one only after a while. A ROS decoder must
+read the message.
 """
 
 from __future__ import annotations

@@ -97,9 +97,9 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
 
 
 def test_a_map_says_nothing_twice() -> None:
-    """A car drives through many cells for which the map has the same belief. The belief must not
-    count repeatedly. Therefore, after the second such cell, the car's friction interval must not
-    become narrower.
+    """A car drives through many cells for which the map has the same belief. Repetition must not
+    make this belief more certain. Therefore the car's friction interval must not become narrower
+    after the second cell.
     """
     prior = MapPrior(1)
     widths = []

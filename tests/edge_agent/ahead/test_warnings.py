@@ -1,6 +1,6 @@
 """Tests of warnings. Each must be given once, and early enough to stop even if the friction is at
-the lower end of its interval. The warning must then be updated and ended, and no warning may be
-false.
+the lower end of its interval. It must end when the ice is passed or gone, or the car takes another
+road. No warning may be false.
 """
 
 from __future__ import annotations

@@ -122,8 +122,8 @@ def test_a_process_that_the_system_ends_is_an_error_and_no_hang(
 
 
 def has_ended(process: subprocess.Popen[str], pipe: Path) -> bool:
-    """Return True if a process has ended. Otherwise release all processes that wait to open or read
-    the named pipe: they read its end.
+    """Return True if a process has ended. Also open and close the named pipe, so that processes
+    that wait for its content read its end.
     """
     with suppress(OSError):  # no process waits
         os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))

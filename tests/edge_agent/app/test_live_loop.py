@@ -131,9 +131,9 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A simulated car brakes with ABS now and then: its published observations must contain the ABS
-    flag. For a car whose flag is always on, and for a car without a flag, the published flag must
-    be unknown.
+    """One simulated car brakes with ABS now and then: its published observations must contain the
+    ABS flag. A second car's flag is always on, and so carries no information; the others have no
+    flag. Their published flag must be unknown.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):
@@ -180,8 +180,8 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
 
 
 class WaitingClock(threading.Event):
-    """Simulated clock, on which the live loop also waits as on an event. Only waiting advances the
-    clock, as if all computation took no time.
+    """Simulated clock that is also the event on which the live loop waits. Only this waiting
+    advances the clock, as if all computation took no time.
     """
 
     def __init__(self) -> None:

@@ -70,11 +70,12 @@ CAUSES: dict[str, tuple[Block, State, list[str], str]] = {
 def told_within(
     source: Block, find: Callable[[SignalWatch], list[str]], seconds: float
 ) -> list[str]:
-    """Return the lines that the agent prints in `seconds` of simulated time about why it publishes
-    nothing.
+    """Let the agent run for `seconds` of simulated time. Return the lines in which it prints why it
+    publishes nothing.
 
-    Args: source: block of signals that arrives every 0.1 s. find: function that returns the present
-    reasons.
+    Args:
+        source: block of signals that arrives every 0.1 s.
+        find: function that returns the present reasons.
     """
     clock = Clock()
     lines = list[str]()

@@ -14,7 +14,9 @@ from edge_agent.cli import main
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Path:
-    """Return the log of a simulated drive of two seconds; its vehicle file lies next to it."""
+    """Return the log of a simulated drive of two seconds. The log's folder also contains the
+    vehicle file.
+    """
     log = tmp_path / "drive.parquet"
     vehicle = ["--vehicle-out", str(tmp_path / "drive.json")]
     assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), *vehicle]) == 0

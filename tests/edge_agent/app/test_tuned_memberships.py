@@ -162,9 +162,8 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
 @pytest.mark.campaign
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
     """The present filter with the shipped memberships (parameters of fuzzy sets) must reach the
-    interval score that their file states for the held-out drives. If the filter was changed after
-    the tuning, this test fails. Then repeat the tuning with the command in the file
-    (`provenance.command`).
+    interval score that their file states for the held-out drives. If the filter was changed since
+    the tuning, repeat the tuning with `provenance.command` of the file.
     """
     document = load_tuned(FOLDER / "aco-fckf.json").document
     found = scores_of(

@@ -30,9 +30,9 @@ def drive() -> Recorded:
 
 
 def offset_judge(vehicle: Vehicle, drive: Drive) -> Prediction:
-    """Return a made-up score of the calibration in a vehicle file, in place of a real prediction
-    error on a drive. A calibrated offset of a_x improves the score, and calibrated wheel radii make
-    it worse.
+    """Return a made-up score of the calibration in a vehicle file. It replaces the prediction error
+    on a real drive. A calibrated offset of a_x improves the score; calibrated wheel radii make it
+    worse.
     """
     known = vehicle.calibration
     if known is None:

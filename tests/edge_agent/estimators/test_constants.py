@@ -1,5 +1,6 @@
-"""Tests of every constant of the default estimator. If a constant changes, a figure of a drive
-(such as the mean interval width) must change as the reason stated for the constant implies.
+"""Tests that each constant of the default estimator has the expected effect. If a test multiplies
+the constant, a figure of a drive (such as the mean interval width) must change by at least the
+ratio in the table MOVES.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of the lists of the papers' equations, tables and figures. Each listed deviation of the
-code from a paper must have a reason, and each listed place in the code must exist.
+"""Tests of the lists of the papers' equations, tables and figures. Each deviation of the code from
+a paper must have a reason, and each listed place in the code must exist.
 """
 
 from __future__ import annotations

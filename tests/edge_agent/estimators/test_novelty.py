@@ -54,9 +54,13 @@ class Bend:
         self.memory["friction"]["median"] = mu
 
     def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
-        """Drive for `seconds` with the lateral force `force`. The lateral slip is the one that the
-        filter expects at the force `slip`. Both forces are divided by the load. Return the degree
-        (0 to 1) to which the last block of samples counts as new, that is, differs from the usual.
+        """Drive through the bend. Return the degree (0 to 1) to which the last block of samples
+        counts as new, that is, differs from the usual.
+
+        Args:
+            slip: lateral slip, given as the force at which the filter expects it.
+            force: lateral force; both forces are divided by the load.
+            seconds: duration.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S

@@ -37,8 +37,8 @@ def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def speed_error(mu: float, missing: slice, *, engine_only: bool = False) -> float:
     """Return the RMS error of the estimated v_x [m/s] in a stop on a road of friction `mu`, without
-    the signals in the columns `missing`. If `engine_only`, the torque signals do not include the
-    brakes.
+    the signals in the columns `missing`. If `engine_only`, the torque signals contain drive torque
+    but no brake torque.
     """
     t, signals, vx = stop(mu)
     signals = signals.copy()

@@ -244,8 +244,8 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
 
 
 def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:
-    """If the noise is so small that rounding leaves no variance in the measured direction, the
-    downdate of the covariance must be refused. The orthogonal update must then give the result.
+    """The noise is so small that rounding leaves no variance in the measured direction. The filter
+    must refuse the downdate of the covariance, and use the orthogonal update instead.
     """
     (mean, other, cov, other_cov), told = _make_update(12, 1e-9)
     assert told[3]

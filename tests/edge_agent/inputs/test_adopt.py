@@ -1,6 +1,6 @@
 """Tests of corrections in the replay of a log. The signal doctor (a check of recorded signals) must
-find delayed sensors, a locked rear axle or wrong wheel radii. The replay must correct them, and
-leave a drive with exact sensors unchanged.
+find delayed sensors, and rear wheels that turn as one. The replay must correct both, and scale
+wheel speeds to given radii. It must leave a drive with exact sensors unchanged.
 """
 
 from __future__ import annotations

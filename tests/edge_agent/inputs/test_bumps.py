@@ -19,7 +19,7 @@ SPEED = 20.0
 
 def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
     """Return times (T,) and signals (T, 18) of a minute at 20 m/s on a road with bumps of size
-    `bumps`. Both axles roll over the same bumps, each with its own noise.
+    `bumps`. Both axles roll over the same bumps. Each wheel speed has its own noise.
     """
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 60.0, 0.01)

@@ -136,9 +136,9 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
     ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
-    """The observation of a visit (pass through a cell) is urgent if it must be sent at once. It
-    must be urgent only if the upper end of its interval, mu ± 0.05, lies below 0.4, or if its
-    median does and enough grip was used.
+    """An urgent observation is sent at once. The observation of a visit (pass through a cell) must
+    be urgent in two cases only: the upper end of its interval, mu + 0.05, lies below 0.4; or its
+    median mu lies below 0.4 and enough grip was used.
     """
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)
@@ -148,8 +148,8 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
 
 
 def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
-    """A car stops braking just before it enters the next cell. The braking must not count as grip
-    used in this cell, although the estimator reports the largest grip of the last second.
+    """The estimator reports the largest grip of the last second. A car stops braking just before it
+    enters the next cell. The braking must not count as grip used in this cell.
     """
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
@@ -166,9 +166,9 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
 
 
 def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
-    """A car brakes on dry road before a cell with ice. The braking must not count as grip in the
-    icy cell. At 14 m/s a car crosses a cell in less than the second over which the estimator
-    reports the largest grip.
+    """The estimator reports the largest grip of the last second. If a car brakes before a cell with
+    ice and crosses this cell in less than a second, this grip is too large for the cell. It must be
+    limited by the acceleration in the cell, if that is known.
     """
     samples = 30
     east = np.arange(samples)[:, None] * 1.4
@@ -251,7 +251,7 @@ def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
 ) -> None:
     """The road changes from ice to dry while the car passes through the second cell. The
     observation of this cell must allow both frictions. Its used grip must be that of the ice,
-    although the brakes used 0.7 before the estimator detected the change.
+    although the estimator reports a used grip of 0.7.
     """
     samples = 40
     east = np.arange(samples)[:, None] * 0.5

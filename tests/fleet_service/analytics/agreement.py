@@ -65,8 +65,9 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
 
 
 def roads_along(cells: IntArray) -> pa.Table:
-    """Return a road network as a table with the columns that `fleet-service roads` writes. Each row
-    of the given cells becomes links of forty cells; one more link lies where no vehicle drove.
+    """Return a road network as a table with the columns that `fleet-service roads` writes. Its
+    links follow the rows of the given cells, forty cells per link. One more link lies where no
+    vehicle drove.
     """
     x, y = grid.deinterleave(cells)
     found = []

@@ -37,8 +37,8 @@ HOUR_NS = 3600 * 10**9
 
 
 def find_visited(fusion: Fusion) -> IntArray:
-    """Return row numbers (n,) of a `Fusion` (beliefs about all cells). The rows are those of pairs
-    of cell and heading sector that a vehicle visited.
+    """Return the numbers (n,) of those rows of a `Fusion` (beliefs about all cells) that have
+    visits. A row is a pair of cell and heading sector.
     """
     return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
 

@@ -24,9 +24,9 @@ PI = 0.3  # share of slippery roads
 
 
 def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
-    """Return statistics of simulated pairs of readings of one road's state, slippery or not. The
-    road changes at the rate `rate` [1/s]. Row: bin of the time between the two readings. Columns
-    (4,): number of pairs, pairs that differ, slippery readings, sum of times [s].
+    """Return statistics (bins, 4) of simulated pairs of readings of one road's state, slippery or
+    not. The road changes at the rate `rate` [1/s]. A bin contains pairs with a similar time between
+    the readings. Columns: number of pairs, pairs that differ, slippery readings, sum of times [s].
     """
     apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
     first = rng.random(count) < PI

@@ -81,9 +81,8 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
 
 
 def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity (boot, seq, row) of every row that the service acknowledged. `boot` is
-    the pseudonym of the agent's start, `seq` the number of the batch, and `row` the place in the
-    batch.
+    """Return the identity of every row that the service acknowledged: pseudonym of the agent's
+    start (boot), number of the batch (seq), and place in the batch (row).
     """
     pseudonyms = Pseudonyms(folder / "archive" / "keys")
     now = time.time_ns()
@@ -99,8 +98,8 @@ def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
 
 
 def list_archived(folder: Path) -> list[tuple[int, int, int]]:
-    """Return the identity (boot, seq, row) of every row in the archive. `boot` is the pseudonym of
-    the agent's start, `seq` the number of the batch, and `row` the place in the batch.
+    """Return the identity of every row in the archive: pseudonym of the agent's start (boot),
+    number of the batch (seq), and place in the batch (row).
     """
     table = pa.concat_tables(
         reading.read_tables(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])

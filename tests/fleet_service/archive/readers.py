@@ -1,5 +1,5 @@
-"""Common tools that read an archive. Each function returns results of one tool: the numbers of rows
-and of rows with a likelihood, the mean of mu, and the zones (map squares of zoom 7).
+"""Common tools that read an archive. Each function returns the results of one tool, such as the
+number of rows.
 
 A tool that is not installed is left out. Spark has a separate test, because it needs Java and
 twenty seconds.

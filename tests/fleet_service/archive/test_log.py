@@ -91,8 +91,8 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
 
 def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
     """A new pseudonym key, from which archived names are computed, must survive a power loss right
-    after its creation. Otherwise the service would create another key. It would then accept already
-    acknowledged batches a second time.
+    after its creation. With another key, the service would not recognise archived batches, and
+    would accept them a second time.
     """
     for seed in range(20):
         live = tmp_path / f"live-{seed}"

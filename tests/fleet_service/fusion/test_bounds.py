@@ -1,6 +1,6 @@
 """Tests of lower bounds. The lower end of a cell's friction interval may exceed the largest grip
-that any vehicle used, but at most by the error of this report. The order and number of the reports
-must not matter.
+that any vehicle used by at most UTILISED_STD, the error of a reported grip. The order and number of
+the reports must not matter.
 """
 
 from __future__ import annotations

@@ -140,10 +140,9 @@ def test_bounds_are_remembered_for_an_hour_and_values_for_three(
 
 
 def repeat_after_settling(evidence: FloatArray, *, forgets: bool) -> Fusion:
-    """Return a fusion (beliefs about all cells) after 300 vehicles passed a cell and vehicle 0
-    repeated its report 40 minutes later. A settled pair is a compact record of one vehicle's
-    earlier reports in a cell. If `forgets`, all settled pairs are deleted before vehicle 0 repeats
-    its report.
+    """Let 300 vehicles pass a cell, and vehicle 0 repeat its report 40 minutes later. Return the
+    fusion (beliefs about all cells). A settled pair is a compact record of one vehicle's earlier
+    reports in a cell. If `forgets`, all settled pairs are deleted before the repetition.
     """
     fusion = Fusion(LATENESS_S)
     fusion.update(observations(0.1 * np.arange(300), np.arange(300), evidence.repeat(300, 0), CELL))

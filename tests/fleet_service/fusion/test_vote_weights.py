@@ -24,9 +24,11 @@ def make_acquainted(
     slope: float = 0.0, gain_std: float = 0.06, *, gain_in_use: bool = False
 ) -> Fusion:
     """Return a fusion (beliefs about all cells) after forty minutes of reports about ten cells.
-    Each vehicle has a constant relative error, of standard deviation `gain_std` over the fleet.
-    Each reported friction value is too low by `slope` times the unused part of μ. If `gain_in_use`,
-    the reported used grip has the same relative error.
+
+    Args:
+        slope: each friction value is too low by `slope` times the unused part of μ.
+        gain_std: standard deviation, over the vehicles, of a vehicle's constant relative error.
+        gain_in_use: True if the reported used grip also has this relative error.
     """
     rng = np.random.default_rng(5)
     fusion = Fusion(120.0)
@@ -63,10 +65,10 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """A gain error is a relative error that changes a vehicle's friction values and its used grip
-    alike. It must not be learned as a slope, which is the error of a value per unit of unused grip.
-    Between vehicles it looks like a slope cov(value, use)/var(use) ≥ 0.3. Between visits of one
-    vehicle it cancels.
+    """A gain error changes all friction values of a vehicle, and its used grip, by the same factor.
+    It must not be learned as a slope (error of a value per unit of unused grip). A comparison of
+    different vehicles would show a slope cov(value, use)/var(use) ≥ 0.3. A comparison of one
+    vehicle's visits shows none.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 

@@ -109,9 +109,9 @@ def test_batches_with_unhashed_starts_are_recognised_again(
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
-    """One car must not raise an alert alone by sending batches that begin in the last month. A
-    vehicle has another pseudonym in each month, and the first record of a batch decides the month.
-    Such batches would therefore count as those of a second vehicle.
+    """A vehicle has another pseudonym in each month, and the first record of a batch decides the
+    month. Batches that begin in the last month would therefore count as those of a second vehicle.
+    One car must not raise an alert alone by sending such batches.
     """
     now = time.time_ns()
     for seq in range(1, 40):

@@ -81,8 +81,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """Return keyword arguments for the function `batch`, by which the named column gets these
-    values.
+    """Return keyword arguments of the function `batch` that give these values to the named column.
     """
     return {column: values}
 
@@ -226,8 +225,8 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
     """A batch with unusable records must be rejected if its head (all fields other than the
-    records) can be read. Without a rejection, the vehicle would send it for ever. After 65 536 more
-    batches the vehicle's stream would stop.
+    records) can be read. Without a rejection, the vehicle would send the batch for ever, and the
+    service would accept at most 65536 of its later batches.
     """
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]

@@ -1,6 +1,6 @@
-"""Tests of simulated reports whose errors are taken from recorded drives. All reports of a town's
-vehicle must use errors of one recorded vehicle, from roads of similar friction, scaled to the
-friction of the town.
+"""Tests of simulated reports in a town. Their errors come from the estimator's reports on other
+drives. All reports of a town vehicle must have the errors of one vehicle in these drives, on roads
+of similar friction, scaled to the town's friction.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tests of the records in which the page receives map cells. A record must have the map's values,
-rounded so that it never shows more grip. A square of the overview must have the values of its worst
-cell.
+rounded so that it never shows more grip than the map. A square of the overview must have the values
+of its worst cell.
 """
 
 from __future__ import annotations

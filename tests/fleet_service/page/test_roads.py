@@ -104,8 +104,8 @@ def test_nothing_is_kept_twice_while_nothing_changes() -> None:
 
 
 def test_cells_side_by_side_are_one_learned_line() -> None:
-    """Two or three parallel rows of cells, among which position errors divide the reports from one
-    lane, must become one road line.
+    """Position errors may divide the reports from one lane among two or three parallel rows of
+    cells. These rows must become one road line.
     """
     scattered = cells(
         *((k, (0, 2, 0, 1)[k % 4]) for k in range(24)), *((k, 2) for k in range(3, 9))

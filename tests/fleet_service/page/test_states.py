@@ -1,6 +1,5 @@
 """Tests of the live page in a real browser, in each of its states (such as "no service answers"):
-the page must name the state in words. A picture of each state is stored in `.page/states`, so that
-a person can look at it.
+the page must name the state in words. A picture of each state is stored in `.page/states`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Tests of vector tiles. The numbers of PMTiles tiles must equal those of the PMTiles library, a
-written file must be read back unchanged, and the page must draw the tiles.
+"""Tests of vector tiles. Tiles must have the ids that the PMTiles library gives them. A written
+file must be read back unchanged, and the page must draw the tiles.
 """
 
 from __future__ import annotations

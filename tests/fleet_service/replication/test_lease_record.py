@@ -119,7 +119,7 @@ def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
 
 
 def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each renewal of the lease has its own turn (serial number). After a failed renewal the next
+    """Each renewal of the lease writes a serial number, its turn. After a failed renewal the next
     one must use another turn, because the failed write may still take effect later.
     """
     bucket = MemoryBucket()

@@ -22,11 +22,12 @@ ROUTE = EAST * grid.SECTORS
 
 
 def borrow_beliefs(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
-    """Return estimated ("borrowed") beliefs about unvisited cells in a row of thirty cells. The
-    estimates come from cells of this row in which three vehicles measured friction.
+    """Let three vehicles measure friction in some cells of a row of thirty. Return the beliefs that
+    unvisited cells borrow, that is, that are estimated from these neighbours.
 
-    Args: visited: measured friction by index of the cell in the row. route: the cells to estimate;
-    None for all cells of the tiles.
+    Args:
+        visited: measured friction by index of the cell in the row.
+        route: keys of the cells to estimate; None for the cells next to visited ones.
     """
     fusion = Fusion(120.0)
     for place, mu in visited.items():

@@ -207,8 +207,9 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
 
 @pytest.mark.parametrize("basis", ["checkpoint", "log"])
 def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, basis: str) -> None:
-    """After a restart of the service, a lone vehicle must not become visible in a public cell (one
-    that readers may see). It must also not be the vehicle that makes another cell public.
+    """After a restart of the service, a lone vehicle in a public cell (one that readers may see)
+    must not change the cell's values. Three vehicles, each alone in its hour, must not make another
+    cell public.
     """
     beside: dict[str, Any] = {
         "latitude": [LATITUDE + 0.002],

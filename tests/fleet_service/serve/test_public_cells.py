@@ -36,8 +36,8 @@ class Map:
 
     def seen(self, second: float, cell: int = CELL) -> list[float]:
         """Return three values of a cell as readers see them at the time `second`: lower end and
-        upper end of its friction (as bin numbers), and P(slippery). Return an empty list if the
-        cell is not public.
+        upper end of its friction (in bins of the friction grid), and P(slippery). Return an empty
+        list if the cell is not public.
         """
         now = START + int(second * SECOND)
         slot = self.public.select(self.slots(cell), now)

@@ -204,8 +204,8 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
 
 
 def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
-    """A client sends more small queries than its share of the service allows. These queries may
-    wait behind heavy queries, but the service must not refuse any of them.
+    """A client sends more small queries than its share of the service allows. They may wait behind
+    heavy queries, but the service must refuse none.
     """
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]

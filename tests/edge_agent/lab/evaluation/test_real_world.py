@@ -151,8 +151,8 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
     """The oracle is an estimator that is given everything except the quantities which the vehicle
-    file and the data sheet leave open. Most of its speed error must come from the wheel radius in
-    the vehicle file. Its friction error must be a few hundredths.
+    file and the data sheet leave open. Its speed error must be similar to the error that the wheel
+    radius in the vehicle file causes. Its friction error must be below 0.1.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

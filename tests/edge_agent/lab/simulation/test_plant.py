@@ -70,7 +70,7 @@ def run(
     x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3
 ) -> FloatArray:
     """Simulate a vehicle for `seconds` from the state `x`, with parameters `p` and constant inputs
-    `u`. Return the last output of its wheels (columns of `Wheel`, 4).
+    `u`. Return the last outputs of its four wheels, shape (columns of `Wheel`, 4).
     """
     w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
@@ -233,8 +233,9 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
-    """An estimator computes the tyre force F_x from J ω̇ = T − R F_x. A larger inertia J in the
-    simulation would make this force wrong, so the integrator must not add to J, even at low speed.
+    """The simulation must not make a wheel's inertia J larger than stated, even at low speed.
+    Estimators compute the tyre force F_x from J ω̇ = T − R F_x, so a wrong J would make this force
+    wrong.
     """
     vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
     for speed in (4.0, 20.0):

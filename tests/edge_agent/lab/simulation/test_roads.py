@@ -169,7 +169,7 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
 
 def test_vehicles_start_on_given_lanes_at_the_speed_of_traffic() -> None:
     """Vehicles must start on the given lanes and drive at each lane's speed of traffic. The test
-    has two parallel straight lanes with speeds of 13 m/s and 6 m/s, and drivers who accept 5 m/s².
+    has two parallel straight lanes with speeds of 13 m/s and 6 m/s.
     """
     x = np.arange(0.0, 400.0)
     lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]

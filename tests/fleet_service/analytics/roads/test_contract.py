@@ -190,9 +190,9 @@ def test_options_that_say_nothing_are_refused(
 
 
 def test_a_breach_lies_within_the_measurements() -> None:
-    """A breach is a time in which the road's friction is below the contracted friction. The reports
-    cover half an hour and begin in the middle of a time slot (fixed step of the computation). No
-    breach may begin before the first report or last longer than the reports.
+    """The reports cover half an hour and begin in the middle of a time slot (fixed step of the
+    computation). No breach (time below the contracted friction) may begin before the first report
+    or last longer than the reports.
     """
     begin = 100 * SLOT_S + 1300
     span = (begin, begin + 1897)

@@ -1,5 +1,5 @@
-"""Simulated AMQP interchange that accepts every message and delivers the messages that a test gives
-it.
+"""Simulated AMQP interchange (message broker). It accepts every message, and delivers the messages
+that a test gives it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from tests.ports import free_ports
 
 @dataclass
 class Interchange:
-    """Simulated interchange: its address, and the messages that it has received."""
+    """Simulated interchange (message broker): its address, and the messages that it has received.
+    """
 
     url: str
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
@@ -62,7 +63,9 @@ def free_url() -> str:
 
 @contextmanager
 def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[Interchange]:
-    """Yield an interchange that listens at an address and delivers the messages `offered`."""
+    """Yield a simulated interchange (message broker) that listens at an address and delivers the
+    messages `offered`.
+    """
     there = Interchange(url)
     injector = EventInjector()
     handler = _Handler(there, offered, injector)
@@ -79,8 +82,8 @@ def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[In
 
 @contextmanager
 def separate_interchange(url: str) -> Iterator[Connection]:
-    """Start a simulated AMQP interchange in a separate process. Yield a pipe to this process, which
-    answers each request sent into the pipe with all messages received so far.
+    """Start a simulated interchange (message broker) in a separate process. Yield a pipe to this
+    process: the answer to each request is the list of all messages received so far.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()

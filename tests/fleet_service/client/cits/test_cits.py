@@ -1,5 +1,5 @@
-"""Tests of DENM (hazard messages). Other encoders must write the same bytes, an event must keep its
-number over restarts, and all DENM of other parties must count as reports of one vehicle.
+"""Tests of DENM (hazard messages). Other encoders must write the same bytes. An event must keep its
+number over restarts. The DENM of all other parties together must count as reports of one vehicle.
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ def stretch(
 
 class Run:
     """Gateway output under test, with a simulated clock. The list `sent` collects the messages that
-    the gateway sends. `settles` is True if the simulated interchange accepts them.
+    the gateway sends. If `settles`, the simulated interchange (message broker) accepts them.
     """
 
     def __init__(self, path: Path, settles: bool = True) -> None:
