@@ -81,8 +81,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
 def one(column: str, values: list[float]) -> dict[str, Any]:
-    """Return keyword arguments of the function `batch` that give these values to the named column.
-    """
+    """Return keyword arguments of the function `batch` with these values for the named column."""
     return {column: values}
 
 

@@ -36,8 +36,8 @@ NEAR: Final = 0.1
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     """Return two durations [s] until the estimated mean friction `mu` (T,) is within NEAR of the
     true value. The first counts from the start of the drive, the second from the change of
-    friction. If the estimate never comes so near before the change, the first duration is the whole
-    time before it; likewise the second, after it.
+    friction. If the estimate never comes so near, a duration is the whole time before or after the
+    change.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]

@@ -22,8 +22,7 @@ from tests.ports import free_ports
 
 @dataclass
 class Interchange:
-    """Simulated interchange (message broker): its address, and the messages that it has received.
-    """
+    """Simulated interchange (message broker): its address, and the messages that it received."""
 
     url: str
     received: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
