@@ -107,7 +107,33 @@ def pointer_to(array: FloatArray) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
-class Limit:
+class CompiledFilters:
+    """Set of filters in C: the loaded library, and the arrays that its functions read."""
+
+    _library: ctypes.CDLL
+    _memory: FloatArray
+    _parameters: FloatArray
+    _setting: FloatArray
+
+    def _run_filters(self, readings: FloatArray, gone: float, out: FloatArray) -> None:
+        """Run all filters over successive readings, which are `gone` seconds apart, and write the
+        means of their states to `out`. The first two axes of `readings` are samples and filters (or
+        blocks of filters).
+        """
+        samples, filters = readings.shape[:2]
+        self._library.drive(
+            pointer_to(self._memory),
+            pointer_to(self._parameters),
+            pointer_to(self._setting),
+            pointer_to(readings),
+            ctypes.c_double(gone),
+            samples,
+            filters,
+            pointer_to(out),
+        )
+
+
+class Limit(CompiledFilters):
     """Set of N filters in C. Each filter has its own C structure, and all OpenMP threads share the
     work.
     """
@@ -136,20 +162,11 @@ class Limit:
         """
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
-        self._library.drive(
-            pointer_to(self._memory),
-            pointer_to(self._parameters),
-            pointer_to(self._setting),
-            pointer_to(readings),
-            ctypes.c_double(gone),
-            samples,
-            vehicles,
-            pointer_to(out),
-        )
+        self._run_filters(readings, gone, out)
         return out
 
 
-class VectorLimit:
+class VectorLimit(CompiledFilters):
     """Set of N filters in C, interleaved in SIMD vectors, on one thread. N must be a multiple of
     the vector length.
     """
@@ -194,16 +211,7 @@ class VectorLimit:
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)
-        self._library.drive(
-            pointer_to(self._memory),
-            pointer_to(self._parameters),
-            pointer_to(self._setting),
-            pointer_to(readings),
-            ctypes.c_double(gone),
-            samples,
-            blocks,
-            pointer_to(out),
-        )
+        self._run_filters(readings, gone, out)
         return out
 
 
