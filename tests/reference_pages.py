@@ -1,5 +1,5 @@
 """Reference pages of the documentation site, generated from the code: commands, settings, tables,
-metrics, and the elements of the papers (equations, tables, figures).
+metrics, and the equations, tables and figures of the papers that the estimators implement.
 
 `deploy/docs/conf.py` writes these pages when the site is built, so they always agree with the code.
 The pages are not committed.
@@ -203,8 +203,9 @@ def _escape_cell(text: str) -> str:
 
 
 def write_pages(folder: Path) -> None:
-    """Write all generated pages of the reference documentation (commands, settings, tables,
-    elements of the papers, metrics) into a folder.
+    """Write all generated pages of the reference documentation into a folder. The pages list the
+    commands, settings, table columns and metrics, and the equations, tables and figures of the
+    papers that the estimators implement.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pages = {f"cli-{program}": command_page(program) for program in COMMAND_LINES}

@@ -90,8 +90,9 @@ def _never_fails(parts: list[Part], start: int) -> bool:
 
 
 def _holds_repeat(item: Any) -> bool:  # noqa: ANN401 tuples of the parser
-    """Return True if a repeated group ends with a repeat of characters with which the group can
-    also begin. The matcher can then divide a text in many ways.
+    """Return True if a repeated group can end with an unbounded repeat of a character with which
+    the group can also begin. An example is `(a+)*`: the matcher can divide the text "aaa" between
+    repetitions of the group in many ways.
     """
     parts = [_describe_part(one) for one in _open_groups(item[1][2])]
     if not any(part.is_unbounded for part in parts):

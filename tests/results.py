@@ -154,8 +154,9 @@ def _render_searches(values: dict[str, float]) -> str:
 
 
 def _format_fading(values: dict[str, float]) -> str:
-    """Return a Markdown table, by weather and time, of the lower end of a dry road's friction
-    interval and of the deceleration [m/s²] that it allows.
+    """Return a Markdown table that shows how the map's knowledge about a dry road ages. It has a
+    row for each kind of weather and a column for each time since the last vehicle passed. Each cell
+    has the lower end of the friction interval, and the deceleration [m/s²] that it allows.
     """
     times = [
         f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in fading.AFTER_MIN

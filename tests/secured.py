@@ -87,11 +87,13 @@ class Network:
     one process, Zenoh may abort when one of two connected routers is closed.
 
     Attributes:
-        guarded: False if the routers check no certificates and no access list, as a control of the
-            tests.
+        guarded: False if the routers check neither certificates nor the access list. Tests use
+            such routers as a control: there the attacks must succeed.
         protocol: transport of sessions.
-        capped: True if the routers limit message rates. Without limits, an earlier attack in a test
-            does not hide a later one.
+        capped: True if the routers limit message rates. Tests of several attacks use routers
+            without limits. With limits, a router could drop the messages of an attack because they
+            follow too soon after those of another attack. The access list would then seem to have
+            refused them.
     """
 
     folder: Path

@@ -159,8 +159,8 @@ def test_links_of_pages_lead_to_files_and_headings() -> None:
 
 
 def test_pages_have_no_reference_links_which_the_link_test_cannot_follow() -> None:
-    """Pages must not define reference links at their end, because the test of links cannot follow
-    such links. Figures belong into generated blocks (parts of a page that a program writes).
+    """Pages must not contain Markdown reference links (`[text][label]`, with `[label]: target` at
+    the end of the page). The test of links follows only inline links, `[text](target)`.
     """
     reference = re.compile(r"^\[[^\]]+\]: \S|\]\[[\w.]+\]", re.MULTILINE)
     for page in list_pages():

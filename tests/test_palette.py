@@ -20,8 +20,8 @@ LEAST = 10.0  # CIEDE2000 difference; side by side, 2.3 is just noticeable
 
 
 def test_the_difference_is_the_published_one() -> None:
-    """The computed differences must equal those published for pairs 1, 13 and 21 in table 1 of
-    Sharma, Wu and Dalal (2005).
+    """The function `colour_difference` must return the CIEDE2000 differences that Sharma, Wu and
+    Dalal (2005) publish in table 1, for the CIELAB colours of pairs 1, 13 and 21.
     """
     pairs = [
         ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),

@@ -46,7 +46,7 @@ class Fence(NamedTuple):
 
     def counts_object(self, name: str) -> bool:
         """Return True if the object with this name is valid according to the fence (list of the
-        former owners' objects that count).
+        valid objects of former owners).
         """
         epoch = layout.term_of(name)
         return epoch is None or epoch >= self.epoch or name in self.names

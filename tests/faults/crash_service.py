@@ -275,9 +275,9 @@ class ServiceHistory(Lives[Sent]):
         return found
 
     def _find_lost(self, rows: Counter[int], last: bool) -> list[str]:
-        """Return one message per acknowledged batch of which rows are missing. In the last life,
-        unacknowledged batches are checked too, because by then every vehicle has sent its batches
-        again.
+        """Return one message for each batch that must be in the archive but lacks rows. All
+        acknowledged batches must be there. After the `last` run of the service, the unacknowledged
+        batches must be there as well, because by then every vehicle has sent its batches again.
         """
         owed = [
             one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))

@@ -1,12 +1,13 @@
-"""Campaign on a full disk: a service and an agent's outbox on a small file system that is full for
-a while under load.
+"""Campaign on a full disk. A service and an agent's outbox (store of unacknowledged messages) run
+on a small file system that becomes full several times under load.
 
 If this process may mount, the file system is a real tmpfs of some megabytes. Otherwise the system
-calls by which log, maintenance jobs and outbox create or rename files fail with ENOSPC. While the
-disk is full, only stored rows may be acknowledged, and jobs must still be tried. When there is
-space again, everything must be acknowledged and nothing may hang. Finally the disk is full while
-the archive has expired days. Retention may delete these only after it has written their roll-ups
-(hourly statistics), for which the space that the service reserves must be enough.
+calls that create or rename files fail with ENOSPC. The campaign checks:
+
+- While the disk is full, the service acknowledges no row that is not stored.
+- When the disk has space again, all batches are acknowledged, and all background jobs continue.
+- Retention (deletion of old days) works on a full disk. Before it deletes a day, it must write the
+  day's roll-up (hourly statistics). The service reserves disk space for this purpose.
 """
 
 from __future__ import annotations

@@ -153,9 +153,9 @@ def old_days(archive: Path) -> list[Path]:
 
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
-    """Return the names of those jobs (checkpoints, compaction) whose results exist in the archive:
-    they ran during the kills. Compacted (sorted) files of the old days do not count, because they
-    existed before.
+    """Return the names of the background jobs (checkpoints, compaction) that have completed during
+    the kills. A job counts as completed if its results are in the archive. Compacted (sorted) files
+    of the old days, which retention deletes, are ignored, because they existed before the kills.
     """
     old = old_days(archive)
     compacted = (file.parents[1] not in old for file in archive.glob("observations/*/*/*.parquet"))

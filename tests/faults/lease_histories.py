@@ -44,7 +44,7 @@ class Event(NamedTuple):
     """Event of the simulated history of several services. There are three kinds. `serves`: a
     service that holds lease `number` (ownership of the archive) begins to serve; the event lists
     the batches that it knows. `acknowledges`: a service acknowledges batches. `reads`: at the end,
-    a reader finds the batches that count.
+    a reader finds the batches in valid objects of the bucket.
     """
 
     kind: str
@@ -372,9 +372,9 @@ class ServiceHistory:
             lease.release()
 
     def _begin_serving(self, lease: Lease) -> set[int]:
-        """Let a service begin to serve under its new lease (ownership of the archive): list the
-        objects in the bucket, and write the fence (list of the objects of earlier holders that
-        count). Return the batches of observations that the service knows.
+        """Let a service begin to serve under its new lease (ownership of the archive). It lists the
+        objects in the bucket, and writes those that are valid into its fence (list of the valid
+        objects of earlier owners). Return the batches of observations in these objects.
         """
         self._world.sleep(self._random.uniform(0.0, 0.3))
         number = lease.term.number
@@ -410,9 +410,9 @@ class ServiceHistory:
             self.events.append(Event("acknowledges", number, (batch,)))
 
     def _find_counted(self, names: Iterable[str]) -> list[str]:
-        """Return those of the object `names` in the bucket that count as archived. An object counts
-        if its lease number is at least that of the newest owner, or if that owner's fence (list of
-        valid older objects) contains it.
+        """Return those of the object `names` in the bucket that are valid, so that readers use
+        them. An object is valid if its lease number is at least that of the newest owner, or if
+        that owner's fence (list of the valid objects of earlier owners) contains it.
         """
         newest = max(self._fences, default=0)
         before = self._fences.get(newest, frozenset())

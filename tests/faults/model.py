@@ -19,8 +19,11 @@ from tests.faults.protocol_model import BROKEN, Rules, explore_states
 def run(site: Site) -> list[Figure]:
     """Check the takeover protocol (`protocol_model`) with all its rules, once with equal and once
     with different lease times of the two services. Then check each variant in BROKEN, which lacks
-    one rule. Return as figures the checks of the whole protocol that found a violation and the
-    variants without a violation (both must be 0), and the number of states of the whole protocol.
+    one rule. Return three figures:
+
+    - number of checks of the complete protocol that found a violation (must be 0)
+    - number of variants in BROKEN in which no violation was found (must be 0)
+    - number of states of the complete protocol that were visited
     """
     checked = [
         explore_states(Rules(), most_turn=site.choose_amount(2, 1)),

@@ -48,8 +48,8 @@ def router_down(site: Site) -> list[Figure]:
 
 
 def freeze_parts(site: Site) -> list[Figure]:
-    """Freeze the router, then the service. Meanwhile agents must keep up with their signals, and
-    nothing may be lost.
+    """Freeze the router for a while, then the service. Meanwhile the simulated agents must accept
+    every block of observations on time, and no observation may be lost.
     """
     frozen_s = site.choose_amount(20, 3)
     spans = []

@@ -1,13 +1,15 @@
 """Campaign on impossible positions: vehicles that report places where they cannot be, and two
 vehicles that report ice on roads where nobody else drives.
 
-Teleports: each car drives honestly, but also reports one place that is too far from its path to be
-possible. This report is in the same batch as the true ones or in another batch, before, between or
-after them. It can have another boot (start of the agent) or region, or be reached by many short
-leaps.
+Teleports: each car drives honestly, but also reports one false place that is too far from its path.
+The false report is sent in different ways (KINDS). It is in the batch of the true reports or in
+another batch. Its time is before, between or after theirs. It can have another boot number (start
+of the agent) or another region. Or the car reports a chain of false places, 3.8 km and a
+millisecond apart.
 
-Two cars: both report ice at 210 places along 400 km. They report either in leaps, or live at a
-plausible 65 m/s, or the same drive all at once afterwards.
+Two cars: both report ice at 210 places along 400 km, in three ways. "leaps": the next place follows
+after a millisecond, which no car can drive. "live": the cars drive at a plausible 65 m/s, and each
+report is sent at once. "backlog": the same drive, but all reports are sent after its end.
 """
 
 from __future__ import annotations
@@ -149,8 +151,8 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
 
 def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> list[Batch]:
     """Return batches of the car `name` that report a place far from its path, at about the time of
-    its true reports. `kind` is the way of sending this false report, for example "walk" (reached in
-    many short steps) or "boot" (under another boot number).
+    its true reports. `kind` is the way of sending this false report, for example "boot" (under
+    another boot number) or "walk" (a chain of false places, 3.8 km and a millisecond apart).
     """
     far = rng.uniform(FAR_M, 4e5) * np.exp(1j * rng.uniform(0, 2 * np.pi))
     second = {"before": -5, "between": 14.5}.get(kind, 31.0)
@@ -180,8 +182,11 @@ def _far_away(kind: str, name: str, start: int, rng: np.random.Generator) -> lis
 
 def _two_cars(site: Site, way: str) -> int:
     """Let two cars report ice on a road where nobody else drives, and return the number of places
-    at which they raise an alert. `way` is how they report: in "leaps", "live", or afterwards
-    ("backlog").
+    at which they raise an alert. `way` is the way of reporting:
+
+    - "leaps": the next place follows after a millisecond, which no car can drive
+    - "live": the cars drive at a plausible speed, and each report is sent at once
+    - "backlog": the same drive, but all reports are sent after its end
     """
     start = time.time_ns() - 9000 * SECOND
     raised = set[int]()

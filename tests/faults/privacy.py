@@ -3,10 +3,13 @@ secure settings.
 
 Five side streets, each with as many households as STREETS states, join a main road. Each
 household's car leaves twice by day. One car leaves alone at night, and its agent does not publish
-the beginning of the trip. The reader stores the tiles of every publication. After each publication
-it takes a cell as the car's place: the one that is new, or whose interval, times or counts changed
-most. The street nearest to the first such places is its guess of the car's street. A reader that
-sees no change guesses at random; such a guess counts by its probability of being right.
+the beginning of the trip.
+
+The reader stores the map tiles of every publication and compares them with the previous ones. It
+assumes that the car is in the cell that changed most: a new cell, or else the cell whose interval,
+times or counts changed most. The reader then guesses the side street that is nearest to the first
+such cells. If no cell has changed, the reader guesses at random. For a random guess, the campaign
+records its probability of being right.
 
 As a control, the same is done with a map that shows every visit (pass through a cell) at once.
 There the reader must find the car.

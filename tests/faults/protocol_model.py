@@ -1,23 +1,28 @@
 """Explicit-state model of acknowledgement, lease (exclusive ownership of an archive), takeover,
 hand-over and erasure; `explore_states` visits every reachable state.
 
-Two services share a bucket (object store). A vehicle sends the batches in BATCHES. Time passes in
-ticks. In each tick a service's clock advances by one, but the clock of a lease holder may stand
-still in every second tick. No step is compulsory: a service that does nothing for a while models a
-frozen or disconnected one. Uploads and renewals take effect in the bucket at any time after they
-began.
+Two services share a bucket (object store). The lease object in the bucket has two counters. The
+*number* grows with each takeover, and the *turn* with each renewal. A vehicle sends the batches in
+BATCHES, and a service uploads each one as an object with the service's lease number. The *fence*,
+written at a takeover, decides which objects count (are valid for readers). These are the objects
+that the fence lists, and all objects whose lease number is not lower than that of the fence.
 
-    renew    begins at a moment; if the bucket shows no higher number afterwards, the renewal counts
-             from its beginning; a renewal that was given up may still write its turn (counter of
-             renewals in the lease object) later
-    ack      only within lease / 2 after the beginning of the last valid renewal, and only for
-             batches that are uploaded
-    take     a standby that saw the same turn for its lease time creates the next number; if the
-             turn changed meanwhile, the standby waits for another lease time
-    list     reads all objects of the bucket: these objects count, and later objects of lower
-             numbers do not (the fence)
-    release  hands the lease over at once; the holder acknowledges nothing afterwards
-    erase    the holder records that a batch is erased, and then deletes it from the bucket
+Time passes in ticks. In each tick a service's clock advances by one, but the clock of a lease
+holder may stand still in every second tick. No step is compulsory: a service that does nothing for
+a while models a frozen or disconnected one. Uploads and renewals take effect in the bucket at any
+time after they began.
+
+    renew    The holder writes the next turn. The renewal is valid if the bucket then shows no
+             higher number; its age is measured from its beginning. If the holder gives a renewal
+             up, its turn may still be written later.
+    ack      The holder acknowledges only uploaded batches, and only within half a lease time after
+             the beginning of its last valid renewal.
+    take     A standby that has seen the same turn for its lease time creates the next number. If
+             the turn changed since it last looked, it waits for another lease time before `list`.
+    list     The new holder writes all objects of the bucket into the fence. Objects with lower
+             numbers that are uploaded later do not count.
+    release  The holder gives up its lease at once. It acknowledges nothing afterwards.
+    erase    The holder records that a batch is erased, and then deletes it from the bucket.
 
 Invariants: every acknowledged batch that is not erased is known to each serving service; a batch
 counts at most once; an erased batch counts nowhere and is not accepted again.
@@ -65,22 +70,23 @@ BROKEN: Final = {
 
 
 class Service(NamedTuple):
-    """State of a service.
+    """State of a service. `age`, `begun` and `same` never exceed the lease time + 1, so that the
+    number of states is finite.
 
     Attributes:
-        role: "waiting", "taking" (has created its number, but has not yet read the objects of the
-            bucket), "serving", or "gone".
+        role: "waiting", "taking" (has created its lease number, but has not yet read the objects of
+            the bucket), "serving", or "gone".
         number: number of its lease (each takeover creates the next one); 0 without a lease.
-        age: ticks since the beginning of its last valid renewal, capped.
-        begun: age of a renewal that is under way; NOT_YET without one.
-        seen: (number, turn) of the lease object that it saw last.
-        same: number of ticks for which it has seen the same (number, turn).
-        wait: number of ticks to wait before it reads the objects of the bucket.
-        known: batches that it knows.
-        sending: batches whose upload is under way.
-        uploaded: own uploads of which it knows that they are in the bucket.
+        age: ticks since the beginning of its last valid renewal.
+        begun: ticks since the beginning of a renewal in progress; NOT_YET without one.
+        seen: (number, turn) in the lease object when the service last looked.
+        same: ticks for which a waiting service has seen this (number, turn).
+        wait: ticks to wait before it reads the objects of the bucket.
+        known: batches that it has accepted or found in the bucket; it does not accept them again.
+        sending: batches whose upload is in progress.
+        uploaded: batches that it knows to be in the bucket; only these may be acknowledged.
         slow: True if its clock did not advance in the last tick.
-        turn: last turn of its lease that it has used.
+        turn: last turn (counter of renewals) that it has used for its lease.
         late: turn of a renewal that was given up and may still be written; 0 without one.
     """
 
@@ -106,9 +112,9 @@ class World(NamedTuple):
         services: states of both services.
         number, holder, turn, released: content of the newest lease object in the bucket; turn
             counts its renewals.
-        objects: batch and lease number of each object in the bucket.
-        fence: lease number of the owner that wrote the fence, and the older objects that count for
-            it.
+        objects: (batch, lease number of the uploader) of each object in the bucket.
+        fence: lease number of the service that wrote the fence, and the objects that it lists.
+            Objects with a lower lease number are valid only if they are in this list.
         acked: batches that were acknowledged to the vehicle as durable.
         erased: batches that were erased.
     """
@@ -168,8 +174,9 @@ def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tupl
 
 
 def list_counted(world: World) -> list[int]:
-    """Return the batches that count for a reader of the bucket in the model's state `world`. A
-    batch occurs twice in the list if it is stored twice and both objects count.
+    """Return the batches of all valid objects in the bucket, in the model's state `world`. An
+    object is valid if the fence lists it, or if its lease number is not lower than that of the
+    fence. If two valid objects contain the same batch, the batch occurs twice.
     """
     number, before = world.fence
     return [batch for batch, epoch in world.objects if epoch >= number or (batch, epoch) in before]
@@ -177,7 +184,7 @@ def list_counted(world: World) -> list[int]:
 
 def find_problem(world: World) -> str:
     """Return a message for the invariant that the model's state `world` breaks, or "" if it breaks
-    none.
+    none. In the messages, a batch counts if a valid object contains it (see `list_counted`).
     """
     counted = list_counted(world)
     if len(counted) != len(set(counted)):

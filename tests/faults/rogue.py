@@ -1,11 +1,15 @@
-"""`python -m tests.faults.rogue`: Zenoh session of any mode in a separate process, for attacks that
-may crash their sender.
+"""`python -m tests.faults.rogue`: Zenoh session of an attacker in a separate process, for attacks
+that may crash their sender. The session can be a client, a peer or a router.
 
-The process reads one line of JSON: settings, name, keys to subscribe to, messages to publish. It
-prints a line when the messages are sent. After the next line of input it prints the keys of the
-messages that it received. Before that it queries the map: when the answer arrives, all earlier
-messages have arrived too. It ends without closing the session, because closing a session in router
-mode may abort the process.
+The process works in these steps:
+
+1. It reads one line of JSON: Zenoh settings, session name, keys to subscribe to, and messages.
+2. It publishes the messages and prints a line.
+3. It waits for a second line of input, and queries the map. When the answer arrives, all earlier
+   messages have arrived too.
+4. It prints the keys of all messages that it has received.
+5. It ends without closing the session, because closing a session in router mode may abort the
+   process.
 """
 
 from __future__ import annotations

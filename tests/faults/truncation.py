@@ -107,9 +107,12 @@ def _list_expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 
 
 def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
-    """Return the number of errors of a service on the archive: missing rows of older segments
-    (files of new rows), plus rows of the newest segment that are wrong, or that are missing
-    although the service counts them as received.
+    """Return the number of wrong or missing rows in the archive, as a restarted service reads it.
+    The number includes:
+
+    - missing rows of older segments (files of new rows)
+    - missing rows of the newest segment, if the service counts their batch as received
+    - rows that no vehicle has sent
     """
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _read_rows(root)}
     streams = SequenceTrackers()

@@ -255,8 +255,9 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """Return a text that describes a file's content and is equal in every run. It is the content's
-    hash, for certificates their days of validity, and "" for private keys and READMEs.
+    """Return a text that describes a file's content and is the same in every run. For most files
+    it is a hash of the content. For certificates, which are different in every run, it is their
+    period of validity [days]. For private keys and READMEs it is "".
     """
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
@@ -298,8 +299,9 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 
 @pytest.mark.parametrize("command", SHOWN_BELOW)
 def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
-    """Each listed option must occur in the test that shows its effect. This test searches the
-    source of the command's test module, and of this module below the tables.
+    """Each option in SHOWN_BELOW must occur in a test that shows its effect. This test searches
+    the source of the modules in GIVEN_IN, and the part of this module that follows its tables of
+    options.
     """
     own = Path(__file__)
     texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]

@@ -36,9 +36,13 @@ Show = Callable[[ServiceConfig, Path], object]
 
 
 def open_engine(config: ServiceConfig, root: Path) -> Iterator[Engine]:
-    """Yield an engine (service without network) with the setting under test, after four reports.
-    The first car's reports are one second and five minutes old; the older one arrives last. The
-    second car's is ten minutes old, the third car's dated a minute ahead.
+    """Yield an engine (service without network) with the setting under test, after it has received
+    four reports in this order:
+
+    - from car sim-001, one second old
+    - from car sim-002, ten minutes old
+    - from car sim-003, dated one minute in the future
+    - from car sim-001 again, five minutes old, so older than this car's first report
     """
     with closing(Engine(config, root)) as engine:
         now = time.time_ns()

@@ -1,5 +1,6 @@
-"""Tests of map cells, tiles and heading sectors. The grid must satisfy its theorems, and places on
-its borders must get the right cell.
+"""Tests of map cells, tiles and heading sectors. A position must lie in its cell, a parent must be
+the cell of the coarser zoom, and conversions between forms of cell numbers must be reversible.
+Places on the grid's borders must get the right cell.
 """
 
 from __future__ import annotations

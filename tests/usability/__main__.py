@@ -55,8 +55,8 @@ DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
 
 
 class House:
-    """Working folder that all measurements share, with a synthetic archive and the files of the
-    mistakes.
+    """Working folder that all measurements share. It contains a synthetic archive, and the files
+    to which the wrong command lines in `mistakes` refer.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -85,8 +85,8 @@ class House:
         return self._readme
 
     def print_measured(self, what: str, found: object) -> None:
-        """Print the measurements `found` of the part named `what`; the figures are computed from
-        them.
+        """Print `what`, the name of a measurement, and `found`, the details from which its figure
+        is computed.
         """
         print(f"{what}: {found}", flush=True)
 
@@ -142,8 +142,9 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """Open the live page with a service and cars on ice. Return (name, errors, requests to other
-    hosts), or None if the page reports no errors and sends no such requests.
+    """Open the live page with a service and cars on ice. Return None if the page reports no errors
+    and requests nothing from other hosts. Otherwise return an entry for the list of faulty pages:
+    ("live", errors, requests to other hosts).
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)
@@ -306,8 +307,9 @@ def install_packages(house: House) -> float:
 
 
 def silent_reasons(house: House) -> float:
-    """Test how many causes an agent names within five seconds when it publishes nothing for a known
-    cause. Return this number.
+    """Return the number of causes of missing data that an agent reports in time. A test creates
+    each cause in turn, for example a silent sensor or a missing position, so that the agent
+    publishes nothing. The agent must print the cause within five seconds.
     """
     path = "tests/edge_agent/app/test_publishing_reasons.py"
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-k", "planted_cause", path]

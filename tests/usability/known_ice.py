@@ -255,8 +255,9 @@ def _hidden_by_demo(ice: KnownIce) -> Places:
 
 
 def _hidden_by_watch(ice: KnownIce) -> Places:
-    """Return the known slippery places in those tiles for which the command `watch` counts fewer
-    slippery or fewer measured cells than there are known slippery places.
+    """Return the known slippery places that the command `watch` hides. For each map tile, `watch`
+    prints a count of slippery cells and a count of measured cells. If either count is smaller than
+    the number of known slippery places in the tile, all these places are returned as hidden.
     """
     found: set[tuple[int, int]] = set()
     for tile, batch in ice.batches():

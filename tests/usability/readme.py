@@ -138,8 +138,9 @@ def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
-    """Yield (command, no maps) for each command of the pages. After the last command of each page,
-    yield (None, the maps to look at).
+    """Yield the steps of a reader who follows PAGES. A step is a pair (command, maps); `maps`
+    contains the name and the address or file of each map that the reader opens in a browser. For
+    each command of a page, yield (command, {}). After its last command, yield (None, maps).
     """
     for page in PAGES:
         for command in list_commands(page.read_text(encoding="utf-8")):

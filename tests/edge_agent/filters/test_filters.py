@@ -1,5 +1,5 @@
-"""Tests that the sigma-point rules satisfy their theorems, and that the square-root filter equals
-textbook filters.
+"""Tests of the sigma-point rules and the square-root filter. A rule must integrate quadratic
+functions exactly, and the filter must equal textbook filters.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Tests of lower bounds. The lower end of a cell's friction interval may exceed the largest grip
-that any vehicle used by at most UTILISED_STD, the error of a reported grip. The order and number of
-the reports must not matter.
+"""Tests of lower bounds. Vehicles that use little grip measure only a lower bound of friction.
+However many such reports arrive, and in any order, the lower end of a cell's friction interval must
+not exceed u + UTILISED_STD. Here u is the largest grip that any vehicle used, and UTILISED_STD is
+the error of a reported grip.
 """
 
 from __future__ import annotations

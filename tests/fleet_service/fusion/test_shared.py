@@ -1,5 +1,6 @@
-"""Tests of errors that all vehicles in one cell have in common. Many reports from the same
-manoeuvre must not make such an error look smaller. Reports from different manoeuvres must.
+"""Tests of errors that all vehicles in one cell have in common. Reports from the same manoeuvre
+share such an error, so many of them must not reduce the estimated uncertainty. Reports from
+different manoeuvres must reduce it.
 """
 
 from __future__ import annotations

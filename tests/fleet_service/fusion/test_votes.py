@@ -1,6 +1,6 @@
-"""Tests of votes (effects of single visits) on the belief about a cell. Visits of many vehicles
-must count more than as many of one vehicle, and a changed road must be believed after few visits. A
-vehicle that always disagrees with others must lose its influence.
+"""Tests of votes (effects of single visits) on the belief about a cell. Visits of several vehicles
+must have more effect than the same number of visits of one vehicle. A change of the road must be
+believed after few visits. A vehicle that always disagrees with others must lose its influence.
 """
 
 from __future__ import annotations

@@ -49,9 +49,9 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
 
 
 def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
-    """Return two road times [h] between `begin` and `end` [h after START]. A road time is elapsed
-    time weighted by the weather: the first weights the slow drift of friction, the second its
-    sudden change.
+    """Return two road times [h] between `begin` and `end` [h after START]. A road time is the
+    elapsed time multiplied by a rate that depends on the weather. The first road time uses the rate
+    of slow drift of friction, the second the rate of sudden changes.
     """
     drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
     return drift / 3600.0, change / 3600.0

@@ -224,8 +224,9 @@ def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
 
 def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> None:
     """A batch with unusable records must be rejected if its head (all fields other than the
-    records) can be read. Without a rejection, the vehicle would send the batch for ever, and the
-    service would accept at most 65536 of its later batches.
+    records) can be read. Without a rejection, the vehicle would send the batch for ever. Its
+    sequence number would stay missing, and the service stores at most 65536 numbers above a missing
+    one. Therefore the service would in the end refuse all later batches of this vehicle.
     """
     pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
     del pb.mu[1:]

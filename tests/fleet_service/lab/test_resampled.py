@@ -1,6 +1,7 @@
-"""Tests of simulated reports in a town. Their errors come from the estimator's reports on other
-drives. All reports of a town vehicle must have the errors of one vehicle in these drives, on roads
-of similar friction, scaled to the town's friction.
+"""Tests of simulated reports in a town. They are drawn from the estimator's reports on other
+simulated drives, so that they have realistic errors. Each town vehicle must get the reports of one
+vehicle of these drives, from roads of similar friction. The values must be scaled to the friction
+of the town's roads.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of the simulated fleet of another car maker. Its reports must have the stated errors. The
-evaluation's figures must be right for maps with known answers.
+"""Tests of the simulated fleet of another car maker, and of the scores of the evaluation that uses
+this fleet. The reports must have the errors that `third_party` describes, such as a gain error. The
+scores must be right for beliefs whose score is known.
 """
 
 from __future__ import annotations

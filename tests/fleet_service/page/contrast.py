@@ -47,7 +47,8 @@ def text_contrasts(theme: str, sight: str) -> dict[str, float]:
 
 def class_contrasts(theme: str, sight: str) -> dict[str, float]:
     """Return the contrast of each map class against the background in a theme (light or dark), as
-    seen with a kind of colour vision. A class counts with its fill or its edge.
+    seen with a kind of colour vision. Some classes are drawn with an edge, because their fill has
+    too little contrast. For these, return the higher contrast of fill and edge.
     """
     named = read_colours(theme)
     edged = re.search(r"EDGED = \[([\d, ]+)\]", (STATIC / "ribbons.js").read_text())

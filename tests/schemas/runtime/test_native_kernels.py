@@ -99,9 +99,10 @@ def run_python(folder: Path, code: str, *words: str) -> list[str]:
 
 @pytest.mark.campaign
 def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
-    """The library must give the results of Numba without importing Numba, and must report an
-    exception in a kernel (compiled function). Numba must run the calls that the library lacks:
-    those whose result is no integer, or that have an array of another layout.
+    """The library must run kernels (compiled functions) without importing Numba, and must return
+    the same results as Numba. An exception in a kernel must be raised as ArithmeticError. Numba
+    must run calls for which the library has no kernel. Here these are a function that returns a
+    float, and a call with an array that is not contiguous.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
     library = str(tmp_path / "library.so")
