@@ -294,8 +294,11 @@ class LostGrip:
 def lost_grip(
     visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
 ) -> LostGrip:
-    """Return the passes of cars over new ice that took place after the first alert for the patch of
-    ice. Warnings reach the share `share` of the drivers.
+    """Find the passes of cars over new ice after the first alert for the patch of ice. Return for
+    each pass if the driver was warned and if a wheel lost its grip.
+
+    `share` is the share of the drivers who receive warnings. It determines which of the vehicles
+    have a warned driver. `changed_ns` is the time [ns] at which the new ice appeared.
     """
     on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     since = np.full(visits.num_rows, NEVER)

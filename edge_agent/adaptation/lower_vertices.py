@@ -1,20 +1,23 @@
 """Triangular fuzzy sets whose lower vertices (feet) can be chosen freely: the sets that paper 004
-tunes (section III.C, figures 2 and 3).
+tunes (section III.C, figures 2 and 3). They adapt the measurement noise R.
+
+The input is the mismatch: actual over theoretical innovation variance, minus 1. The output is the
+step: the change of ln R in one adaptation.
 
 Legend
     peaks       upper vertices of the five sets of the mismatch [1] (5,)
-    feet        their lower vertices between the peaks: right foot of set k, left foot of set k + 1
-                [1] (8,)
-    out_peaks   upper vertices of the five sets of the step, ln of the factor on R [nat] (5,)
-    out_feet    their lower vertices [nat] (8,)
-    w_k, c_k    membership of set k, and centroid (left foot + peak + right foot)/3 of its output
-                set
+    feet        two lower vertices between each pair of neighbouring peaks: right foot of set
+                k, left foot of set k + 1 [1] (8,)
+    out_peaks   upper vertices of the five sets of the step [nat] (5,)
+    out_feet    lower vertices of the sets of the step, in the order of `feet` [nat] (8,)
+    w_k         membership of the mismatch in set k
+    c_k         centroid of output set k: (left foot + peak + right foot)/3
 
 The step is sum(w_k*c_k)/sum(w_k). The outer sets are shoulders: beyond the outer peaks their
-membership is 1. With the feet at the neighbouring peaks and out_feet at the neighbouring out_peaks,
-these are almost the sets of `memberships.Memberships`, whose feet always lie at the neighbouring
-peaks and whose output sets are points. If the feet leave a gap and no set has a membership there,
-the step is zero.
+membership is 1. If the feet leave a gap and no set has a membership there, the step is zero.
+
+The default estimator uses simpler sets (`memberships.Memberships`). Their feet always lie at the
+neighbouring peaks, and their output sets are points.
 """
 
 from __future__ import annotations
@@ -35,14 +38,18 @@ LEAST_OVERLAP: Final = 0.02
 
 @dataclass(frozen=True)
 class LowerVertices:
-    """Triangular fuzzy sets of the mismatch (of the innovation variance) and of the step of ln R.
-    Their feet (lower corners) can be chosen, as shares of the distance between neighbouring peaks.
+    """Triangular fuzzy sets for the adaptation of the measurement noise R.
+
+    The input sets describe the mismatch (actual over theoretical innovation variance, minus 1). The
+    output sets describe the step, which is the change of ln R. The feet (lower corners) are given
+    as shares of the distance between neighbouring peaks; a foot with share 1 lies at the
+    neighbour's peak.
 
     Attributes:
-        feet: for each pair of neighbours, how far set k extends towards peak k + 1, then how far
-            set k + 1 extends towards peak k [1]; 1 means up to the peak.
-        out_feet: the same shares for the output sets (sets of the step of ln R).
-        peaks: upper vertices of the sets of the mismatch [1].
+        feet: two shares for each pair of neighbouring sets k and k + 1 [1]: the right foot of set
+            k, measured from its peak, then the left foot of set k + 1, measured from its peak.
+        out_feet: the same shares for the output sets.
+        peaks: upper vertices of the input sets [1].
         out_peaks: upper vertices of the output sets [nat].
 
     Raises:
@@ -78,9 +85,12 @@ class LowerVertices:
             )
 
     def triangle_sets(self) -> tuple[FloatArray, FloatArray]:
-        """Return two arrays (5, 3): the fuzzy sets of the mismatch (actual over theoretical
-        innovation variance, minus 1) and those of the step of ln R (measurement noise). The columns
-        are left foot, peak, right foot.
+        """Return the vertices of the fuzzy sets as two arrays (5, 3) with the columns left foot,
+        peak, right foot.
+
+        The first array has the sets of the mismatch (actual over theoretical innovation variance,
+        minus 1) [1]. The second has the sets of the step, the change of ln R [nat]. R is the
+        measurement noise.
         """
         return _triangle_sets(self.peaks, self.feet), _triangle_sets(self.out_peaks, self.out_feet)
 
@@ -94,9 +104,9 @@ class LowerVertices:
         return float(weight @ outputs.mean(axis=1)) / total if total > 0.0 else 0.0
 
     def knot_table(self, knots: int) -> tuple[FloatArray, FloatArray]:
-        """Return a table for linear interpolation of the function `step`, as two arrays (knots,):
-        the mismatches (actual over theoretical variance of the innovations, minus 1) [1], and the
-        steps of ln R [nat] for them. R is the measurement noise.
+        """Return a table for linear interpolation of the function `step`, as two arrays (knots,).
+        The first has mismatches (actual over theoretical innovation variance, minus 1) [1]. The
+        second has, for each mismatch, the change of ln R [nat]. R is the measurement noise.
         """
         inputs, _ = self.triangle_sets()
         corners = np.unique(np.clip(inputs.ravel(), self.peaks[0], self.peaks[-1]))
@@ -128,9 +138,12 @@ class LowerVertices:
 
 
 def _triangle_sets(peaks: tuple[float, ...], feet: tuple[float, ...]) -> FloatArray:
-    """Return left foot, peak and right foot of five triangular fuzzy sets, (5, 3), from their
-    `peaks` (5,) and their feet between the peaks `feet` (8,). The outer feet of the first and last
-    set lie at their peaks.
+    """Return left foot, peak and right foot of five triangular fuzzy sets, (5, 3).
+
+    `peaks` (5,) are the peaks. `feet` (8,) are the distances of the feet from the peaks of their
+    sets, as shares of the distance between neighbouring peaks. Each pair of neighbours has two
+    entries: right foot of the lower set, left foot of the upper set. The first set has no left
+    slope and the last no right slope, so these outer feet lie at the peaks.
     """
     sets = np.repeat(np.asarray(peaks, float)[:, None], 3, axis=1)
     for k in range(SETS - 1):

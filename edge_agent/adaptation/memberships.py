@@ -10,21 +10,23 @@ Legend
     ln_scales   ln of the nominal R relative to the table of constants: for wheel speeds and for
                 axle forces [nat] (2,)
 
-Rules of the default estimator (`rule_base.py`): `far` is a ramp (foot, peak), the others are
-consequents of rules.
-
-    far         mismatches at which the membership in FAR (beyond theory) begins and is complete [1]
-    consequents ln of the factor on the axles' R while steering is WIDE [nat]; rate at which
-                offsets, slope and bank return to their prior while the mismatch of the
-                wheels is FAR [1/s]
-    shares      ln of the share of a block's evidence on friction that is used, in the order: a
-                wheel slides (no, yes), demand (low, middle, high), forces (as before, new) [nat]
-                (12,)
-    strained    term added to `shares` where the beliefs about the car are strained (far from their
-                prior), in the order: a wheel slides (no, yes) [nat] (2,)
-
 Each triangle ends at its neighbours' peaks. Therefore the memberships of a mismatch sum to one, and
 the sets cover the whole range.
+
+The other fields belong to the rules of the default estimator (`rule_base.py`). The set FAR contains
+large mismatches of the wheel speeds, the set WIDE large steering angles.
+
+    far         mismatch at which the membership in FAR is 0, and mismatch at which it is 1 [1] (2,)
+    consequents two outputs of rules (2,): ln of the factor on the axles' R while steering is
+                WIDE [nat], and rate at which offsets, slope and bank return to their prior
+                while the mismatch is FAR [1/s]
+    shares      ln of the share of a block's evidence on friction that is used [nat]: one value
+                for each combination of three inputs (12,)
+    strained    term added to `shares` if the estimated states of the car are far from their
+                prior [nat] (2,): while no wheel slides, and while a wheel slides
+
+The inputs of `shares` are a wheel's slide (no, yes), the force over load (low, middle, high) and
+the change of forces (unchanged, changed). The last input varies fastest in the list.
 """
 
 from __future__ import annotations

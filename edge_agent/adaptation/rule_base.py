@@ -1,22 +1,26 @@
-"""Fuzzy rules by which the default estimator adapts three quantities: the measurement noise R, the
-share of the evidence on friction that it uses, and the rate at which it forgets offsets.
+"""Fuzzy rules of the default estimator. They adapt three quantities: the measurement noise R, the
+share of the evidence on friction that is used, and the rate at which sensor offsets are forgotten.
 
 | if | then | kind |
 |---|---|---|
 | mismatch of wheels or axles is in one of five sets | ln R changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
-| slide, demand, new forces, strain are in a set each | ln of the evidence share | Takagi–Sugeno |
+| slide, demand, new forces and strain each have a set | ln of the evidence share | Takagi–Sugeno |
 
-Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1). The
-first row is implemented in `fuzzy.py`. The other sets are ramps from a foot (membership 0) to a
-peak (membership 1); feet, peaks and consequents are `Memberships`. Demand is the force over load of
+Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1).
+Takagi–Sugeno: each combination of the four inputs' sets has a value, and the result is their mean,
+weighted by membership. The first row is implemented in `fuzzy.py`. The other sets are ramps from a
+foot (membership 0) to a peak (membership 1); `Memberships` contains feet, peaks and consequents.
+
+Mismatch is actual over theoretical innovation variance, minus 1. Demand is the force over load of
 an axle. Forces are new if they differ from their recent averages. Strain is the deviation of the
 estimated states of car and sensors from their prior. Inputs come from the block (0.05 s of samples)
 that has just ended, so no rule has its own effect as input.
 
-`plain_rules` has no fuzzy set: the share of evidence is a product of two ramps, and nothing else
-changes. It is the baseline with which the evaluation compares the rules (figure `fuzzy.worth`).
+`plain_rules` is the baseline without fuzzy sets. It replaces the last row by the formula of
+`plain_share`, and switches off the second and third row. The evaluation divides the score with
+fuzzy rules by the score of this baseline; the ratio is the figure `fuzzy.worth`.
 """
 
 from __future__ import annotations
@@ -45,8 +49,8 @@ class RuleBase(NamedTuple):
     """Parameters of the fuzzy rules: a ramp (foot, peak) per fuzzy set, and the consequents
     (outputs) of the rules.
 
-    If `by_sets` is False, `plain_share` with the parameters `plain` replaces the fuzzy rules of
-    the share of evidence.
+    Rules also determine the share of the evidence on friction that the filter uses. If `by_sets` is
+    False, the formula of `plain_share`, with the parameters `plain`, replaces these rules.
     """
 
     far: Annotated[FloatArray, 2]
@@ -78,9 +82,14 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return a rule base without fuzzy sets. The share of the evidence on friction that the filter
-    uses is then `plain_share` with `half`, `power` and `steady`, and neither the measurement noise
-    R nor forgetting is adapted.
+    """Return a rule base without fuzzy sets. The filter then uses the share `plain_share` of the
+    evidence on friction. Wide steering does not increase R, and no mismatch accelerates the
+    forgetting.
+
+    Args:
+        half: demand (force over load of an axle) at which half of the evidence is used [1].
+        power: exponent of demand, which determines how steeply the share rises around `half` [1].
+        steady: factor on the share while the forces equal their recent averages [1].
     """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))

@@ -2,18 +2,19 @@
 rules (paper 001).
 
 Legend
-    alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the
-                paper's (18) is a difference of traces, which adds squares of different units
-    rate        rate of alpha [1/s]
-    level       consequent of a rule: ln of the factor on R [nat]                         (5, 7)
+    alpha       mismatch of the innovation variance: actual over theoretical, minus 1 [1]
+    rate        rate of change of alpha [1/s]
+    level       output of a rule: ln of the factor on R [nat]                             (5, 7)
 
 Sets are triangles that end at their neighbours' peaks, so memberships sum to one and the inference
 is bilinear.
 
-Table 1 of paper 001 has rows NB NM Z PM PB for the rate, and columns NB NM NS Z PS PM PB for alpha.
-For negative alpha the printed table increases R, although the text asks for a decrease; there the
-reciprocal of the level is used. The sets PMB and PSM, which the paper does not define, are assumed
-to be the steps next to PM.
+The module departs from the paper in three points. (1) Equation (18) defines alpha as a difference
+of traces of covariance matrices. A trace adds squares of different units, so the ratio is used
+here. (2) Table 1 has rows NB NM Z PM PB for the rate, and columns NB NM NS Z PS PM PB for alpha.
+For negative alpha the printed table increases R, although the text asks for a decrease. There the
+reciprocal of the factor is used. (3) The paper uses two output sets, PSM and PMB, without a
+definition. Here PSM lies between PS and PM, and PMB between PM and PB.
 """
 
 from __future__ import annotations
@@ -66,9 +67,14 @@ def infer_two(
     alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray
 ) -> float:
     """Return ln of the factor on the measurement noise R [nat] by bilinear interpolation in the
-    table `levels` (5, 7). The arguments are `alpha`, the mismatch of the innovations' variance,
-    with set peaks `at` (7,), and its rate, with set peaks `of` (5,). Beyond the outer peaks the
-    result is constant.
+    table `levels` (5, 7) of rule outputs. Beyond the outer peaks the result is constant.
+
+    Args:
+        alpha: mismatch of the innovations: actual over theoretical variance, minus 1 [1].
+        rate: rate of change of alpha [1/s].
+        at: (7,) peaks of the fuzzy sets of alpha, the columns of the table.
+        of: (5,) peaks of the fuzzy sets of the rate, the rows of the table.
+        levels: (5, 7) ln of the factor on R for each pair of sets [nat].
     """
     i, u = bracket_peaks(alpha, at)
     j, v = bracket_peaks(rate, of)

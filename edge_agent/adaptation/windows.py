@@ -1,10 +1,15 @@
 """Measurement noise from a moving window of innovations in which larger innovations have more
 weight (paper 002, equations 24 and 25).
 
-Legend: e_j innovations (measurement minus prediction) of one measurement in the last N samples; c_j
-= |e_j| their weights, normalised (the paper's are not); P variance of the predicted measurement; R
-= sum(c_j*e_j^2)/sum(c_j)/2 - P. The factor one half is not in the paper; it makes R correct,
-because for a normal variable E|e|^3 / E|e| = 2 var(e).
+Legend
+    e_j         innovation (measurement minus prediction) j of the last N, for one measurement
+    c_j         weight of e_j: its absolute value |e_j|
+    P           variance of the predicted measurement, without noise
+    R           noise variance: sum(c_j*e_j^2)/sum(c_j)/2 - P
+
+Two points differ from the paper. The sum is divided by the sum of the weights, which the paper does
+not do. The factor one half is added; with this factor R is correct for normally distributed errors,
+because then E|e|^3 / E|e| = 2 var(e).
 """
 
 from __future__ import annotations

@@ -95,9 +95,9 @@ class MapSubscriber:
         """Subscribe to alerts and send map queries along the possible paths, the most likely path
         first. The call does not wait for an answer.
 
-        The subscriptions cover the first `within` metres of the paths. Queries are sent only if a
-        part of these metres was not requested recently. They then cover all such parts up to the
-        ends of the paths.
+        The subscriptions cover the first `within` metres of the paths. A path is queried only if
+        some part of its first `within` metres was not requested recently. The queries then cover
+        every part of the whole path that was not requested recently.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back = bool(routers - self._routers)

@@ -1,10 +1,11 @@
-"""Path ahead in steps of one metre, with the map cells and heading sectors of each metre. The
-module is pure.
+"""Path ahead in steps of one metre, with the map places of each metre. The module is pure.
 
 Legend
     s        distance ahead of the car [m], (M,): 1, 2, 3 …
-    key      cell·4 + sector: a place of the map, int64
-    places   (M, C) keys that a metre may lie in, the likeliest first; NONE fills unused columns
+    place    a map cell together with one of four sectors of the driving direction
+    key      number of a place, cell·4 + sector, int64
+    places   (M, C) keys of the places whose map data apply to a metre, the likeliest first;
+             NONE fills unused columns
 
 The map's reports come from cars that may have driven in the next lane, with a position error of 1.5
 m. Therefore each metre also covers places a little to the left and right. If the heading is near

@@ -43,9 +43,9 @@ class PlannerLink:
         self._session = open_session(self._settings)
 
     def receive_horizons(self, _: str, horizons: list[Horizon], pose: Pose) -> None:
-        """Compute the speed limit from the horizons (knowledge of the map about each metre ahead).
-        Publish the limit if it has changed, or if the last message was sent at least REPEAT_S
-        seconds ago.
+        """Compute the speed limit from `horizons`, the map's values for each metre ahead on each
+        possible path. Publish the limit if it has changed, or if the last message was sent at least
+        REPEAT_S seconds ago.
         """
         changed = self._limit.update(limit_of(horizons), pose.time)
         if self._session is None or not (changed or pose.time - self._sent >= REPEAT_S * NS):

@@ -1,9 +1,14 @@
 """The map as prior knowledge about the friction in the vehicle's current cell. The module is pure
 (no I/O).
 
-The estimator itself does not use the map: its recursion, and the published evidence of a visit
-(passage of one cell), are bit-equal with and without a map. This module computes a second belief,
-the one that the estimator would have if it had started the visit with the map's belief:
+The estimator itself does not use the map. Its results, and the published evidence of a visit
+(passage of one cell), are bit-equal with and without a map. This module computes a second belief
+(probabilities of friction). It is the belief that the estimator would have if it had started the
+visit with the map's belief.
+
+At the border of a cell, the filter's and the map's belief give the initial belief q. Inside the
+cell, the measurements turn q into p_M. The result p is a mean of p_M and the filter's own belief w,
+weighted by the probability β' that the map is wrong:
 
     q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at the border of a cell
     p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            inside the cell
@@ -12,18 +17,21 @@ Legend
     w⁻, w   the filter's own belief at the border, and now             (32,)
     m       the map's belief about this cell, faded with its age        (32,)
     u       uniform distribution on the friction grid                   (32,)
-    h       probability that the road changes at this border: the difference between the map's
-            beliefs about the two cells (total variation); BLIND if only this cell is known
+    h       probability that the road changes at this border
     L       likelihood of the visit's measurements so far               (32,)
     q, p_M  belief with the map at the border, and now                  (32,)
     p       result: mixture of the beliefs with and without the map     (32,)
-    β, β'   probability that the map is wrong here, before and after the measurements: β' =
-            β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. β begins at
-            SHARE, its lowest value. At each border β = SHARE + KEPT·(β' - SHARE)
+    β, β'   probability that the map is wrong here, before and after the measurements
+
+h is the total variation distance between the map's beliefs about the last cell and this cell. If
+the map knows only this cell, h is BLIND.
+
+β' follows from Bayes' rule: β' = β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. In
+the first cell β is SHARE, its lowest value. At each later border β = SHARE + KEPT·(β' - SHARE).
 
 At a border, only the filter's own belief is carried to the next cell, never the mixture p.
-Otherwise the map's belief about one cell would be counted again in the next. Averaging of
-hypotheses by their predictions: Hoeting et al., Bayesian model averaging, Stat. Sci. 14 (1999).
+Otherwise the map's belief about one cell would be counted again in the next. The mixture p is an
+instance of Bayesian model averaging (Hoeting et al., Stat. Sci. 14, 1999).
 """
 
 from __future__ import annotations

@@ -82,9 +82,12 @@ class _Neighbours:
         self.side = side
 
     def next_places(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Return the keys (cell·4 + sector) of the places that may follow the position `here` [m]
-        on a road, the most likely first. The vehicle's heading is `heading` [rad]. The places lie
-        at most `cells` cell widths away. At a fork, one place per road is returned.
+        """Return the map places that may follow the position `here` [m] on a road, the most likely
+        first. At a fork, one place per road is returned.
+
+        A place is a map cell together with one of four sectors of the driving direction; its key is
+        cell·4 + sector. The vehicle's heading is `heading` [rad]. The places lie at most `cells`
+        cell widths away.
         """
         reach = cells * self.side
         found = []

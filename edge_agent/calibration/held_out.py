@@ -147,10 +147,12 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
-    """Return True if the predictions `tried` are worse than `best`. They are worse if their mean
-    log-likelihood is lower by more than WORSE, or if on some drive the flag CONTRADICTION
-    (measurements contradict the model) is set for a share of the time that is larger by more than
-    LONGER.
+    """Return True if the predictions `tried` are worse than the predictions `best` on the same
+    drives.
+
+    Either of two reasons suffices. The mean log-likelihood is lower by more than WORSE. Or, on at
+    least one drive, the share of time with the flag CONTRADICTION (measurements contradict the
+    model) is larger by more than LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))

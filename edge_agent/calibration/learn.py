@@ -1,34 +1,37 @@
-"""Systematic errors of one car's sensors, learned from its own drives: for each quantity its mean
-over the drives, and the standard deviation of that mean.
+"""Systematic errors of one car's sensors, learned from its own drives. Each quantity gets a value
+and a standard deviation.
 
-    quantity          from
-    radius_fl … rr    speed of each wheel against the mean of the four in calm moments, minus the
-                      difference that yaw and slip explain
-    ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
-    yaw_rate          intercept of the regression of the wheels' yaw rate on the gyroscope's
-    steer_offset, steer_gain, understeer    δ = gain · L r/v + understeer · v r + offset, all three
-                                            in one regression
-    force_gain        torque over radius, divided by mass times acceleration: errors of torque gain
-                      and mass, if torque is recorded
+    quantity          estimate from one drive
+    radius_fl … rr    speed of the wheel relative to the mean of the four wheels, minus the
+                      difference that yaw and slip explain; only at small accelerations
+    ax                median of a_x − dv/dt
+    ay                median of a_y − v·r, only on straights
+    yaw_rate          gyroscope reading at which the wheel speeds show no yaw, by regression
+    steer_offset, steer_gain, understeer    coefficients of one regression:
+                      δ = gain · L r/v + understeer · v r + offset
+    force_gain        torque over radius, divided by mass times acceleration, if torque is
+                      recorded: errors of torque gain and mass
     wheel_lag, steer_lag    delay relative to the inertial unit: lags.py
 
-Symbols: v speed, r yaw rate, δ steering angle, L wheelbase.
+Symbols: v speed, r yaw rate, δ steering angle, L wheelbase, a_x and a_y accelerometer readings. A
+quantity that a drive does not excite enough is left out for that drive.
 
-At a single speed, gain and understeer have the same effect; only a prior common to all cars
-separates them. Therefore the regression of a drive has a prior with mean SOUND and standard
-deviation USUAL, and its standard deviations include the remaining uncertainty.
+At a single speed, steering gain and understeer have the same effect, so their regression needs a
+prior. The prior is the same for all cars, with mean SOUND and standard deviation USUAL. The
+standard deviations of the regression include the uncertainty that remains.
 
 Wheels slip under force. The driven axle therefore turns faster, and the other one slower. The radii
 are corrected for this with the stiffness and the driven axle of the vehicle file, and with usual
 air and rolling resistance.
 
-A quantity that a drive does not excite enough is left out for that drive. The standard deviation
-has two parts. The first is the median deviation between drives divided by the square root of their
-number; it is at least FLOOR, because few drives may agree by chance. The second is BIAS, the error
-common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). Both were set on 40
-simulated cars with large errors, with other seeds than those of the published results. The result
-is the posterior with the prior USUAL: a quantity with little excitation is therefore moved towards
-its usual value.
+The value of a quantity is the median over the drives. Its standard deviation has two parts. The
+first is the median deviation between drives, divided by the square root of their number. That
+deviation is at least FLOOR, because few drives may agree by chance. The second is BIAS, the error
+common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). FLOOR and BIAS were set
+on 40 simulated cars with large errors, with other seeds than those of the published results.
+
+Finally, the value is combined with the prior of SOUND and USUAL, unless its regression has already
+included this prior. A quantity with little excitation is therefore moved towards its usual value.
 """
 
 from __future__ import annotations
@@ -177,9 +180,10 @@ def _posterior_of(
     """Return the posterior (mean, standard deviation) of a quantity of the calibration, called
     `kind`, from its estimates in several drives, `values` (n,).
 
-    `bias` is the standard deviation of errors common to all drives, and `unknown` the smallest
-    standard deviation that a drive states. If `unknown` is not 0, the estimates already include the
-    prior, so their median is not moved towards the prior mean again.
+    `bias` is the standard deviation of errors common to all drives. `unknown` is the smallest
+    standard deviation that the steering regression reports for the quantity; 0 for quantities from
+    other methods. That regression already includes the prior. Therefore the median is moved towards
+    the prior mean only if `unknown` is 0.
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))

@@ -102,7 +102,8 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     """Return a function that prints warnings on stdout, as text or as JSON, depending on the log
     format.
 
-    In JSON an infinite number of seconds until the stretch is written as null.
+    A warning contains the time [s] until the car reaches the slippery stretch of road. In JSON, an
+    infinite time is written as null.
     """
     say = line_logger(config.log, sys.stdout)
 

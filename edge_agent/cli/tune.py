@@ -190,8 +190,10 @@ def run(args: argparse.Namespace) -> int:
 def _tuning_drives(
     args: argparse.Namespace, objective: str, duration_s: float
 ) -> tuple[TuningSet, TuningSet]:
-    """Return two sets of drives: for the search for fuzzy sets, and held-out ones to compare its
-    results. The drives are simulated, or parts of the recorded logs that the options name.
+    """Return two sets of drives. The search for fuzzy sets uses the first set. The second set is
+    held out from the search; the fuzzy sets found by different searches are compared on it.
+
+    The drives are simulated, or parts of the recorded logs that the options name.
     """
     if not args.log:
         return record_all("train", duration_s), record_all("held_out", duration_s)

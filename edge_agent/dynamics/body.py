@@ -1,10 +1,16 @@
 """The planar rigid body: accelerations that result from wheel forces.
 
-Legend: Fx, Fy wheel forces in the wheel's frame [N], delta road-wheel angle [rad], m mass [kg], Iz
-yaw inertia [kg m^2], (x, y) wheel position [m], a_x, a_y acceleration of the centre of gravity in
-body axes [m/s^2] (the reading of a level accelerometer there), r yaw rate [rad/s]. The velocities
-follow from v_x' = a_x + r*v_y and v_y' = a_y - r*v_x (paper 004, equation 2, with the sign of the
-errata).
+Legend
+    Fx, Fy      wheel forces in the wheel's frame [N]
+    delta       road-wheel angle [rad]
+    m, Iz       mass [kg], yaw inertia [kg m^2]
+    (x, y)      wheel position relative to the centre of gravity [m]
+    a_x, a_y    acceleration of the centre of gravity in body axes [m/s^2]; a level
+                accelerometer at the centre of gravity measures these values
+    r           yaw rate [rad/s]
+
+The velocities follow from v_x' = a_x + r*v_y and v_y' = a_y - r*v_x. These are equations (2) of
+paper 004 with a sign corrected (see the paper's errata).
 """
 
 from __future__ import annotations

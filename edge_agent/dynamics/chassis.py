@@ -79,13 +79,18 @@ def tyre_forces(
     shape: float,
     forces: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Fill the two arrays (4,) of `forces` [N], the longitudinal and lateral tyre forces in the
-    wheels' axes, at motion (5,): velocities v_x, v_y, yaw rate, and accelerations a_x, a_y. The
-    accelerations determine the loads.
+    """Compute the longitudinal and lateral tyre forces [N] of the four wheels in the wheels' axes,
+    and write them to the two arrays (4,) of `forces`.
 
-    row: vehicle parameters; wheels: result (4, 3) of `wheel_inputs`, where a wheel with speed NaN
-    rolls freely; mu (4,): friction at the wheels; shape: shape factor c of the Magic Formula (with
-    curvature 0), or DUGOFF.
+    Args:
+        row: vehicle parameters.
+        motion: (5,) velocities v_x, v_y [m/s], yaw rate [rad/s], accelerations a_x, a_y [m/s^2];
+            the accelerations determine the wheel loads.
+        wheels: (4, 3) result of `wheel_inputs`; a wheel with speed NaN rolls freely.
+        mu: (4,) friction at the wheels [1].
+        shape: selects the tyre model. DUGOFF selects the Dugoff model. Any other value is the
+            shape factor c of a Magic Formula with curvature 0.
+        forces: receives the longitudinal forces, then the lateral forces.
     """
     parameters = body_of(row)
     loads = wheel_loads(parameters, motion[3], motion[4])

@@ -1,16 +1,19 @@
-"""The electric drive wheel: motor, wheel and tyre force; a sliding mode models the derivative of
-the force (paper 002).
+"""The electric drive wheel: motor, wheel and longitudinal tyre force (paper 002). The force is a
+state whose derivative returns to zero, modelled as a sliding mode.
 
 Legend
     tau     motor torque at the wheel, K_t*i [N m]           J    inertia, wheel and rotor [kg m^2]
     tau_u   stationary torque for the voltage [N m]          T_e  electric time constant L/R [s]
     omega   wheel speed [rad/s]                              R    wheel radius [m]
     F, F'   longitudinal force, its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
+    K_t     torque per motor current i [N m/A]               K_a  back-EMF constant [V s/rad]
 
-tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31). Torque is
-used in place of current, because the paper's K_a, K_t and J do not belong to one machine, and there
-are no signals of current or voltage. Equation (31) prints the derivative of F in place of that of
-F', and takes the sign of a difference of quantities with different units; both are corrected here.
+tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31).
+
+Departures from the paper: (1) Torque replaces the motor current, because there are no signals of
+current or voltage. Moreover, the paper's values of K_a, K_t and J do not belong to the same motor.
+(2) The left side of (31) is printed as F', but F'' is meant. (3) The sign function in (31) is
+printed with a difference of quantities that have different units. Here its argument is F'.
 """
 
 from __future__ import annotations

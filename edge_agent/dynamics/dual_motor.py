@@ -1,9 +1,13 @@
 """Drive with one motor per axle and a differential: paper 004, equations (4) to (6).
 
-Legend: omega_1, omega_2 speeds of an axle's wheels and omega_c of its midpoint [rad/s], T_di drive
-torque at wheel i [N m], T_m motor torque [N m], i_t transmission ratio, eta_t efficiency of the
-transmission, F_xi and F_x longitudinal force of the wheel and of the axle [N], J_w inertia of a
-wheel [kg m^2], R wheel radius [m].
+Legend
+    omega_1, omega_2    speeds of an axle's wheels [rad/s]
+    omega_c             rotational speed at the axle's midpoint [rad/s]
+    T_di                drive torque at wheel i [N m]
+    T_m                 motor torque [N m]
+    i_t, eta_t          ratio and efficiency of the transmission [1]
+    F_xi, F_x           longitudinal force of wheel i, and of the axle [N]
+    J_w, R              inertia [kg m^2] and radius [m] of a wheel
 
     J_w*omega_i' = T_di - F_xi*R                    (4)
     2*J_w*omega_c' = T_m*i_t*eta_t - F_x*R          (5), (6)

@@ -1,9 +1,15 @@
 """Vertical wheel loads with quasi-static load transfer.
 
-Legend: m mass [kg], h height of the centre of gravity [m], L wheelbase [m], a, b distances to the
-axles [m], a_x, a_y acceleration of the centre of gravity [m/s^2], Fz load [N]; wheels in the order
-fl, fr, rl, rr. ISO 8855 signs: forward acceleration moves load to the rear, and a left turn (a_y >
-0) to the right wheels.
+Legend
+    m           mass [kg]
+    h           height of the centre of gravity [m]
+    L           wheelbase [m]
+    a, b        distances from the centre of gravity to the front and rear axle [m]
+    a_x, a_y    acceleration of the centre of gravity [m/s^2]
+    Fz          wheel load [N], in the order fl, fr, rl, rr
+
+Signs follow ISO 8855: forward acceleration moves load to the rear, and a left turn (a_y > 0) to the
+right wheels.
 """
 
 from __future__ import annotations

@@ -40,10 +40,12 @@ class Parameter(IntEnum):
 def parameter_row(vehicle: Vehicle) -> FloatArray:
     """Return the parameters of `vehicle`, shape (15,), indexed by `Parameter`.
 
-    The stiffnesses in the vehicle file are means over the four wheels at static load. The row has
-    stiffness per newton of load, which is valid for lightly and heavily loaded wheels. If the file
-    gives a separate rear stiffness, the rear one is used for all wheels. The remaining difference
-    of the front axle is explained by compliance, a state of the default estimator.
+    The stiffnesses in the vehicle file are means over the four wheels at static load. The row
+    contains stiffness per newton of load, which is valid for lightly and heavily loaded wheels.
+
+    If the file gives a separate rear cornering stiffness, that value is used for all wheels. The
+    front axle appears softer, because steering column and bushings yield. The default estimator
+    estimates this effect separately, by its state `compliance`.
     """
     static_load = vehicle.mass * GRAVITY / 4.0
     rear = vehicle.cornering_stiffness_rear

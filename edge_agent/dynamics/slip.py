@@ -1,8 +1,13 @@
 """Velocity of a wheel centre and the slip of its tyre.
 
-Legend: v_x, v_y velocity of the centre of gravity [m/s], r yaw rate [rad/s], (x, y) wheel position
-in the body [m], delta road-wheel angle [rad], R radius [m], omega wheel speed [rad/s]; index w: in
-the wheel's frame.
+Legend
+    v_x, v_y    velocity of the centre of gravity [m/s]
+    r           yaw rate [rad/s]
+    (x, y)      wheel position in the body [m]
+    delta       road-wheel angle [rad]
+    R           wheel radius [m]
+    omega       wheel speed [rad/s]
+    index w     in the wheel's frame
 """
 
 from __future__ import annotations

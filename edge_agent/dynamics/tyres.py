@@ -74,12 +74,15 @@ def combined_magic(
     c: float,
     e: float,
 ) -> tuple[float, float]:
-    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
-    directions, by similarity with the Magic Formula.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame at combined slip (longitudinal
+    and lateral) with the Magic Formula.
 
-    `slip` is (longitudinal slip, tangent of the slip angle) [1], `stiffness` (longitudinal [N],
-    lateral [N/rad]), `mu` the friction [1], `load` the wheel load [N]; `c` and `e` are shape and
-    curvature of the curve [1].
+    Similarity method: the normalised slips of both directions form a vector. The Magic Formula
+    gives the size of the force for the length of this vector. The force has the vector's direction.
+
+    `slip` is (longitudinal slip, tangent of the slip angle) [1], and `stiffness` (longitudinal [N],
+    lateral [N/rad]). `mu` is the friction [1], and `load` the wheel load [N]. `c` and `e` are shape
+    and curvature of the Magic Formula [1].
     """
     grip = mu * load
     if grip <= 0.0:
@@ -97,12 +100,16 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """Return the forces (Fx, Fy) [N] of one wheel in its own frame, from its slip in both
-    directions, by similarity with the Dugoff curve. slip (longitudinal, tangent of the slip angle)
-    [1], stiffness (longitudinal [N], lateral [N/rad]), mu [1], load [N].
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame at combined slip (longitudinal
+    and lateral) with the Dugoff curve f.
 
-    The curve of the normalised slip theta is theta up to one half, where the force is stiffness
-    times slip, then 1 - 1/(4*theta). It has no falling branch.
+    Similarity method: the normalised slips of both directions form a vector of length theta. The
+    force has the direction of this vector and the size mu*load*f(theta). Up to theta = 1/2,
+    f(theta) = theta, so that the force is stiffness times slip. Beyond, f(theta) = 1 - 1/(4*theta),
+    which has no falling branch.
+
+    `slip` is (longitudinal slip, tangent of the slip angle) [1], and `stiffness` (longitudinal [N],
+    lateral [N/rad]). `mu` is the friction [1], and `load` the wheel load [N].
     """
     grip = max(mu * load, 0.0)
     free_x = stiffness[0] * slip[0]

@@ -1,8 +1,14 @@
-"""Torque balance of a wheel.
+"""Torque balance of a wheel: J*omega' = T - R*F_x.
 
-Legend: T torque at the wheel, driving positive [N m], J inertia [kg m^2], omega wheel speed
-[rad/s], R radius [m], F_x longitudinal tyre force [N]: J*omega' = T - R*F_x. Torque gives the force
-with little noise. Wheel speed is used as a measurement, never as an exact input (errata).
+Legend
+    T       torque at the wheel, driving positive [N m]
+    J       inertia [kg m^2]
+    omega   wheel speed [rad/s]
+    R       wheel radius [m]
+    F_x     longitudinal tyre force [N]
+
+Torque gives the force with little noise. Wheel speed is used as a measurement, never as an exact
+input (see the errata of the papers).
 """
 
 from __future__ import annotations

@@ -74,8 +74,11 @@ class AdaptiveDesign:
 
 
 class AdaptiveSetting(NamedTuple):
-    """Options of paper 001's filter: adaptation of noise and shares, tyre model, and motion
-    filter.
+    """Options of paper 001's filter.
+
+    `adaptive` switches the adaptation of the measurement noise R and of the information shares on
+    or off. `tyre` selects the tyre model. `motion` contains the noise variances of the filter that
+    estimates velocity, acceleration and yaw rate (`gaussian/federated_motion`).
     """
 
     adaptive: bool = True  # False: R and shares are constant (comparator FKF)

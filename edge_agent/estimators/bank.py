@@ -80,8 +80,9 @@ class EstimatorBank:
             threads: number of threads that share the vehicles; the result does not depend on it.
 
         Returns:
-            Estimates at the same samples. Only the column `evidence` contains NaN. It is NaN at all
-            samples at which neither a visit ends nor friction jumps.
+            Estimates at the same samples. The field `evidence` (log-likelihood of the measurements
+            for each friction) has values only where a visit ends or where friction jumps. At all
+            other samples it is NaN. No other field contains NaN.
 
         Raises:
             InputError: an array has the wrong shape for the bank, or threads is below 1.

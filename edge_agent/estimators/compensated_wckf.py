@@ -1,15 +1,20 @@
-"""Estimator `compensated-wckf`: the filters of paper 002, weighted square-root cubature filters on
-the electric drive wheel, with compensation of the tyre force. Numbers in brackets are the paper's
-equations.
+"""Estimator `compensated-wckf`: the two filters of paper 002, WCKF-A for the wheels and WCKF-B for
+the vehicle. Both are weighted square-root cubature Kalman filters. Numbers in brackets are the
+paper's equations.
 
 Chen, Cai, Chen, Xu, Jiang, Sun, "Design of vehicle running states-fused estimation strategy using
 Kalman filters and tire force compensation method", IEEE Access 2019, doi
 10.1109/ACCESS.2019.2925370 (paper 002).
 
-Filter WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4] (yaw rate r; torque,
-speed and force of each wheel), measurement [r, tau x 4, omega x 4] (30) to (32), see `drive_wheel`.
-Tyre forces: Magic Formula (12), compensated by (33). Filter WCKF-B: states [v_x, v_y, r],
-measurement [r, a_x, a_y] (35), (36). Both filters compute R from a weighted moving window (25), see
+WCKF-A estimates 19 states: v_x, v_y, yaw rate r, and for each wheel motor torque tau, speed omega,
+longitudinal force F_x and its derivative F_x'. It measures r, tau and omega, by equations (30) to
+(32). The module `drive_wheel` contains its model of a driven wheel.
+
+Tyre force compensation (33) blends two longitudinal forces per wheel: the estimate F_x of WCKF-A
+and the force of the tyre model, the Magic Formula (12).
+
+WCKF-B estimates v_x, v_y and r from the compensated forces. It measures r, a_x and a_y, by
+equations (35) and (36). Both filters compute R from a weighted moving window (25), see
 `adaptation.windows`.
 
 The filters do not estimate friction: they assume a constant, here DRY (a dry road). Therefore the
@@ -76,8 +81,11 @@ B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of measured r, a_x and a_y, 
 
 
 class DriveWheelState(IntEnum):
-    """Index of a state in the state vectors of the filters WCKF-A and WCKF-B. For a quantity that
-    WCKF-A has per wheel, it is the index of the front left wheel's value.
+    """Index of a state in the state vectors of paper 002's filters: WCKF-A for the wheels and
+    WCKF-B for the vehicle. WCKF-B has only the first three states.
+
+    TORQUE, OMEGA, FORCE and SLOPE (derivative of the force) exist once per wheel. Their index is
+    that of the front left wheel; the other three wheels (fr, rl, rr) follow.
     """
 
     VX = 0
@@ -90,8 +98,8 @@ class DriveWheelState(IntEnum):
 
 
 class CompensatedMemory(PaperMemory):
-    """State of paper 002's filters, WCKF-A and WCKF-B, for one vehicle, kept from one sample to the
-    next.
+    """State of paper 002's filters for one vehicle, kept from one sample to the next: WCKF-A for
+    the wheels and WCKF-B for the vehicle.
     """
 
     mean: Annotated[FloatArray, A_STATES]
@@ -179,9 +187,10 @@ def _compensated_forces(
     """Compute the compensated longitudinal forces (4,) [N] of the wheels at the motion x (3,), by
     equation (33) of paper 002.
 
-    The result is a blend of the forces of the tyre model and of the forces `observed` by WCKF-A. It
-    is written into the first array of `forces`; the lateral forces of the tyre model are written
-    into the second.
+    For each wheel, the result is the weighted mean of the tyre model's force and of the force
+    `observed`, which the wheel filter WCKF-A estimates. The weight of the tyre model is
+    `slip_share`. The result is written into the first array of `forces`. The second array receives
+    the lateral forces of the tyre model.
     """
     X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])

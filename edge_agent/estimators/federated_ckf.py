@@ -1,19 +1,22 @@
-"""Estimator `federated-ckf`: the filters of paper 000, joint federated cubature filters for motion
-and for the friction of four wheels. Numbers in brackets are the paper's equations.
+"""Estimator `federated-ckf`: the joint filters of paper 000 for vehicle motion and for the friction
+of four wheels. Both are federated cubature Kalman filters: a master fuses the results of two
+sub-filters. Numbers in brackets are the paper's equations.
 
 Wu, Li, Fan, "Joint estimation of driving state and road adhesion coefficient for distributed drive
-electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443. Motion filter: see
-`gaussian/federated_motion`. Friction filter: state [mu_fl, mu_fr, mu_rl, mu_rr], random walk (28).
-Like the motion filter it has two sub-filters, with measurements [a_x, a_y, r] and [a_y, r] (40) to
-(48), fused by (51), (52). The friction filter uses the estimated motion, and the tyres of the
-motion filter use the estimated friction (figure 3). The information shares of the sub-filters
-follow from (54).
+electric vehicle", IEEE Access 2021, doi 10.1109/ACCESS.2021.3081443.
 
-The printed Q = I and R = 10 000 (57) suit a tyre whose slip stiffness is proportional to friction;
-`literal.federated_friction` contains the friction filter as printed. The stiffness of a real tyre
-does not depend on friction, so here R is sensor noise plus model error. The estimate returns to the
-prior with the distance driven, because the road may change. ELEMENTS lists each element of the
-paper and every departure with its reason.
+The motion filter is described in `gaussian/federated_motion`. The friction filter has the state
+[mu_fl, mu_fr, mu_rl, mu_rr], which the paper models as a random walk (28). Its first sub-filter
+measures [a_x, a_y, r] and its second [a_y, r], by equations (40) to (48). The master fuses both by
+(51) and (52). The information shares of the sub-filters follow from (54). The friction filter uses
+the estimated motion, and the tyre model of the motion filter uses the estimated friction (figure
+3).
+
+The paper's values Q = I and R = 10 000 (57) suit a tyre whose slip stiffness is proportional to
+friction; `literal.federated_friction` contains the friction filter as printed. The stiffness of a
+real tyre does not depend on friction, so here R is sensor noise plus model error. The estimate
+returns to the prior with the distance driven, because the road may change. ELEMENTS lists each
+element of the paper and every departure with its reason.
 """
 
 from __future__ import annotations
@@ -93,8 +96,9 @@ def make_bank(
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of paper 000's joint filters, one per vehicle. `tyre` and `motion` replace the
-    default options of the tyre model and of the motion filter.
+    """Return a bank of paper 000's joint filters, one per vehicle. `tyre` replaces the default
+    options of the tyre model. `motion` replaces the default variances of the filter of planar
+    motion.
     """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)

@@ -8,6 +8,9 @@ nodes at once, with one node per lane of a vector register (`schemas.runtime.lan
 `linearization`, `residuals`, `covariance` and `tyre_curve`. `weighing` computes the weights
 (probabilities) of the nodes from the result of the update. `mixing` and `friction_grid` with
 `split_sides` combine the nodes' results. `restart` starts and resets a filter, `step` runs all
-operations in order, and `bank` writes the output. `constants` holds all numbers, `design` the
-tables computed from them, and `memory` and `workspace` the records.
+operations in order, and `bank` writes the output.
+
+Four modules define data. `constants` contains all numbers, and `design` the tables computed from
+them. `memory` defines the state of one filter that is kept between samples. `workspace` defines the
+scratch arrays of a computation step.
 """

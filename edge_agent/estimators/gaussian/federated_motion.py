@@ -62,8 +62,8 @@ LEAST_BETA = 0.1  # [1] smallest information share, so that both sub-filters kee
 
 
 class MotionSetting(NamedTuple):
-    """Variances of the motion filter: process noise per STEP_S, initial state, and measurement
-    noise of each sub-filter.
+    """Variances of the filter of planar motion (velocity, acceleration, yaw rate): process noise
+    per STEP_S, initial state, and measurement noise of each sub-filter.
     """
 
     process: tuple[float, ...] = tuple(map(float, PROCESS**2))
@@ -76,8 +76,8 @@ class MotionSetting(NamedTuple):
 
 
 class FederatedMotion:
-    """Data of the motion filter of one vehicle: setting, state of the master, information shares of
-    the sub-filters, and latest innovations (measurement minus prediction).
+    """Data of the filter of planar motion for one vehicle: variances, state of the master,
+    information shares of the sub-filters, and latest innovations (measurement minus prediction).
     """
 
     process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S

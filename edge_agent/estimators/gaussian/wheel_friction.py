@@ -1,10 +1,14 @@
 """The friction of four wheels as states of a Gaussian filter: its return to the prior over the
 distance driven, and the mean over the wheels.
 
-Legend: mu_i friction of a wheel, m_0 and s_0 its prior mean and standard deviation (moments of the
-uniform prior), lambda distance constant of forgetting [m], rho correlation between the wheels'
-friction. Over d metres mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda).
-Without evidence friction returns to the prior.
+Legend
+    mu          friction of a wheel [1]
+    P           covariance of the four frictions
+    m_0, P_0    prior mean and covariance (moments of the uniform prior)
+    lambda      distance constant of forgetting [m]
+
+Over d metres mu' = m_0 + k*(mu - m_0) and P' = k^2*P + (1 - k^2)*P_0, with k = exp(-d/lambda).
+Without evidence, friction thus returns to the prior.
 """
 
 from __future__ import annotations

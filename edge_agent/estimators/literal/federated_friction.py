@@ -1,12 +1,16 @@
-"""The friction filter of paper 000 as printed: two cubature sub-filters and a master, with given
-motion. Numbers in brackets are the paper's equations.
+"""The friction filter of paper 000 as printed: two cubature sub-filters, and a master that fuses
+their results. The vehicle's motion is given. Numbers in brackets are the paper's equations.
 
-State mu_fl, mu_fr, mu_rl, mu_rr, a random walk (28); measurements [a_x, a_y, r] and [a_y, r] (53);
-F_x from wheel torque (10). The information shares follow from (54), which gives more information to
-the worse sub-filter. Both shares start at one half, because the printed start at zero divides by
-zero. Equation (52) uses P_f, not its inverse. The cubature points use singular values (40), (41).
+The state is [mu_fl, mu_fr, mu_rl, mu_rr], a random walk (28). The first sub-filter measures [a_x,
+a_y, r], and the second [a_y, r] (53). F_x follows from wheel torque (10).
 
-Legend: beta_i share of sub-filter i; P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20).
+Legend
+    P_f, Q      covariance and process noise of the master
+    beta_i      information share of sub-filter i; its P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20)
+
+The information shares follow from (54), which gives more information to the worse sub-filter. Both
+shares start at one half, because the printed start at zero divides by zero. Equation (52) uses P_f,
+not its inverse. The cubature points use singular values (40), (41).
 """
 
 from __future__ import annotations

@@ -3,10 +3,12 @@ block (the samples within 0.05 s).
 
 Longitudinal force comes from torque, F_x = (T - J*omega')/R. Where torque or speed is missing, the
 force m*a_x is divided among the axles, with a larger standard deviation, because this division is
-uncertain (`drive_split.py`). On a slope or bank (lateral slope) an accelerometer also measures
-gravity. The tyres carry exactly this force. Therefore the forces here include slope and bank, but
-offsets of the sensor are subtracted. Lateral axle forces come from m*a_y and Iz*r' (paper 004,
-equation 2; errata 000 on signs and arms).
+uncertain (`drive_split.py`). On a slope or bank (lateral slope), an accelerometer also measures a
+part of gravity. The tyres must carry this part too, so mass times the reading is the tyre force.
+Therefore only the sensor's offsets are subtracted from the reading, not slope and bank.
+
+Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2). Signs and lever arms of that
+equation are corrected as for paper 000 (see its errata).
 """
 
 from __future__ import annotations
@@ -48,9 +50,11 @@ LIKELY = 2.0  # of the estimated difference of the wheel radii
 
 @compiled
 def strained_noise(trust: Trust, constants: Constants) -> float:
-    """Return the factor by which the measurement noise R of the axle forces is multiplied. It grows
-    with the strain, the deviation of the vehicle and sensor states from their prior. A car that
-    deviates much in these known errors probably also has large unknown errors.
+    """Return the factor by which the measurement noise R of the axle forces is multiplied.
+
+    It grows with the strain, the deviation of the estimated vehicle and sensor states from their
+    prior. If these states show large errors of the car, errors that the filter does not estimate
+    are probably large too.
     """
     factor = (trust.strain / constants.strain_usual) ** constants.strain_power
     return float(min(max(factor, constants.strain_least), constants.strain_most))
@@ -230,10 +234,11 @@ def axle_force(memory: MixtureMemory, features: BlockFeatures, axle: int) -> flo
 @compiled
 def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None:
     """Compute the lateral force over load of both axles, and each wheel's share of the axle load.
-    Also compute the derivatives of the force by a_y, and by the leak (the share of a_y that is
-    gravity felt by the rolled body).
-
     The lateral force is NaN if a_y is missing.
+
+    Also compute two derivatives of the lateral force over load: with respect to a_y, and with
+    respect to the leak. Body roll tilts the accelerometer, so that a part of the measured a_y is
+    gravity. The leak is this part as a share of a_y.
     """
     row = memory.row
     loads = features.loads
@@ -264,7 +269,9 @@ def _compute_side_forces(memory: MixtureMemory, features: BlockFeatures) -> None
 @compiled
 def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
     """Set the lateral force of an axle to NaN if it cannot be used, and return the health flags.
-    Without the steering angle the slip of the axle is unknown, and without the yaw rate its force.
+
+    The force cannot be used without the steering angle, because the lateral slip of the axle is
+    then unknown. It cannot be computed without the yaw rate.
     """
     health = 0
     counts = memory.block.counts
@@ -283,9 +290,12 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
 @compiled
 def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
     """Write the standard deviation of each measurement residual, and the variance of the slip
-    noise, to `features`. A residual is the distance of the measured point (slip, force) from the
-    tyre curve. Slip and force count equally in this distance, so half of the variance of the slip
-    noise enters.
+    noise, to `features`.
+
+    A residual is the distance of the measured point (slip, force) from the tyre curve. Slip is
+    scaled so that the curve begins with slope 1. There, an error of the slip changes the distance
+    by 1/sqrt(2) of the error. Therefore half of the slip variance is added to the residual's
+    variance.
     """
     row = memory.row
     constants = design.constants
@@ -372,11 +382,11 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
 
 @compiled
 def _compute_information(constants: Constants, features: BlockFeatures) -> None:
-    """Compute features.informs_x and features.informs_y of both axles. These are factors, 0 to 1,
-    by which the effect of the filter's stiffness states on the axle's computed slips is multiplied.
+    """Compute features.informs_x and features.informs_y: for each axle, factors from 0 to 1 that
+    limit how much the filter learns about longitudinal and lateral tyre stiffness.
 
-    The factors are near 0 at small forces. There the slip is mostly noise, and without the factors
-    the filter would learn a wrong stiffness from it.
+    The factors are near 0 at small forces. There the measured slip is mostly noise, and without the
+    factors the filter would learn a wrong stiffness from it.
     """
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
@@ -391,12 +401,13 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
 def unexplained_slip_difference(
     memory: MixtureMemory, constants: Constants, features: BlockFeatures
 ) -> float:
-    """Return the largest difference in slip between the left and right wheel of an axle, over both
-    axles, minus the part that the forces of these wheels explain.
+    """Return the difference in slip between the left and right wheel of an axle that the forces of
+    these wheels do not explain. The larger value of the two axles counts.
 
-    Slip is expressed as the force over load of a linear tyre [1]. Wheels of unequal radius always
-    differ in slip. Therefore the estimated difference of the radii is subtracted, with an allowance
-    for its uncertainty.
+    The unit is force over load [1]: slip times the tyre's stiffness per load. Wheels of unequal
+    radius always differ in slip. Therefore the estimated difference of the radii is removed. An
+    allowance for the uncertainty of this difference and for wheel-speed noise is subtracted from
+    the result.
     """
     row = memory.row
     block = memory.block

@@ -6,9 +6,10 @@ road changes only once in hundreds of metres, so that learned friction lasts. Wi
 alone, the lower end would fall to the friction of ice much too late for a patch of a few metres.
 
 Therefore this module stores, for each ice node (hypothesis of low friction), the probability that
-the car is now on a patch. While the car drives the length of a patch, this probability grows to the
-node's prior probability minus its probability in the mixture. Evidence against ice reduces it. Only
-the reported lower end uses this probability.
+the car is now on a patch. While the car drives, this probability approaches a target, within about
+the length of a patch. The target is the node's prior probability, minus the probability that the
+mixture already gives to the node. Measurements that speak against ice reduce the stored
+probability. Only the reported lower end uses the stored probability.
 """
 
 from __future__ import annotations

@@ -142,17 +142,16 @@ def apply_road_change(
 
 @compiled
 def carried_degree(memory: MixtureMemory, constants: Constants, demand: float) -> float:
-    """Return the fuzzy degree, 0 to 1, to which the tyres carry as much force as the slippery road
-    of a slide allows.
+    """Return the fuzzy degree, 0 to 1, to which the end of a slide shows that the road has changed.
 
     After a slide, a wheel grips again either because the road has changed, or because the driver
-    has released the brake or the accelerator. If the tyres still carry such a force, the road has
-    changed.
+    has released the brake or the accelerator. In the second case the tyre forces are small.
+    Therefore the degree grows with the ratio of the tyre force to the friction of the slippery
+    road. It is 0 up to the ratio `carried_share`, 1 from twice that ratio, and linear between them.
 
     Args:
         memory: state of the filter; its friction is still that of the slippery road.
-        constants: contain `carried_share`, the share of that friction up to which the degree is 0;
-            it is 1 from twice this share.
+        constants: contain `carried_share` [1].
         demand: larger force over load of the two axles [1].
     """
     slippery = min(memory.friction_left.median, memory.friction_right.median)

@@ -60,8 +60,13 @@ FORGIVEN_S = 300.0  # [s] time constant with which evidence against the model an
 def update_consistency(
     memory: MixtureMemory, design: MixtureDesign, duration: float, ratio: float, health: int
 ) -> None:
-    """Update memory.trust (strain, and evidence against the model) with the states, the innovations
-    (measurement minus prediction) and the health flags of the block (0.05 s).
+    """Update memory.trust, the filter's trust in its model, after a block (0.05 s) of `duration`
+    [s].
+
+    The strain (deviation of the vehicle and sensor states from their prior) is computed from the
+    current states. The log-likelihood ratio against the model grows with the innovations
+    (measurement minus prediction) and with a reset of the motion (`health`). At its threshold, the
+    filter stops using evidence on friction for some time.
 
     `ratio` is the sum of the squared innovations of the axles in the block over their stated
     variance.
@@ -145,12 +150,12 @@ def mixture_cost(mean: FloatArray, nominal: Nominal) -> float:
 
 @compiled
 def belief_strain(cost: float, learned: float, prior: float) -> float:
-    """Return the strain (chi-square per degree of freedom) of the estimated vehicle and sensor
-    states. `cost` [nat] is half of the chi-square of these states against their prior.
+    """Return the strain: how far the estimated vehicle and sensor states deviate from their prior,
+    as chi-square per degree of freedom. `cost` [nat] is half of that chi-square.
 
-    `learned` is the number of degrees of freedom that measurements have determined. `prior` further
-    degrees of freedom are assumed, with a chi-square of 1 each. Therefore the result is 1 if
-    nothing was learned.
+    `learned` is the number of degrees of freedom that measurements have determined. The chi-square
+    of a few degrees of freedom is uncertain. Therefore `prior` degrees of freedom with a chi-square
+    of 1 each are added. Without learned states the result is thus 1.
     """
     return (2.0 * cost + prior) / (learned + prior)
 

@@ -127,14 +127,18 @@ def mixture_likelihood(scratch: Scratch, groups: int) -> float:
 
 @compiled
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Weaken (temper) the log-likelihood [nat] of each node (friction hypothesis) for a block (0.05
-    s), in scratch.log_likelihood. The weight, 0 to 1, with which it counts comes from fuzzy rules,
-    or from a formula if the filter is not adaptive.
+    """Weaken (temper) the log-likelihoods [nat] of all nodes (friction hypotheses) in a block (0.05
+    s), and store them in scratch.log_likelihood.
 
-    A node whose friction is below the grip in use is always penalised, at any tyre force. Once the
-    consistency test (`trust.py`) finds that the measurements contradict the model, no evidence is
-    used. Without accelerations, yaw rate or steering, sliding cannot be distinguished from rolling,
-    so no evidence on friction is used either.
+    Each node's log-likelihood relative to that of the best node is multiplied by a factor from 0 to
+    1. Fuzzy rules determine this factor, or a formula if the filter is not adaptive. A loss beyond
+    `plausible_loss` counts in full. A node whose friction is below the grip in use gets a penalty
+    that does not depend on the factor.
+
+    All log-likelihoods become 0, so that no node gains probability, in two cases. In the first, the
+    consistency test (`trust.py`) has found that the measurements contradict the model. In the
+    second, accelerations, yaw rate or steering are missing. Sliding then cannot be distinguished
+    from rolling.
     """
     constants = design.constants
     features = scratch.features
@@ -166,14 +170,15 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
     """Return the amount [nat] by which the log-likelihood of a node (friction hypothesis) must be
-    reduced because the measurement moved the node's vehicle states away from their prior.
+    reduced in this block (0.05 s). Add this amount to the node's total, memory.penalty[node].
 
-    `price` is the increase of the node's penalty by the block (0.05 s). A negative result (refund)
-    never exceeds the amount charged before.
+    `price` [nat] grows with the distance by which the block has moved the node's vehicle states
+    away from their prior. It is negative if the states have moved back. The result is then a
+    refund, which is at most the total charged before.
 
-    Reason: tempered (weakened) evidence contains only a part of this cost, although the measurement
-    changed the states in full. Without the charge, on drives with little grip demand, a low
-    friction would remain probable if combined with an improbable stiffness or sensor offset.
+    Reason: the evidence of a block is weakened, but its measurements change the vehicle states in
+    full. Without the charge, a wrong low friction would remain probable on drives with little grip
+    demand. An improbable stiffness or sensor offset would make up for the wrong friction.
     """
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
