@@ -137,9 +137,16 @@ class QueryEngine:
     def _read(
         self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*"
     ) -> Table:
-        """Return a table of the given files with one more column: the time column `moment`, in
-        whole seconds since 1970. The argument `seconds` is the name of this column. Queries use it
-        instead of `moment`, because DuckDB and Spark convert times differently.
+        """Return a table of the given files with one additional column: a time in whole seconds
+        since 1970. Queries use the additional column instead of the original time column, because
+        DuckDB and Spark convert times differently.
+
+        Args:
+            name: name of the table.
+            paths: Parquet files.
+            moment: name of the original time column.
+            seconds: name of the additional column.
+            columns: names of the other columns to read, separated by commas.
         """
         texts = [str(path) for path in paths]
         if self._spark is None:

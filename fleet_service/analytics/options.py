@@ -1,4 +1,6 @@
-"""Options of the questions, in addition to the selected part of the archive."""
+"""Options of the predefined questions (such as `vehicles` or `replay`) that can be asked about an
+archive. The time range and the area of the question are given separately.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Options:
-    """Options of all questions; each question uses some of them.
+    """Options of the predefined questions about an archive; each question uses some of them.
 
     Attributes:
         at: time of a road treatment, or of a replayed map [ns].
@@ -17,8 +19,9 @@ class Options:
         least_vehicles: minimum number of vehicles that must have measured a slippery stretch, a
             slippery period, or a road link, for it to be listed or judged.
         step_s: time between the frames of an animated replay [s]; None for one map.
-        lateness_s: setting of the service whose map is replayed: maximum delay of reports that are
-            used in order of time [s].
+        lateness_s: allowed delay of observations in a replayed map [s]. Observations with a longer
+            delay count less. The value must equal the setting `lateness_s` of the service;
+            otherwise the replayed map differs from the service's map.
         roads: table made by `fleet-service roads`.
         level: minimum friction that a maintenance contract requires.
         within_s: time within which this friction must be restored [s].

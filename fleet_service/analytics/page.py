@@ -54,8 +54,10 @@ class DrawnCells:
         part: for each square, the index of its row; None if every row has one square.
         sector: heading sector of each row: 0 east, 1 north, 2 west, 3 south.
         panels: for each panel (map), its name and one value per row; None means 'not measured'.
-        names, rows: labels of the texts that are shown for each row, and these texts.
-        frames, frame: names of the frames, and the frame number of each row.
+        names: labels of the texts that the page shows about a row when its place is selected.
+        rows: texts of each row, in the order of `names`.
+        frames: label of each frame; a frame is the map at one moment of an animation.
+        frame: for each row, the index of its frame; None if there is only one frame.
         lasting: for each row, True if its value will still grow, such as the duration of a slippery
             spell that has not ended.
     """

@@ -29,8 +29,10 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 
 
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
-    """Return the map at the end of the selected part, replayed from everything received until then,
-    as a GeoParquet table.
+    """Return the map at the time `part.until` and in the box `part.bbox`, as a GeoParquet table.
+    The map is computed again from all reports in the archive that were received until this time.
+
+    `lateness_s` is the allowed delay of observations [s], a setting of the service.
     """
     return snapshot_table(
         visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox),

@@ -36,8 +36,13 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """Task of a rebuild: archive, output folder, time of the map [ns], and maximum delay of reports
-    that are used in order of time [s].
+    """Task of a rebuild of the map and the hourly statistics.
+
+    Attributes:
+        root: folder of the archive.
+        out: folder for the output.
+        until: time of the map [ns].
+        lateness_s: allowed delay of observations [s]; observations with a longer delay count less.
     """
 
     root: Path

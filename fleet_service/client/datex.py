@@ -264,10 +264,15 @@ def _has_ended(record: ET.Element) -> bool:
 
 
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
-    """Return the id of a situation (hazard) in the previous publication that has a cell in common
-    with the stretch of road of `alert`, has not ended, and is not in `written`; None if there is
-    none. Cells are compared instead of names, because a client gives a stretch another name after a
-    restart.
+    """Return the id of the situation (hazard) in the previous publication that belongs to the
+    stretch of road of `alert`; None if there is none. The situation must not have ended, and must
+    contain a cell of the stretch. Cells are compared instead of names, because a client gives a
+    stretch another name after a restart.
+
+    Args:
+        alert: stretch of road with an active alert.
+        old: records of the previous publication by id.
+        written: ids that the new publication already contains; they are skipped.
     """
     cells = {
         f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points

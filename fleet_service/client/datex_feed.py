@@ -27,16 +27,16 @@ REFRESH_S: Final = 60.0
 
 
 class DatexFile:
-    """DATEX II publication (message for road authorities) that is stored in a file; each version
-    continues the previous content of the file.
+    """DATEX II publication (message for road authorities) that is stored in a file. Each version is
+    made from the previous content of the file, so that the reported hazards keep their ids.
 
     Args:
         supplier: supplier of the publication.
-        path: path of the file.
+        path: path of the file; a new publication is begun if the file does not exist.
         say: called with a line of text for the operator when the content changes.
 
     Raises:
-        InputError: the file has other content.
+        InputError: the file exists, but its content is not a publication that this class wrote.
     """
 
     def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
@@ -115,8 +115,9 @@ class DatexFeed:
             self._has_news = True
 
     def query_alerts(self, session: zenoh.Session) -> None:
-        """Query all active alerts, and end those that are not in the answer. Alerts at places for
-        which no service answers are not ended.
+        """Query all services for the active alerts, and replace the known alerts by the answer. A
+        known alert that is missing from the answer is ended, unless no service answers for its
+        place.
         """
         found = standing_alerts(session)
         self._heard = {}

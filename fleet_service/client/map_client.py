@@ -174,11 +174,13 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     """Return True if there is any sign of a service for the queried part of the map. This
     distinguishes an empty map from a missing service.
 
-    Any of three signs is sufficient. First, a service answers for one tile: at the start of the
-    route, at a corner of the box, or anywhere. Second, if no place is queried, a service replies to
-    a query of the whole map. Third, a service's liveliness token is visible. Each sign may be
-    absent: a router matches only services that answer for all of a key expression, and not every
-    reader may see tokens.
+    Three signs are checked in turn, because each may be absent although a service runs:
+
+    1. A service answers for one tile. It is the tile at the start of the queried route or at a
+       corner of the queried box. For a query without a place, it is the tile at latitude and
+       longitude 0, for which a service of limited regions usually does not answer.
+    2. If the query names no place, a service replies to a query of the whole map.
+    3. A service's liveliness token is visible. Not every reader may see tokens.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
     if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):

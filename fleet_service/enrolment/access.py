@@ -1,18 +1,22 @@
 """Configuration of a Zenoh router: mutual TLS, and an access list that denies everything not listed
 here. Pure (no I/O).
 
-| role    | may publish                                       | may read and query            |
-|---------|---------------------------------------------------|-------------------------------|
-| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, alive/NAME | as a reader; ack/NAME, PRIVATE |
-| owner   | nothing                                           | as a reader; PRIVATE of its own |
-| reader  | nothing                                           | map, alert and serves         |
-| weather | weather/**                                        | nothing                       |
-| service | everything under gripmap/ but PRIVATE             | the same                      |
-| router  | messages that others may publish, between routers | the same                      |
+| role    | may publish                          | may read and query                     |
+|---------|--------------------------------------|----------------------------------------|
+| reader  | nothing                              | PUBLIC keys                            |
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME,    | PUBLIC keys, ack/NAME,                 |
+|         | alive/NAME, own PRIVATE keys         | own PRIVATE keys                       |
+| owner   | nothing                              | PUBLIC keys, PRIVATE keys of the       |
+|         |                                      | vehicles that it owns                  |
+| weather | weather/**                           | nothing                                |
+| service | all keys except PRIVATE keys         | all keys except PRIVATE keys           |
+| router  | all keys, to forward messages        | all keys, to forward messages          |
 
-NAME is the name in the certificate. PRIVATE stands for the keys ahead/NAME and vss/NAME: the road
-ahead of a vehicle, and the friction at the vehicle. An owner reads the PRIVATE keys of the vehicles
-that it owns. Zenoh decides by the common name of the certificate. It reads the list only at its
+The table omits the prefix gripmap/v1/ of the keys. NAME is the name in the vehicle's certificate.
+PUBLIC keys are map/**, alert/** and serves/**. The PRIVATE keys of a vehicle are ahead/NAME (the
+road ahead) and vss/NAME (the friction at the vehicle).
+
+Zenoh identifies a client by the common name of its certificate. It reads the list only at its
 start. The sender is not informed about denials. Publishing on a wildcard counts as publishing on
 every matching key, so a rule must allow all of them.
 """
@@ -98,10 +102,13 @@ def rate_caps(fleet: Enrolment, name: str) -> list[Section]:
     """Return the rules that limit the message rate of each session at the router `name`, so that a
     flooding vehicle does not slow down others.
 
-    Zenoh counts messages per session and rule, and cannot distinguish a vehicle from a router. A
-    session of another router carries the messages of many vehicles and must not be limited. Routers
-    reach each other over TLS only. Therefore QUIC is always limited. TLS is limited everywhere if
-    there is only one router, else only on the interfaces named for vehicles.
+    A session of another router carries the messages of many vehicles and must not be limited. Zenoh
+    cannot distinguish a router from a vehicle, so the rules depend on the kind of connection:
+
+    - QUIC sessions are always limited, because routers never use QUIC to reach each other.
+    - TLS sessions are all limited if there is only one router.
+    - If there are several routers, TLS sessions are limited only on the router's
+      `vehicle_interfaces`, the network interfaces on which no other router connects.
     """
     router = fleet.routers[name]
     caps = [_rate_cap("quic", {"link_protocols": ["quic"]})] if router.quic else []

@@ -53,7 +53,8 @@ class Registry:
     """Folder of a certificate authority, and the operations on it.
 
     Args:
-        folder: DIR as described in `authority`; created if it does not exist.
+        folder: folder for the authority's keys, all certificates and the routers' configurations;
+            created if it does not exist.
         terms: validity periods.
         now: current time, with time zone.
         used_at: folder in which the routers will find their files (default: `folder`).

@@ -5,11 +5,15 @@ compiled.
 Legend
     p    belief about the friction that the whole fleet reads: probability per bin (32,)
     q    a belief in packed form: bins of 16 bits, the largest is 65 535          (32,)
-    L    likelihood of one visit, from its bytes                                (32,)
+    L    likelihood of one visit, decoded from the report (one byte per bin)    (32,)
     B    bias kernel: B[i, j] = P(the vehicle reads μ_j on a road of μ_i)  (32, 32), rows sum to 1
     L̃    B·L divided by its mean: L averaged over the vehicle's bias            (32,)
-    s    strength of a vote: share of new information × trust × P(the visit was in this cell) [-]
+    s    strength of a vote: a × b × c                                          [-]
+         a    share of the visit's information that earlier visits of the vehicle did not give
+         b    trust in the vehicle, its weight among all vehicles
+         c    P(the visit was in this cell), because positions are inaccurate
     h    P(the road changed within Δt), 1 - exp(-Δt / CHANGE_S)                 [-]
+         CHANGE_S    mean time between sudden changes of the road               [s]
 
 Arithmetic is in single precision, which takes half the memory of double precision. Only two digits
 of a belief are significant, so this is exact enough.

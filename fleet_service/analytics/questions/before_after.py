@@ -6,8 +6,9 @@ Legend
     n_b, n_a  number of values of a cell before and after the given time
     w         weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
     D         difference Σ w·(mean after - mean before) / Σ w
-    u_v       influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period),
-              with + and n = n_a after the given time, - and n = n_b before
+    u_v       influence of a vehicle on D, a difference of two sums over the vehicle's values:
+              Σ after the given time, w/(n_a·Σw)·(y - mean after)
+              minus Σ before the given time, w/(n_b·Σw)·(y - mean before)
     sd        standard deviation of D, sqrt(V/(V-1)·Σ u_v²) for V vehicles. All values of one
               vehicle count as one (cluster-robust variance, Liang and Zeger 1986).
 """
@@ -27,10 +28,16 @@ from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
-    """Return a table with one row: the numbers of cells, vehicles and values, and four sums, from
-    which the difference and its standard deviation are computed. Three sums are over cells: the
-    weights, and the weighted means before and after the given time. The fourth is over vehicles:
-    their squared influences.
+    """Return a table with one row, from which the difference D and its standard deviation are
+    computed. Only cells with values in both periods are used. The symbols are those of the module.
+
+    Columns of the row
+        cells, vehicles, values   numbers of cells, vehicles and values that are used
+        w                         Σ w over the cells
+        before, later             Σ w·mean before and Σ w·mean after, over the cells
+        squares                   Σ (u_v·Σw)² over the vehicles
+
+    `at_s` is the time that separates the periods, in seconds since 1970.
     """
     t = t.filter(has_value(t))
     t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))

@@ -42,9 +42,9 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Return a table of percentiles of mu per day, map cell and heading sector; `expression`
-    describes the rows. Also report the daily coverage of the network, which is the set of all cells
-    and heading sectors visited in the selected time.
+    """Return a table of percentiles of mu per day, map cell and heading sector. The docstring of
+    `expression` explains the columns. Also report the daily coverage of the network, which is the
+    set of all cells and heading sectors visited in the selected time.
     """
     found = engine.answer(expression(engine.observations()))
     for line in coverage_lines(found):
@@ -53,9 +53,13 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def coverage_lines(found: pa.Table) -> list[str]:
-    """Return one line of text per day: the shares of the road network (all cells visited in the
-    selected time) with a friction value, with only a lower bound of friction, and without a visit
-    of a vehicle on this day.
+    """Return one line of text per day about the coverage of the road network on this day. The
+    network is the set of all cells and heading sectors that `found` contains on any day.
+
+    Each line states three shares of the network:
+    measured       vehicles reported a value of the friction
+    only bounded   vehicles reported only lower bounds of the friction
+    not visited    no vehicle drove there
     """
     key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
     network = len(np.unique(key))

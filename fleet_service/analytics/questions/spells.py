@@ -69,6 +69,6 @@ def expression(t: Table, least_vehicles: int) -> Table:
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return a table with one row per slippery spell (time during which a cell was slippery) in the
-    selected part of the archive; `expression` describes the rows.
+    selected part of the archive. The docstring of `expression` explains the columns.
     """
     return engine.answer(expression(engine.observations(), options.least_vehicles))

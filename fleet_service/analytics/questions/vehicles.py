@@ -1,5 +1,5 @@
-"""`vehicles`: for each vehicle, the deviation of its values from those of other vehicles in the
-same cell and hour, and the health of its sensors.
+"""`vehicles`: for each vehicle, the deviation of its friction values from the values of other
+vehicles in the same cell and hour, and the health of its sensors.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ HOUR_S = 3600
 
 
 def expression(t: Table) -> Table:
-    """Return a table with one row per vehicle: the deviation (`bias`) of its values from those of
-    other vehicles. `bias` is null if the vehicle never measured in the same cell and hour as
-    another.
+    """Return a table with one row per vehicle. The column `bias` is the deviation of the vehicle's
+    friction values from the values of other vehicles in the same cell and hour. `bias` is null if
+    there are no such values of other vehicles.
 
-    `bias` is the mean of (own mean - mean of the others) over cells and hours. `bias_std` is its
-    standard error, and `z` is |bias| / bias_std.
+    `bias` is the mean of (own mean - mean of the other vehicles) over cells and hours. `bias_std`
+    is its standard error, and `z` is |bias| / bias_std.
     """
     reported = has_value(t)
     mine = t.group_by("vehicle").aggregate(
@@ -63,7 +63,8 @@ def expression(t: Table) -> Table:
 
 
 def ask(engine: QueryEngine, _: Options) -> pa.Table:
-    """Return a table with one row per vehicle in the selected part of the archive: the deviation of
-    its values from those of others; `expression` describes the rows.
+    """Return a table with one row per vehicle in the selected part of the archive. A row states how
+    far the vehicle's friction values deviate from the values of other vehicles in the same cell and
+    hour. The docstring of `expression` explains the columns.
     """
     return engine.answer(expression(engine.observations()))

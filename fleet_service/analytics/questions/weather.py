@@ -77,7 +77,7 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Return a table of the measured friction with one row per band of air temperature, for the
-    selected part of the archive; `expression` describes the rows.
+    selected part of the archive. The docstring of `expression` explains the columns.
 
     Raises:
         InputError: the table of stations is missing, or lacks a column.

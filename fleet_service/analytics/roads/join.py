@@ -80,7 +80,8 @@ class _Joined(NamedTuple):
         distance: distance from the cell's centre to this mark [m].
         ambiguous: by how much another link fits worse than the best one, as additional distance
             [m]; NaN if there is no other link.
-        second: True if this link is the second one of the cell: a link that adjoins it fits better.
+        second: True if the cell and sector also have a better row: an adjoining link that fits the
+            cell better than the link of this row.
     """
 
     cell: IntArray

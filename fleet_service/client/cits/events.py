@@ -152,9 +152,9 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return a DENM (hazard message) of an event with those fields set that all its messages
-        have in common. Both its detection time and its reference time (that of this version) are
-        `now` [ns UTC].
+        """Return a DENM (hazard message) of an event. Only the fields that every message of an
+        event contains are set. Both the detection time and the reference time (the time of this
+        version of the message) are `now` [ns UTC].
         """
         return Denm(
             self.station,

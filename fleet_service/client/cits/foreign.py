@@ -82,9 +82,11 @@ def encode_reports(
 def _headings(denm: Denm) -> tuple[float, ...]:
     """Return the headings [deg from north] of the traffic that a DENM (hazard message) concerns.
 
-    If the DENM states no heading, return both directions of the road. The road's axis is the line
-    from the event to the first other point of a trace or of the history. If there is no such point,
-    return north, east, south and west.
+    If the DENM states no heading, return both directions of the road. The direction of the road is
+    estimated by the line between the event and another position in the message. This position is
+    the first one that differs from the event's position, searched in two lists: the traces (paths
+    that lead to the event), then the history (further points of the event). If there is no such
+    position, return north, east, south and west.
     """
     if denm.heading is not None:
         return (denm.heading, denm.heading + 180.0) if denm.both_ways else (denm.heading,)

@@ -101,7 +101,8 @@ def run_gateway(
     """Send and receive DENM (hazard messages) until `stop` is set.
 
     Raises:
-        InputError: no service answers, the state file has other content, or a package is missing.
+        InputError: no service answers, a package is missing, or the file `sending.state` is damaged
+            or belongs to another station.
     """
     witness = None
     if receiving is not None:

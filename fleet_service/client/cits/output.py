@@ -29,14 +29,15 @@ class DenmOutput:
     Args:
         station: identifier of the originating station.
         originator: publisher, for the properties of the messages.
-        path: file of the events and of the messages that are not accepted yet; its content is
-            continued.
+        path: state file with the events and the messages that are not accepted yet. If it exists,
+            the output starts from its content, so a restart does not repeat events.
         send: function that sends a message; `mark_accepted` must be called with the message's name
             once it is accepted.
         clock: function that returns the time [ns UTC].
 
     Raises:
-        InputError: the file has other content.
+        InputError: the state file is damaged, belongs to another station, or was not written by
+            this class.
     """
 
     def __init__(
