@@ -88,8 +88,8 @@ class SpoolFile:
 
     def list_batches(self) -> Iterator[tuple[int, tuple[str, int, str, int, int, int], int]]:
         """Yield each batch as (key, identifier, size of the payload [bytes]), oldest first. The
-        identifier has the columns NAME (vehicle, agent run, kind, region, sequence number, number
-        of records).
+        identifier consists of vehicle, agent run, kind, region, sequence number and number of
+        records.
         """
         rows = self._database.execute(f"SELECT id, {NAME}, LENGTH(payload) FROM batch ORDER BY id")
         for key, *name, size in rows:
@@ -97,7 +97,7 @@ class SpoolFile:
             yield key, (vehicle, boot, kind, region, seq, records), size
 
     def insert_row(self, name: Row, payload: bytes) -> int:
-        """Insert a batch with its identifier `name` (the columns NAME) and its payload into the
+        """Insert a batch with its payload and its identifier `name` (see `list_batches`) into the
         outbox's file. Return the key (row number) of the new row.
         """
         cursor = self._database.execute(
@@ -132,8 +132,8 @@ class SpoolFile:
 
 
 def batch_checksum(name: Row, payload: bytes) -> int:
-    """Return the checksum (CRC-32) over the identifier `name` of a batch (its columns NAME) and its
-    payload.
+    """Return the checksum (CRC-32) of a batch: over its payload and its identifier `name` (vehicle,
+    agent run, kind, region, sequence number, number of records).
     """
     return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
 

@@ -3,9 +3,10 @@ makes the service lose or refuse data.
 
 A wall clock may jump: a time server corrects it, a machine wakes up, or a person sets it. The
 service therefore runs on a monotonic clock from its start. It follows a jump of more than JUMP_NS
-only if the reports of most current vehicles agree with the wall clock. Until then, a report that
-agrees with the wall clock or with the service's time is not refused. If it is later than the
-service's time, it is not acknowledged either, so its sender keeps it and sends it again.
+only if the reports of most current vehicles agree with the wall clock. Until then, the service
+refuses no report that agrees with the wall clock or with the service's time. Such a report may have
+a later time than the service. Then the service ignores it and sends no acknowledgement, so the
+sender keeps the report and sends it again.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ class TimeNow(NamedTuple):
         now: time of the service.
         slack: accepted reports may be this much later than `now`; above 0 if the archive contained
             later reports at the start.
-        doubt: reports that are later than `now` + `slack`, by at most this much, are ignored but
-            not rejected; their senders repeat them.
+        doubt: reports whose time is after `now` + `slack`, by at most this much, are neither
+            accepted nor refused; their senders repeat them.
         least: lower bound of the true time.
-        sure: True if the passing of time alone may end alerts; False while the clock may be wrong.
+        sure: False while the clock may be wrong; alerts whose time is over are then not ended.
     """
 
     now: int

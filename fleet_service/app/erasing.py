@@ -2,11 +2,11 @@
 `archive.identity.erasure_requests`. (A segment is a file of new rows, a checkpoint a saved state of
 the service.)
 
-    1. after a segment:               the service's state is on disk up to this segment
-    2. in a separate process:         the vehicle's rows are removed from the files; all other rows
-                                      are read again and make a checkpoint
-    3. between two later segments:    the service drops its state, and loads this checkpoint and the
-                                      segments written since
+    1. The service completes a segment, so that all rows that it has accepted are on disk.
+    2. A separate process removes the vehicle's rows from the files. It then reads all other rows up
+       to this segment, and writes a checkpoint computed from them.
+    3. Between two later segments, the service drops its state. It loads the new checkpoint and the
+       segments written since step 1.
 
 Checkpoints, snapshots of the map, retention (removal of old rows) and compaction (merging of files)
 run in the same thread, so none of them sees an incomplete erasure. Other processes wait for the

@@ -50,9 +50,10 @@ class PastQuery(NamedTuple):
     Attributes:
         query: parameters of the query.
         at: the moment [ns].
-        lateness_s: maximum delay of reports that are used in order of time [s].
+        lateness_s: allowed delay of observations [s]; observations with a longer delay count less.
         only: the only selected tile; None for any.
-        public: minimum number of recent vehicles of a cell that readers may see.
+        public: smallest number of vehicles that must have visited a cell recently, so that readers
+            may see the cell.
     """
 
     query: MapQuery

@@ -168,7 +168,7 @@ class BackgroundJobs:
     """Thread that runs the background jobs.
 
     Attributes:
-        failed: number of consecutive failures by job; only jobs whose last run failed.
+        failed: for each job whose last run failed, the number of its consecutive failures.
     """
 
     def __init__(

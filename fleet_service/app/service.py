@@ -1,10 +1,12 @@
 """The running service. One worker thread connects Zenoh and the engine (the parts of the service
 without its network).
 
-subscribers ─► inbox ─► worker: ingest ─► alerts at once
-                                flush ─► thread: rows on disk ─► acknowledgements
-                                tiles once a second, with the time that is left
-queryables  ─► answers, in Zenoh's threads
+Zenoh messages ─► inbox ─► worker thread, in a loop:
+                           1. process the messages; publish alerts at once
+                           2. give new rows to another thread, which writes them to disk;
+                              acknowledge the rows that are on disk
+                           3. publish changed map tiles, each at most once a second, if time is left
+Zenoh queries  ─► answered in Zenoh's own threads
 """
 
 from __future__ import annotations
@@ -170,9 +172,11 @@ class Service:
                 raise
 
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
-        """Return True if another service has taken over the archive. Normally the lease in the
-        bucket shows this. While the bucket does not answer, the function `came` shows it: it
-        returns True if liveliness tokens of another service for the same regions have appeared.
+        """Return True if another service has taken over the archive.
+
+        Normally this service learns this from the lease (time-limited ownership), which is stored
+        in the bucket (object store) with the archive's copy. If the bucket does not answer, this
+        service calls `came`, which returns True if another service has announced the same regions.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():

@@ -1,5 +1,6 @@
-"""Settlement of admitted batches (messages with records): their rows are first written to disk as
-segments (files of new rows), and to the bucket; then acknowledgements are sent.
+"""Settlement of admitted batches (messages with records). First, their rows are written to disk as
+segments (files of new rows). If the archive has a copy in a bucket (object store), the segments are
+also uploaded to this bucket. Only then are the batches acknowledged.
 """
 
 from __future__ import annotations
@@ -65,8 +66,9 @@ class Settlement:
 
     @property
     def is_full(self) -> bool:
-        """Return True if too many rows wait for the disk, or too many batches (messages with
-        records) for the archive's copy in the bucket.
+        """Return True if the service must not accept more messages for now. Either too many rows
+        wait to be written to disk, or too many batches (messages with records) wait to be uploaded
+        to the archive's copy in a bucket (object store).
         """
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
@@ -85,9 +87,12 @@ class Settlement:
         return self._log.hangs_s
 
     def until_early_s(self, now_s: float) -> float:
-        """Return the time [s] until the waiting rows should be written to disk early, that is,
-        before the regular period ends; `now_s` is the monotonic time [s]. Infinite if no rows wait,
-        if a write is running, or if the last write failed.
+        """Return the time [s] until the waiting rows may be written to disk before the regular
+        period (setting `segment_s`) ends. The earlier they are durable, the earlier their senders
+        receive an acknowledgement. At most WRITE_SHARE of the time is spent on writing.
+
+        The result is infinite if no rows wait, if a write is running, or if the last write failed.
+        `now_s` is the monotonic time [s].
         """
         if self.failing or not self._log.can_begin:
             return math.inf

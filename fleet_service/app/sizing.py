@@ -2,8 +2,9 @@
 measured costs per vehicle, cell, pair of vehicle and cell, and observation.
 
 The costs of processor, network and disk come from `make country-bench` (100 000 vehicles for ten
-minutes on two cores). The costs of memory are fitted to engines (services without network) with 10⁴
-to 10⁵ vehicles, of which `make bench ONLY=sizing` measures two again.
+minutes on two cores). The costs of memory are fitted to the measured memory of engines (services
+without network) with 10⁴ to 10⁵ vehicles. `make bench ONLY=sizing` checks the fit: it measures the
+memory for 10⁴ and for 10⁵ vehicles again.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class Costs(NamedTuple):
         process_bytes: memory of a service without data.
         vehicle_bytes, cell_bytes, pair_bytes: memory per vehicle; per cell and sector; per pair of
             a vehicle and a cell that it visited lately.
-        waiting_bytes: memory per observation in the lateness window, the last minutes in which late
-            reports are still used in order of time.
+        waiting_bytes: memory per observation in the lateness window (the last minutes, whose
+            observations are kept so that delayed ones can be sorted in by time).
         window_bytes: additional memory per cell and sector with such observations.
         service_s: processor time of a service per observation [s].
         router_s: processor time of a router per message [s].
@@ -73,7 +74,7 @@ COSTS: Final = Costs(
 class MemoryContent(NamedTuple):
     """Content of a service's memory: numbers of vehicles, of cells (counted once per heading
     sector), of pairs of a vehicle and a cell that it visited lately, and of observations in the
-    lateness window (the last minutes, in which late reports are still used in order of time).
+    lateness window (the last minutes, whose observations are kept to sort in delayed ones by time).
     """
 
     vehicles: float
@@ -90,7 +91,8 @@ class PlannedFleet(NamedTuple):
         rate_hz: observations per second of each vehicle; one per visited cell.
         cells: number of cells (counted once per heading sector) of all roads.
         message_rows: observations per message.
-        lateness_s: setting `lateness_s` of the service [s].
+        lateness_s: allowed delay of observations [s], a setting of the service. The service keeps
+            all observations of this period in memory, so that it can sort delayed ones.
     """
 
     vehicles: float

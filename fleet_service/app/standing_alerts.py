@@ -1,6 +1,8 @@
-"""Active ("standing") alerts of a service, prepared for publication. All alerts of a tile are the
-answer to a query. Single alerts are published again, one after the other, for clients that start
-late. Ended alerts give a message that states the end.
+"""Active ("standing") alerts of a service, prepared for publication.
+
+- A query is answered with all active alerts of each queried tile (map square).
+- Active alerts are published again in turn, so that clients that connect later receive them.
+- When an alert ends, a message that states its end is published.
 """
 
 from __future__ import annotations
@@ -73,8 +75,11 @@ class StandingAlerts:
         return out
 
     def end_erased(self, before: Iterable[Alert]) -> None:
-        """End the alerts in `before`, the alerts that were active before an erasure, if they are no
-        longer active. The caller must hold the lock of the shared state.
+        """Prepare the end messages of alerts that an erasure of data has removed. `expire` returns
+        these messages. The caller must hold the lock of the shared state.
+
+        `before` contains the alerts that were active before the erasure. Those that are missing
+        from the active alerts now were removed.
         """
         still = {(alert.cell, alert.sector) for alert in self.all}
         ended = [alert for alert in before if (alert.cell, alert.sector) not in still]

@@ -103,7 +103,8 @@ class SharedState:
 
     Args:
         state: state loaded from the archive.
-        public_vehicles: minimum number of vehicles of a cell that readers may see.
+        public_vehicles: smallest number of vehicles that must have visited a cell, so that readers
+            may see the cell.
 
     Attributes:
         guard: lock that is held while the map is changed or read.

@@ -52,8 +52,8 @@ class _Load(Generic[Batch]):
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
         """Write one segment per kind (observations or states) that has waiting rows. Then make all
-        segments (files of new rows) durable: on disk and, if `upload` is given, also in a second
-        place.
+        segments (files of new rows) durable: on disk and, if `upload` is given, also in another
+        storage.
         """
         for kind, waiting in self.waiting.items():
             if waiting:
@@ -74,15 +74,17 @@ class SegmentLog(Generic[Batch]):
     Args:
         root: folder of the archive.
         shard: name of the service.
-        upload: function that copies segments to a second place. If given, a batch (message with
-            records) is durable only when it is in both places.
-        epoch: smallest epoch (number of the start) for segment names, larger than those of earlier
-            owners of the archive; 0 if the archive is used without a lease.
+        upload: function that copies segments to another storage, such as a bucket (object store).
+            If given, a batch (message with records) is durable only when it is on disk and there.
+        epoch: smallest allowed epoch, the number in segment names that increases with every start
+            of a service. If services own the archive in turn by a lease, pass the epoch of the
+            lease; without a lease pass 0.
 
     Attributes:
         on_written: called in the internal thread when a write has ended, successfully or not.
-        begun_s: monotonic time [s] at which the last write with rows began.
-        write_s: duration [s] of the last write with rows that has ended.
+        begun_s: monotonic time [s] at which the newest write began; writes without rows are
+            ignored.
+        write_s: duration [s] of the newest completed write; writes without rows are ignored.
     """
 
     def __init__(
@@ -120,8 +122,8 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def unsettled(self) -> int:
-        """Return the number of accepted batches (messages with records) that are not yet durable on
-        disk.
+        """Return the number of accepted batches (messages with records) that are not yet durable:
+        written to disk and, if `upload` is given, also copied to the other storage.
         """
         return len(self._next.batches) + len(self._load.batches)
 
@@ -169,7 +171,7 @@ class SegmentLog(Generic[Batch]):
         Each batch is returned once.
 
         Raises:
-            OSError: the disk is full or broken, or the second place cannot be reached; rows that
+            OSError: the disk is full or broken, or `upload` could not copy the segments. Rows that
                 are not durable wait for the next write.
         """
         if self._written is None:

@@ -1,5 +1,6 @@
-"""`fleet-service forget`: erase one vehicle's data of a month, or the key of a complete month. If a
-service is running, it carries out the erasure.
+"""`fleet-service forget`: remove one vehicle's data of a month, or make all data of a month
+anonymous by destroying the secret key of the month's pseudonyms. If a service is running, it
+carries out the erasure.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Erase the rows of the selected vehicle, or destroy the key of the selected month."""
+    """Erase the selected vehicle's rows of a month. If no vehicle is selected, destroy the secret
+    key of the month's pseudonyms, so that the month's rows can no longer be attributed to vehicles.
+    """
     return on_archive(arguments, _forget_data)
 
 
@@ -132,8 +135,8 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     (object store), if any.
 
     Raises:
-        InputError: the settings of the copy are unknown, and nothing was done; or the copy could
-            not be reached.
+        InputError: the archive has a copy, but the configuration does not name it (nothing is
+            erased then); or the copy could not be reached.
     """
     from fleet_service.replication.replica import BucketReplica
     from fleet_service.replication.upload_journal import last_copy_url

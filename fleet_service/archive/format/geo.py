@@ -114,10 +114,14 @@ def _ring_dtype(corners: int) -> np.dtype[Any]:
 def _cell_outlines(
     table: pa.Table, cells: IntArray, count: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return longitudes and latitudes of the corners of cells, (n, k) each. If the table has a
-    column `sector`, the corners are those of the quarters of cells.
+    """Return longitudes and latitudes [deg] of the corners of cells, (n, 4) each. If the table has
+    a column `sector`, return instead the corners of triangles, (n, 3) each: the quarter of each
+    cell that belongs to the heading sector of the cell's row.
 
-    `count` is the number of cells per row; None means one.
+    Args:
+        table: table whose rows consist of the cells.
+        cells: cells (n,) of all rows, in the order of the rows.
+        count: number of cells of each row; None if each row has one cell.
     """
     if "sector" not in table.schema.names:
         return grid.outline(cells)

@@ -53,8 +53,9 @@ _DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")
 
 
 class Cut(NamedTuple):
-    """Position in the sequence of segments (files of new rows). It stands for all rows up to and
-    including this segment. A later segment always has a larger position, whatever the clock shows.
+    """Position of a segment (file of new rows) in the sequence of all segments: the epoch and the
+    number in the segment's name. The position stands for all rows in this segment and in earlier
+    ones. A later segment always has a larger position, even if the system clock is set back.
     """
 
     epoch: int
@@ -161,9 +162,10 @@ def segment_name(prefix: str, number: int) -> str:
 
 
 def with_term(name: str, term: int) -> str:
-    """Return the first part of a file name with the term (lease epoch) of the service that writes
-    the file. If the name contains the term of an earlier writer, this is replaced. Thus two
-    services never write the same file. For term 0 (no lease), the result contains no term.
+    """Return `name`, the beginning of a file name, with the term (lease epoch) of the service that
+    writes the file appended: NAME.0000000012. If `name` ends with the term of another service, that
+    term is replaced. Thus two services never write the same file. For term 0 (no lease), `name` is
+    returned unchanged.
     """
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 

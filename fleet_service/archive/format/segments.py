@@ -57,8 +57,9 @@ class Writer:
     Args:
         root: folder of the archive.
         shard: name of the service.
-        epoch: smallest epoch (number of the start) for segment names, larger than those of earlier
-            owners of the archive; 0 if the archive is used without a lease.
+        epoch: smallest allowed epoch, the number in segment names that increases with every start
+            of a service. If services own the archive in turn by a lease, pass the epoch of the
+            lease; without a lease pass 0.
     """
 
     def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:

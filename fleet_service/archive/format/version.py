@@ -2,16 +2,19 @@
 
 | version | change |
 |---|---|
-| 1.0 | no version and no digest; the columns are exactly those of FIRST |
-| 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
-| 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` null if only bounded |
-| 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
-| 1.4 | states: `p_slippery` |
+| 1.0 | The footer states no version and no digest. FIRST contains the digests of the columns. |
+| 1.1 | The footer contains `gripmap.version` and `gripmap.digest`. |
+| 1.2 | New columns: observations `value`; roll-up (hourly statistics) `value_count`, `value_sum`. |
+|     | In the map, `mu` is null for cells of which only a lower bound is known. |
+| 1.3 | New columns of the observations: `esc_active`, `tcs_active`, `wiper`. |
+| 1.4 | New column of the states: `p_slippery`. |
 
 A minor version adds columns: older readers ignore them, newer readers read null. A major version
-changes the meaning of a column: older readers refuse the file. The digest is computed in the same
-way in all versions, so that a damaged file is not mistaken for one of another version. Parquet's
-page checksums cover the values, but not the names and types of the columns.
+changes the meaning of a column: older readers refuse the file.
+
+The digest covers the names and types of the columns and the version, which Parquet's own checksums
+do not cover. All versions compute the digest in the same way. Therefore a reader can verify the
+digest before it uses the version: a damaged version is reported as damage.
 """
 
 from __future__ import annotations

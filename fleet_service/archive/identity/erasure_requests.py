@@ -30,7 +30,13 @@ _KEPT_S: Final = 86_400.0  # [s] time for which an answer is kept if no process 
 
 @dataclass(frozen=True)
 class Erasure:
-    """Request to destroy a month's key, or to remove one vehicle's rows of that month."""
+    """Request to erase data of one month.
+
+    Attributes:
+        month: the month, such as 2026-01.
+        vehicle: name of the vehicle whose rows of the month are removed. If None, the secret key of
+            the month's pseudonyms is destroyed; nobody can then attribute the rows to vehicles.
+    """
 
     month: str
     vehicle: str | None = None

@@ -66,9 +66,9 @@ class Pseudonyms:
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
-        """Return the pseudonym of one start of a vehicle, as a number of 63 bits. It replaces
-        `boot`, the number of this start in the vehicle's messages. The key is that of the month of
-        `time` [ns].
+        """Return a pseudonym (number of 63 bits) for one start of a vehicle's agent. In the
+        archive, it replaces `boot`, the number of this start in the vehicle's messages. The
+        pseudonym is a keyed hash with the secret key of the month that contains `time` [ns].
 
         Raises:
             OSError: the key of the month can neither be read nor created.

@@ -2,15 +2,18 @@
 pseudonym in the archive changes each month.
 
     keys/witness.key            secret key: a vehicle's number is the keyed hash of its name
-    keys/2026-01.witnesses      number of each pseudonym of the month; removed with the month's key
+    keys/2026-01.witnesses      number of each pseudonym of the month; removed with the secret key
+                                of the month's pseudonyms
     keys/2026-01.TERM.witnesses the same for a service that owns the archive by a lease; each
                                 service writes a file of its own
 
-One car must never count as two independent sources, neither after the end of a month nor when it
-claims to be another car. Restarts and replays know only pseudonyms, so they read the files per
-month. If a line is lost or damaged, a replay counts the vehicle as two; there is no other effect. A
-service therefore checks the lines at start, counts damaged lines and removes them. The vehicle's
-next batch (message with records) writes its line again.
+The map counts each vehicle as one independent source ("witness"). By its pseudonyms, a vehicle
+would count as two sources after the end of a month; by its permanent number, it counts as one.
+
+The archive contains only pseudonyms. A replay of the archive therefore reads the permanent numbers
+from the files per month. If a line of these files is lost or damaged, a replay counts the vehicle
+as two; there is no other effect. At its start, a service counts and removes damaged lines. The
+vehicle's next batch (message with records) writes its line again.
 """
 
 from __future__ import annotations
@@ -114,8 +117,9 @@ def read_numbers(folder: Path) -> dict[int, int]:
 
 
 def remove_damaged_lines(folder: Path) -> int:
-    """Remove damaged lines and other text from the files with the permanent vehicle numbers, if the
-    disk allows it; return the number of damaged lines.
+    """Rewrite the files with the permanent vehicle numbers, so that only lines with a correct
+    checksum stay; return the number of damaged lines. A file that cannot be written stays
+    unchanged, because readers skip damaged lines.
 
     Raises:
         OSError: a file cannot be read.

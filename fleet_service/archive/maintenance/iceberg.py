@@ -113,8 +113,8 @@ def place_of(root: Path) -> Place | None:
     """Return the Iceberg registration of an archive; None if it has none.
 
     Raises:
-        InputError: the record cannot be read. It must not be ignored, because tables may refer to
-            files of the archive.
+        InputError: the file with the registration is damaged. The caller must not treat the archive
+            as unregistered, because Iceberg tables may refer to its files.
     """
     path = root / RECORD
     try:

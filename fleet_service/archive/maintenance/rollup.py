@@ -10,8 +10,11 @@ again when its rows are rewritten.
 How parts are merged (columns of `tables.CELL_HOUR`)
     sums, counts     add
     mu_min, mu_max   minimum, maximum
-    vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of
-                     zeros) (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2)
+    vehicle_bits     bitwise OR
+
+The 64 bits `vehicle_bits` serve to count distinct vehicles over several parts. Each vehicle sets
+one bit, which its pseudonym selects. V vehicles set about 64·(1 - exp(-V/64)) bits, so the estimate
+is V ≈ -64·ln(share of zero bits) (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2).
 """
 
 from __future__ import annotations
