@@ -184,10 +184,13 @@ def build_records(
 class SampleNotes(NamedTuple):
     """Additional data per sample for the visits (passages of a map cell).
 
-    `row` (T, N): at a sample where friction changed within a visit, the index of a row of `told`;
-    -1 at all other samples. `told` (k, 32): evidence (log-likelihood of friction) from the part of
-    the visit before that change. `context` (T, N, len(CONTEXT)): flags of controllers, air
-    temperature and wiper; empty if unknown. `position_std`: standard deviation of the position [m].
+    The friction may change k times within visits of the block. Then `told` (k, 32) has one row per
+    change: the log-likelihood of friction from the part of the visit before the change. `row` (T,
+    N) links samples to these rows: it is the row's index at the sample of a change, and -1 at all
+    other samples.
+
+    `context` (T, N, len(CONTEXT)) contains controller flags, air temperature and wiper; empty if
+    unknown. `position_std` is the standard deviation of the position [m].
     """
 
     row: IntArray
@@ -374,8 +377,10 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
     n ended visits (passages of a map cell). Both are NaN without acceleration readings.
 
     The square of the total grip used is divided between the two directions in proportion to their
-    summed squared accelerations. A visit may contain both braking and driving, or left and right
-    turns. The sign is that of the stronger one.
+    summed squared accelerations. A visit may contain both braking and acceleration, or left and
+    right turns. The longitudinal grip is positive if the sum of squares is larger for acceleration,
+    and negative if it is larger for braking. The lateral grip is positive if the sum of squares is
+    larger for left turns, and negative if it is larger for right turns.
     """
     along = ended["driving"] + ended["braking"]
     across = ended["left"] + ended["right"]
@@ -394,10 +399,13 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 def _grip_used(ended: RecordArray) -> FloatArray:
     """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
 
-    It is the largest value of `mu_utilised` (grip used in the last second), limited to the grip
+    The grip used is the largest `mu_utilised` (grip used in the last second), limited to the grip
     that the accelerometers show in this cell. The limit is needed because that second may include
-    part of the previous cell. If friction changed within the visit, the result is the smallest
-    value of its parts (before and after each change).
+    part of the previous cell.
+
+    If the friction changed within a visit, the grip used is computed separately for the parts
+    before and after each change. The result is the smallest of these values, so that the friction
+    of every part is at least the result.
     """
     last = np.minimum(ended["mu_utilised"], ended["felt"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))
@@ -461,9 +469,12 @@ def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArra
     """Return the likelihoods of n visits (passages of a map cell) in the encoding of the message,
     (n, 32); (n, 0) for an estimator without evidence (likelihood of friction).
 
-    The likelihood is flat for a visit that the estimator did not process from its start. If
-    friction changed within the cell, the friction before or after the change may apply. Therefore
-    the larger of both likelihoods counts.
+    The likelihood is flat for a visit that the estimator did not process from its start.
+
+    If the friction changed within the cell, the cell contains road with different frictions, but
+    the message has only one likelihood per visit. Therefore a friction gets the largest of the
+    likelihoods from before and after each change. A friction that either part supports stays
+    likely.
     """
     if evidence is None:
         return np.zeros((len(ended), 0), dtype=np.uint8)
@@ -478,8 +489,10 @@ def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
     """Return the states (position, motion and friction) to publish: for each vehicle, the first
-    sample of each time slot (reporting interval), if its position is known. The function stores the
-    index of each vehicle's last slot in `after.slot`.
+    sample of each time slot (reporting interval), if its position is known.
+
+    `after` contains the vehicles' data for the next block of samples. On entry, `after.slot` is the
+    index of each vehicle's last time slot before this block. The function updates it.
     """
     slot = np.floor_divide(time, round(NS / config.state_rate_hz))
     earlier = np.vstack([after.slot[None], slot[:-1]])

@@ -28,8 +28,9 @@ log = logging.getLogger(__name__)
 @dataclass
 class Counts:
     """Counts of the publisher. `offered`, `published`, `acknowledged`, `rejected` and `dropped` are
-    numbers of records of each kind. `late` is the number of batches that arrived too late for the
-    map to use in order of time, and `resent_batches` the number that were sent again.
+    numbers of records of each kind. `late` is the number of batches (messages) with records that
+    were older than the map's limit when they arrived. The map gives such records less weight or
+    ignores them. `resent_batches` is the number of batches that were sent again.
     """
 
     offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))

@@ -168,8 +168,8 @@ class Pacer:
         return out
 
     def _take_probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
-        """Return the key of one batch to send as a probe at time `now` [s], or an empty list if no
-        probe is due.
+        """Return a list of the keys of batches to send as probes at time `now` [s]. The list has
+        one key, or none if no probe is due or no batch waits.
 
         The probe is alternately the oldest and the newest batch, so that a batch that the service
         cannot read does not block all others.

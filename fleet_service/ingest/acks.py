@@ -40,8 +40,8 @@ class Acks:
             durable[stream].append(seq)
 
     def record_late(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches (messages with records) arrived too late for the map to use them in
-        order of time. Their senders learn this from the acknowledgement of the batches.
+        """Record that batches (messages) contain records that were older than the map's limit when
+        they arrived. Their senders learn this from the acknowledgement of the batches.
         """
         for stream, seq in batches:
             self._late[stream].add(seq)
