@@ -15,12 +15,13 @@ vertex and chooses one position at each; its path is one vector of values.
     ρ       evaporation per iteration                            -
     α, θ₀   exponents of pheromone and of visibility             -
 
-Departures from the paper. The paper calls ρ = .284 the residual, but uses it as evaporation in
-(32). Here .284 is the part that remains, so ρ = .716 in (32), because the colony must learn within
-few iterations. Pheromone belongs to (vertex, position), not to edges, because the objective depends
-on positions and not on their sequence. Deposits depend on the rank of an ant, so the scale of the
-objective does not matter. The best path so far also receives a deposit. Pheromone stays within
-bounds, so the colony cannot stagnate. (These are the rank-based, elitist and max-min ant systems.)
+Departures from the paper. The paper calls .284 the residual of the pheromone, but inserts it in
+(32) as the evaporation ρ. Here .284 is the share that remains after an iteration, so ρ = 1 − .284 =
+.716. With this faster evaporation the colony learns within few iterations. Pheromone belongs to
+(vertex, position), not to edges, because the objective depends on positions and not on their
+sequence. Deposits depend on the rank of an ant, so the scale of the objective does not matter. The
+best path so far also receives a deposit. Pheromone stays within bounds, so the colony cannot
+stagnate. (These are the rank-based, elitist and max-min ant systems.)
 """
 
 from collections.abc import Callable
@@ -80,8 +81,8 @@ def transition_probabilities(
     theta: float,
 ) -> FloatArray:
     """Return the probabilities (V, K) with which an ant chooses the positions (possible values) of
-    all V vertices (variables), by equation (31): in proportion to pheromone^alpha *
-    visibility^theta. A probability is zero where no position exists, and each row sums to one.
+    all V vertices (variables), by equation (31) of paper 004. The probability is proportional to
+    pheromone^alpha * visibility^theta, and zero where no position exists. Each row sums to one.
     """
     attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
     probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
@@ -123,16 +124,17 @@ def renew(
     retrace: float,
 ) -> FloatArray:
     """Return the pheromone (V, K) after evaporation and the deposits `laid` (V, K), by equation
-    (32), limited to [τ_min, 1]. The pheromone is zero where a vertex (variable) has no such
-    position (possible value).
+    (32) of paper 004. The result is limited to the range from τ_min to 1. A vertex (variable) may
+    have fewer than K positions (possible values). The pheromone of the missing positions is zero.
     """
     renewed = (1.0 - evaporation) * pheromone + laid
     return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
 
 
 def _walk_ant(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
-    """Return the path of one ant, (V,): at each vertex (variable), the index of a position
-    (possible value) drawn with the probabilities (V, K) of equation (31).
+    """Return the path of one ant, (V,): the index of a position (possible value) for each vertex
+    (variable). It is drawn at random with `probabilities` (V, K), the result of
+    `transition_probabilities`.
     """
     reached = np.cumsum(probabilities, axis=1)
     drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]

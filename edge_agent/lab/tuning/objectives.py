@@ -8,18 +8,20 @@ Legend
     l_v         -1/2 (v' S^-1 v + ln det 2 pi S), summed over updates, per second of driving [nat/s]
     NIS         v' S^-1 v over its expectation [1]
 
-IS and l_v are proper scores: in expectation, stating the true distribution gives the best score.
-Therefore inflating R does not improve them. Paper 004's objective (equation 33, variance mismatch)
-is not a proper score, and neither is the error of an estimate. IS is the score of Gneiting and
-Raftery (JASA 2007). l_v does not need the true friction. However, it looks only one update ahead
-and does not show persistent errors. A tuning on l_v alone therefore reduces R to that of white
-noise, and friction intervals become too narrow. Therefore the objective `predictive` subtracts from
-l_v a cost for the deviation of NIS from its expectation. README.md, section "Choices", explains the
-default objective.
+IS and l_v are proper scores: on average, a filter has the best score if it states the true
+distribution. Therefore inflating R does not improve them. Paper 004's objective (equation 33,
+variance mismatch) is not a proper score, and neither is the error of an estimate. IS is the score
+of Gneiting and Raftery (JASA 2007).
 
-The simulated cars are inaccurate: misaligned sensors, slopes, clock delays, and in towns half of
-the cars have no torque. The drives of a search and the held-out drives share no seed, no vehicle
-file and no pair of manoeuvre and vehicle.
+l_v does not need the true friction, but it judges only the prediction of the next update.
+Persistent errors hardly change it. A tuning on l_v alone therefore chooses R as small as the white
+noise, and friction intervals become too narrow. The objective `predictive` corrects this: it is l_v
+minus a cost for the deviation of NIS from 1. README.md, section "Choices", explains the default
+objective.
+
+The simulated cars are inaccurate: their sensors are misaligned and their clocks are delayed. They
+drive on slopes. In towns, half of the cars have no torque signal. The drives of a search and the
+held-out drives share no seed, no vehicle file and no pair of manoeuvre and vehicle.
 """
 
 from __future__ import annotations

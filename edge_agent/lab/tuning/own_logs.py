@@ -27,8 +27,9 @@ def own_drives(
     """Cut recordings into parts of `duration_s` [s]; return the parts for the search and the
     held-out parts.
 
-    The last third of the parts is held out. Recordings may have any sampling rate. Each part has as
-    many samples as the recording with the lowest rate has in `duration_s`.
+    The last third of the parts is held out. All parts have the same number of samples: the number
+    that the recording with the lowest sampling rate has in `duration_s`. Recordings are not
+    resampled. Therefore parts of recordings with a higher rate are shorter than `duration_s`.
 
     Raises:
         InputError: the recordings are too short.

@@ -46,9 +46,11 @@ Sets = Memberships | LowerVertices
 
 @dataclass(frozen=True)
 class LevelDrive:
-    """Simulated drive at one level of measurement noise (`batch`), with one copy per seed of the
-    noise, and the filter's setting for it. In the setting, R (assumed noise variance) equals the
-    noise variance of the drive. The tuning runs the filter on the drive.
+    """Simulated drive at one level of measurement noise, and the setting of the filter that the
+    tuning runs on this drive.
+
+    `batch` contains several copies of the drive that differ only in the random noise. In `setting`,
+    the noise variance R that the filter assumes equals the true noise variance of the drive.
     """
 
     batch: DriveSet
@@ -129,8 +131,9 @@ def _run_filter(sets: Sets, drive: LevelDrive) -> Estimates:
 
 
 def visibility() -> list[FloatArray]:
-    """Return the visibility eta (prior preference) of every position (value) of every vertex
-    (variable), for equation (31). The visibility is larger for positions near the untuned value.
+    """Return the visibility eta of the ant colony (equation (31) of paper 004), one array for each
+    tuned number ("vertex"). Each array contains the prior preference for every possible value
+    ("position"), which is larger for values near the untuned one.
     """
     preferred = np.exp(-0.5 * ((POSITIONS - 1.0) / PREFERENCE) ** 2)
     return [preferred] * len(LowerVertices().to_vector())
@@ -139,7 +142,10 @@ def visibility() -> list[FloatArray]:
 @dataclass(frozen=True)
 class PaperTuning:
     """Result of the tuning: the tuned fuzzy sets, the objective's values over the iterations, and
-    the final pheromone of the ant colony (16 vertices, 7 positions).
+    the final pheromone of the ant colony.
+
+    The colony tunes 16 numbers ("vertices", the feet of the fuzzy sets). For each number it can
+    choose among 7 values ("positions"). Therefore the shape of `pheromone` is (16, 7).
     """
 
     sets: LowerVertices

@@ -200,8 +200,9 @@ def list_without_effect(changes: Sequence[ConstantChange]) -> list[str]:
 
 
 def to_markdown(changes: Sequence[ConstantChange]) -> str:
-    """Return the changes as a Markdown table, followed by the names of the constants without
-    effect.
+    """Return the results of the sensitivity analysis as Markdown. The table has a row per constant
+    and factor: the changes of the filter's measures if the constant is multiplied by the factor.
+    The names of the constants without effect follow.
     """
     lines = [
         "| number | factor | score [%] | false ice [pp] | found [pp] | time [%] |",

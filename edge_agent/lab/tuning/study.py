@@ -45,9 +45,12 @@ WAYS: Final[dict[str, Callable[..., Result]]] = {
 
 
 class Condition(NamedTuple):
-    """Condition of a study: the filter's measurement noise R divided by the true constant variance
-    (VARIANCE), and a flag that is True if the simulated noise varies over time by the paper's
-    schedule.
+    """Condition of a study: measurement noise that the filter assumes, and true noise of the
+    simulation.
+
+    The filter assumes the constant variance R = `scale` * VARIANCE. The true noise has the constant
+    variance VARIANCE. If `schedule` is True, its variance changes over time by the paper's schedule
+    instead.
     """
 
     scale: float
@@ -163,8 +166,8 @@ def _noisy(
 
 
 def setting(condition: Condition) -> Setting:
-    """Return the setting of paper 004's filter for a condition: its noise R is the true variance
-    times the condition's `scale`.
+    """Return the setting of paper 004's filter for a condition: its noise R is VARIANCE times the
+    condition's `scale`.
     """
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
@@ -211,8 +214,9 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. Other
-    parameters are not tuned, because the study's condition determines the measurement noise R.
+    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. All other
+    parameters keep their untuned values. Noise scales are not tuned either, because each condition
+    of the study fixes the measurement noise R.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 

@@ -60,8 +60,10 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships (fuzzy sets) found by each search of the kind `way`. If `way` is
-        the name of fuzzy sets in GIVEN, which are not searched, return only those.
+        """Return the memberships (fuzzy sets) found by each search of the kind `way`.
+
+        `way` may also be a name in GIVEN, the table of fuzzy sets that need no search. The list
+        then contains only the sets with this name.
         """
         if way in GIVEN:
             return [GIVEN[way]]
@@ -69,8 +71,10 @@ class Study:
 
     def best(self, way: str) -> Memberships:
         """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
-        by the objective on the drives of the search. If `way` is the name of fuzzy sets in GIVEN,
-        which are not searched, return those.
+        by the objective on the drives of the search.
+
+        `way` may also be a name in GIVEN, the table of fuzzy sets that need no search. The result
+        is then the sets with this name.
         """
         if way in GIVEN:
             return GIVEN[way]
@@ -108,8 +112,8 @@ def run(
 
 def figures(done: Study) -> list[Figure]:
     """Return the figures (named numbers) of the study for each kind of search. These are the scores
-    on held-out drives under each condition of the measurement noise, the objective on search and
-    held-out drives, and the progress of the searches.
+    on held-out drives under each condition of the study (right or wrong measurement noise R), the
+    objective on search and held-out drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -182,9 +186,12 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores of the best memberships (fuzzy sets) found by the kind of search `way`, on
-    the search drives and on the held-out drives. They are averaged over all conditions of the
-    measurement noise R. The file of tuned memberships contains them.
+    """Return the scores that are stored in the file of tuned memberships (fuzzy sets): one `Score`
+    for the drives of the search ("train"), and one for the held-out drives ("held_out").
+
+    The scores belong to the best memberships found by the kind of search `way`. Each score is the
+    mean over all conditions of the study (CONDITIONS), for example a measurement noise R that is
+    ten times too small.
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
