@@ -74,8 +74,11 @@ class WarnedDrivers:
     def heeding(
         self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
     ) -> Iterator[Block]:
-        """Yield the blocks of samples of a source unchanged. After each block, call `hear`, which
-        may store new warnings, and pass all stored warnings to the simulated drivers.
+        """Yield the blocks of samples of a source unchanged, and pass the stored warnings to the
+        simulated drivers after each block.
+
+        The argument `hear` is a function of the caller, not the method of this class. It is called
+        just before the warnings are passed, so that it can store new ones.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:

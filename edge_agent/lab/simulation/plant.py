@@ -11,11 +11,18 @@ accelerations with a lag, the body rolls, and there are air drag and rolling res
 
     v_x, v_y   velocity of the centre of gravity in the body's axes [m/s]
     r          yaw rate [rad/s]
+    m, I_z     mass [kg], yaw inertia [kg·m^2]
+    D          air drag over squared speed [kg/m]
     X, Y       wheel forces in the body's axes [N]
+    x_i, y_i   position of wheel i ahead and to the left of the centre of gravity [m]
     ω, T       wheel speed [rad/s], torque at the wheel [N·m]
+    J, R       inertia [kg·m^2] and radius [m] of a wheel
+    F_x, F_z   longitudinal force in the wheel's axes, wheel load [N]
+    k_r        rolling resistance over load [1]
 
     θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s    slip (longitudinal, lateral), K its stiffness
     K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0  static load, ε degression of the stiffness
+                                                 κ    stiffness over load at the static load [1]
 
     g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to
                                                            the left
@@ -34,9 +41,9 @@ that length), and controllers that work in cycles and report their activity (ABS
 
 Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
 slip is stiff. The denominator of a wheel's step contains the secant slope of the tyre, so the step
-is stable at any speed. The step also contains the change of the ground's speed under the wheel;
-without it, a wheel would behave as if its inertia were twice as large. Wheel order fl, fr, rl, rr;
-ISO 8855 signs.
+is stable at any speed. During a step the vehicle's speed changes too, and with it the slip of the
+wheels. The wheels' step includes this change. Without it, wheels would accelerate as slowly as
+wheels with twice the inertia. Wheel order fl, fr, rl, rr; ISO 8855 signs.
 """
 
 from __future__ import annotations
@@ -206,8 +213,8 @@ def body_accelerations(
     """Return (a_x, a_y) that an accelerometer at the centre of gravity measures [m/s^2], and the
     yaw acceleration [rad/s^2].
 
-    `x`, `p` and `u` are state, parameters and inputs of the vehicle; `w` must contain the wheel
-    forces.
+    `x`, `p` and `u` are state, parameters and inputs of the vehicle. `w` (8, 4) is the array of
+    wheel data that `wheel_forces` has filled for this state.
     """
     ax, ay, yaw_acceleration = planar_accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
     return (
@@ -226,11 +233,13 @@ def turn_wheels(
     dt: float,
     change: tuple[float, float],
 ) -> None:
-    """Apply one linearly implicit Euler step of `dt` [s] to the wheel speeds in the vehicle's state
-    `x`: every torque that decreases with ω acts as damping.
+    """Advance the wheel speeds ω in the vehicle's state `x` by one linearly implicit Euler step of
+    `dt` [s]. Torques that decrease with ω are in the implicit part of the step, so that the step is
+    stable.
 
-    `change` is dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. From them follows the change of
-    the ground's speed under the wheels.
+    `change` contains dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. The function computes from
+    it how much each wheel's speed over the ground changes. `w` (8, 4) is the array of wheel data
+    that `wheel_forces` has filled for this state.
     """
     gain, yaw_acceleration = change
     radius = p[Parameter.RADIUS]

@@ -24,9 +24,11 @@ STIFFNESSES: Final = {"proportional-to-friction": 1.0}  # name -> TrueParameter.
 class TrueVehicle:
     """True parameters of a vehicle, including those that no vehicle file contains.
 
-    With the tyre's shape c and curvature e, the force has its peak between the normalised slips θ =
-    2.3 (c 1.6, e -.4) and 3.5 (c 1.4, e .1) and decreases beyond. An estimator that assumes the
-    textbook shape has force errors of 5 to 15 % at these slips.
+    The force of a tyre depends on the normalised slip θ: slip times slip stiffness, divided by the
+    largest force μ F_z. Shape c and curvature e determine the θ at which the force has its peak.
+    For c = 1.6 and e = -.4 the peak is at θ = 2.3, and for c = 1.4 and e = .1 at θ = 3.5. Beyond
+    the peak the force decreases. An estimator that assumes the textbook shape has force errors of 5
+    to 15 % at these slips.
     """
 
     vehicle: Vehicle

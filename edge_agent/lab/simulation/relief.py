@@ -3,15 +3,18 @@
 
 Legend
     h       height [m] over x (east) and y (north) [m]
-    ∇h      rise per metre east and north [1]; a wave with steepest slope a and length λ in the
-            direction of the unit vector e gives a cos(2π s/λ + φ) e, with s = (x, y)·e; with
-            infinite length it is one constant slope
-    c, b    crossfall to the right of a lane [1], and banking per curvature [m], which lowers the
-            inner side of a bend
+    ∇h      slope: rise per metre east and per metre north [1]
+    c       crossfall of a lane: fall per metre to its right [1]
+    b       banking of bends [m]: b times the curvature of a bend is the slope by which its inner
+            side is lower
 
-Slopes add up and are limited to STEEPEST. Positions are measured along the road, so that a metre of
-road on a slope of 8 % counts as a metre, although it is .997 m on a map. The sizes are those of
-real roads: standard deviation 3 %, hardly ever more than 8 %, crossfall 2.5 %.
+The slope of the road is the sum of waves, crossfall and banking. A wave contributes ∇h = a cos(2π
+s/λ + φ) e. The unit vector e is the wave's direction, s = (x, y)·e the position along it, a the
+steepest slope, λ the wavelength [m] and φ the phase. A wave of infinite length is a constant slope.
+
+The sum is limited to STEEPEST. Positions are measured along the road, so that a metre of road on a
+slope of 8 % counts as a metre, although it is .997 m on a map. The sizes are those of real roads:
+standard deviation 3 %, hardly ever more than 8 %, crossfall 2.5 %.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@ direction on the right, and connectors through junctions.
 
     lane       a directed polyline, points about a metre apart, with heading and curvature
     connector  a lane through a junction, from the end of one lane to the start of another road's
-    profile    v²/q at each point [m], where v is the highest speed of a driver who accepts lateral
-               accelerations of q m/s^2 and braking of BRAKING·q, and sees the next turns;
-               because v² is proportional to q, one profile serves all drivers
+    q          lateral acceleration that a driver accepts [m/s^2]
+    profile    v²/q at each point [m], where v is the highest speed of this driver. The driver
+               brakes before bends and junctions with at most BRAKING·q. v² is proportional to q, so
+               one profile serves all drivers.
 """
 
 from __future__ import annotations
@@ -267,12 +268,12 @@ def _lane_table(lane: FloatArray) -> FloatArray:
 def _plan_speeds(
     tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray
 ) -> None:
-    """Compute the speed profiles of all lanes (v²/q: squared speed over the acceleration that the
-    driver accepts): for each lane backwards from its end, repeatedly until no profile changes. The
-    profiles are written into `tables`.
+    """Write the speed profiles of all lanes into `tables`, the tables of their points.
 
-    At each point, a driver brakes at most with the part of the accepted acceleration that cornering
-    leaves.
+    A profile is v²/q [m], where v is a driver's highest speed and q the acceleration that the
+    driver accepts. `limits` are the profile's upper limits by bends and junctions. Each lane is
+    computed backwards from its end, so that the driver can brake in time. This is repeated until no
+    profile changes. With the lateral acceleration a, braking is at most BRAKING·sqrt(q² − a²).
     """
     while True:
         before = [table[0, LanePoint.PROFILE :].copy() for table in tables]
