@@ -6,23 +6,40 @@ everything that is not listed as unknown. Unknown are the quantities that the ve
 sensors' data sheet leave open. The equations are linearised around the true values, so the oracle's
 estimate is least squares with a Gaussian prior.
 
+The body of a car rolls and pitches with a lag after the acceleration. Its tilt adds a share of
+gravity to the readings of the accelerometers.
+
 `speed`: v_x in sine steering with acceleration. Wheel speeds have no noise here: W = (1 + ρ) v.
 
     a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)      over stretches of STRETCH_S
-    a_l, a_p   part of the acceleration that the body's roll and pitch have followed
-    unknown    ρ error of the radius, c ln of cornering stiffness, κ shares of gravity that roll and
-               pitch add, τ lag of roll, b offsets
+    a_x, a_y   readings of the accelerometers [m/s^2]
+    v, v_y, r  true v_x and v_y [m/s], true yaw rate [rad/s]; ' is the time derivative
+    W, ΔW      speed of the car by the wheels [m/s], its change over a stretch
+    l_r        distance from the centre of gravity to the rear axle [m]
+    a_l, a_p   a_y and a_x with the lag of roll and pitch [m/s^2]; a_l' includes the share of
+               gravity that roll adds
+    unknown    ρ    relative error of the wheel radius
+               c    error of ln of the cornering stiffness
+               κ_y  error of the share of gravity that roll adds to a_y
+               κ_x  error of the share of gravity that pitch adds to a_x
+               τ    error of the lag of roll [s]
+               b    offsets of the accelerometers [m/s^2]
 
 `friction`: μ at the end of a drive with .6 g. The oracle gets the mean speed of the four wheels and
-the force of every tyre. It knows the vehicle's speed except for the errors that offset and gravity
-in a_x cause.
+the force of every tyre. It knows the vehicle's speed except for the errors that an offset of a_x
+and pitch cause.
 
     R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))
+    R, ω       wheel radius of the vehicle file [m], mean wheel speed [rad/s]
     s          true slip
-    g          slip that the forces cause at μ and with that shape of the tyre curve, over the true
-               slip
-    unknown    μ (uniform), shape (distributed as in the fleet), k ln of stiffness, ρ, b, κ, v_0
+    g          slip at which the forces arise for this μ and this shape of the tyre curve, divided
+               by the true slip
+    unknown    μ    friction; all values are equally likely
+               k    error of ln of the longitudinal stiffness
+               v_0  error of the initial speed [m/s]
+               ρ, b, κ  as above, for a_x
+               shape  shape of the tyre curve, distributed as in the fleet
 """
 
 from __future__ import annotations
@@ -60,10 +77,12 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """Drives of scenario 002.sine for the oracle (an ideal observer): readings and true values
-    (`batch`), and the effects of the body's roll and pitch on the accelerometers. `rolled` and
-    `pitched` (T,) are the parts of a_y and a_x [m/s^2] that roll and pitch have followed. `felt`
-    (T, 2) are a_x and a_y as read by accelerometers with no other error.
+    """Data for the oracle (an ideal observer) from drives with sine steering while the speed rises
+    (paper 002): readings and true values (`batch`), and effects of the body's tilt.
+
+    The body rolls with a lag after a_y, and pitches with a lag after a_x. `rolled` and `pitched`
+    (T,) are a_y and a_x with this lag [m/s^2]. `felt` (T, 2) are the readings of a_x and a_y
+    [m/s^2] by accelerometers whose only error is the gravity that this tilt adds.
     """
 
     batch: DriveSet
@@ -73,8 +92,8 @@ class OracleSignals(NamedTuple):
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
-    """Return the RMSE of v_x [m/s] as estimated by the oracle (an ideal observer) in the drive
-    002.sine, one value per seed.
+    """Return the RMSE of v_x [m/s] as estimated by the oracle (an ideal observer), one value per
+    seed. The drive is that of paper 002: sine steering while the speed rises from 20 to 25 m/s.
     """
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
@@ -140,9 +159,13 @@ def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Return two arrays with one value per seed: the friction error |μ − true value| of the oracle
-    (an ideal observer) at the end of the drive 003.accel, and the mean error that the oracle
-    expects from its own posterior.
+    """Return two arrays with one value per seed: the friction error of the oracle (an ideal
+    observer), and the error that the oracle itself expects.
+
+    The drive is an acceleration of .6 g on dry road (paper 003). At the end of the drive, the
+    oracle's estimate of friction is the median of its posterior. The first array is the distance of
+    this median from the true friction. The second is the mean distance of friction from the median
+    under the posterior.
     """
     scenario = PAPERS["003.accel"]
     exact = realistic(scenario, seeds[:1], "ideal")

@@ -59,13 +59,19 @@ def variances(t: FloatArray, experiment: str) -> FloatArray:
 def experiments(
     seeds: Sequence[int],
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
-    """Run the experiments of paper 004. Return the measures per drive by (experiment, filter), and
-    the drives for plots by experiment.
+    """Run the experiments of paper 004. Return the error measures of each drive by (experiment,
+    filter), and for plots the drives and estimates of the paper's filter by experiment.
 
-    "sedan" and "van" are the experiment "constant" with the simulator's own vehicles; with the
-    suffix ".variable" they are the experiment "variable". There are three filters: that of the
-    paper, the same filter untuned (paper-fckf), and without adaptation (paper-ckf). Only a_x, a_y
-    and the yaw rate have noise.
+    Each experiment is a double lane change, with noise only on a_x, a_y and the yaw rate. The
+    experiments differ in noise and vehicle:
+
+    - "constant", "variable": noise of constant variance, or of a variance that changes over time.
+      The vehicle has the equations of the filter's model.
+    - "sedan", "van": noise of constant variance, with the simulator's own vehicle of that name.
+    - "sedan.variable", "van.variable": the same vehicles with the variable noise.
+
+    Each experiment is run with three filters: the paper's (paper-aco-fckf), the same with untuned
+    fuzzy sets (paper-fckf), and the same without adaptation of R (paper-ckf).
     """
     found = {}
     drives = {}

@@ -41,9 +41,9 @@ PRINTED_002: Final = {"sine": (".1008", ".0779"), "jturn": (".0825", ".0117")}
 def printed_row(
     paper: str, scenario: str, estimator: str, measure: str, what: str, value: str
 ) -> Printed:
-    """Return the number `value` that a paper prints for a scenario and an error measure. With it
-    come the names of the two results of this evaluation that are compared with this number: one
-    with error-free sensors, one with ordinary sensors.
+    """Return one entry of the table of printed numbers. The entry contains the number `value` that
+    a paper prints for a scenario and an error measure. It also contains the names of two results of
+    this evaluation for comparison: with error-free sensors, and with ordinary sensors.
     """
     same = f"ideal.{scenario}.{estimator}.{measure}"
     real = f"real.{scenario}.ESTIMATOR.{measure}"

@@ -5,13 +5,14 @@ A folder contains LOG.parquet with its vehicle file LOG.json. Optional files are
 (columns t, vx, vy, mu, as far as they were measured) and LOG.meta.json (`mu_known`: known friction
 of the surface). The figures cover the time in which the car moves, from the third second on:
 
-    informative    share of the time with a friction interval narrower than INFORMATIVE times the
-                   prior's
-    right          share of the informative time in which the interval is consistent with the
-                   recording: it contains the true friction; if that is unknown, its upper end is at
-                   least the grip that the car used
-    ice            share of the time with P(slippery) > CALLED_SHARE although the road was not
-                   slippery
+    informative    share of the time in which the friction interval is clearly narrower than the
+                   prior's: less than INFORMATIVE (.6) of its width
+    right          share of the informative time in which the friction interval is correct. If the
+                   true friction was measured, the interval must contain the true friction.
+                   Otherwise the upper end of the interval must not be below a lower limit of the
+                   road's friction, which follows from the grip that the car used and `mu_known`.
+    ice            share of the time in which the estimator reports ice (P(slippery) above
+                   CALLED_SHARE, .9) although the road was not slippery
     contradicted   share of the time with the health flag CONTRADICTION (no friction explains the
                    data)
     urgent         number of friction observations per hour that the agent would send immediately;

@@ -4,25 +4,28 @@ slope, for every estimator.
 Towns (friction, hills), cars, sensors and clocks are drawn randomly by the seed; half of the cars
 have no torque signal. Results for towns are means over the samples of all towns together.
 
-Legend
+Terms
     surface       class of the mean friction of the four wheels: ice up to .2, snow up to .45, wet
                   up to .75, dry above
-    missed ice    share of the excited samples on ice with P(mu < SLIPPERY_MU) of at most
-                  CALLED_SHARE
+    excited       a sample is excited if a wheel used at least EXCITED_SHARE (.6) of its available
+                  friction within the last second
+    called ice    a sample is called ice if the estimator's probability P(mu < SLIPPERY_MU) is above
+                  CALLED_SHARE (.9)
+
+Results
+    missed ice    share of the excited samples on ice that are not called ice
     false grip    share of the samples on ice for which the lower end of the estimated friction
-                  interval is more than FALSE_GRIP above the true friction
-    false ice     share of the samples on wet and dry road with P(mu < SLIPPERY_MU) above
-                  CALLED_SHARE
-    settled       false ice, but only of samples at least SETTLED_S after the car left snow or ice,
-                  because an estimator notices the end of the ice only when grip is used
-    of_all        number of samples with P(mu < SLIPPERY_MU) above CALLED_SHARE on a road with
-                  friction above SURE_GRIP, as a share of all samples
-    below         share of all samples whose friction interval ends below the grip in use, so that
-                  the interval is certainly wrong
-    excited       some wheel used EXCITED_SHARE of its grip within the last second
+                  interval is more than FALSE_GRIP (.05) above the true friction
+    false ice     share of the samples on wet and dry road that are called ice
+    settled       false ice, without the samples within SETTLED_S (3 s) after the car has left snow
+                  or ice, because an estimator notices the end of the ice only when grip is used
+    of_all        share of all samples that are called ice although the true friction is above
+                  SURE_GRIP (.6)
+    below         share of all samples whose friction interval is certainly wrong, because its upper
+                  end is below the grip that the car uses
     contradiction share of the samples with the health flag CONTRADICTION: no friction explains the
                   data
-    lost          share of the samples with a speed error above LOST_M_S
+    lost          share of the samples with a speed error above LOST_M_S (1 m/s)
 """
 
 from __future__ import annotations
@@ -146,8 +149,9 @@ def in_use(batch: DriveSet) -> FloatArray:
 
 
 def recent_maximum(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
-    """Return, for each sample, the largest value of `used` (T, N) within the last `seconds`, (T,
-    N).
+    """Return the moving maximum of `used` over the last `seconds`, (T, N). `used` (T, N) is a
+    quantity at T samples of N cars, for example the share of the available friction that a car
+    uses [1]. In a mask, True counts as 1.
     """
     samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])

@@ -4,11 +4,11 @@ an estimator's posterior. For a reliable estimator, the share equals the level o
 Estimates contain only the quantiles 5, 50 and 95 %. The posterior at other levels is found as
 follows.
 
-- The default estimator can also output the likelihood of friction over a visit (passage of a map
-  cell). Here a visit lasts from the start of the drive until now. The prior of the visit is
-  uniform, so the posterior is proportional to this likelihood. The estimator outputs the likelihood
-  only when the visit ends. Therefore the visit is ended in a copy of the estimator, and the
-  original estimator continues the drive.
+- The default estimator can also output the likelihood of friction over a stretch of the drive. It
+  does so when the caller marks the end of the stretch. In the vehicle, a stretch is the passage of
+  a map cell. Here the stretch is the whole drive so far. The prior is uniform, so the posterior is
+  proportional to this likelihood. The end is marked in a copy of the estimator, so that the
+  original estimator can continue the drive.
 - For other estimators, the posterior is assumed to be Gaussian, or uniform if the interval is as
   wide as the prior's (see `between_quantiles`).
 """

@@ -4,17 +4,22 @@ motion and the force of every tyre, except for noise.
 The oracle does not know the stiffness of the tyre and the shape of its force curve. Because it
 knows more than any estimator, its evidence is an upper limit of the information in a visit.
 
-    f    |F| / F_z, known with noise FORCE_STD
-    q    slip times stiffness per load, known with the wheels' noise σ_q
-    f = μ F(k q / μ; c, e)     c, e shape and curvature of the Magic Formula, k stiffness factor,
-                               log-normal
+    f = μ F(k q / μ; c, e)     force curve of a tyre: Magic Formula F with shape c and curvature e
+    f        force over load |F| / F_z of a wheel, known with noise of standard deviation FORCE_STD
+    q        slip times stiffness per load, known with noise of standard deviation σ_q (from the
+             wheel speeds)
+    k        stiffness factor of the tyre, random (log-normal)
+    slope    df/dq, the slope of the force curve at q
+    N(x; m, v)  normal density of x with mean m and variance v
+    p(q)     prior density of q
 
-    ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope ·
-    σ_q)²) · p(q)
+    L(μ) = mean over random tyres of Π over wheels and samples
+           N(f; μ F(k q/μ), FORCE_STD² + (slope · σ_q)²) · p(q)
 
-p(q) is the prior of the slip. Drivers demand a force, and all forces are assumed equally likely, so
-the density of the slip is the slope of the force curve, at least LEAST_SLOPE. Only every EACH-th
-sample is used, because the errors of successive samples are correlated.
+For p(q), every force that a driver may demand is assumed equally likely. A uniform density of f
+means that the density of q is proportional to df/dq. Therefore p(q) is the slope of the force
+curve, at least LEAST_SLOPE. Only every EACH-th sample is used, because the errors of successive
+samples are correlated.
 """
 
 from __future__ import annotations
@@ -86,8 +91,9 @@ def _evidence(
     """Return the log-likelihood ln L of the oracle's data on the friction grid, assuming each of
     the random tyres in turn, (TYRES, BINS).
 
-    force and slip are force over load and slip with noise, (T, 4); noise (T,) is the standard
-    deviation of the slip noise; tyres (TYRES, 3) is the result of `tyres_drawn`.
+    `force` (T, 4) is the force over load of each wheel, and `slip` (T, 4) its slip times stiffness
+    per load. Both contain noise. `noise` (T,) is the standard deviation of the noise of `slip`.
+    `tyres` (TYRES, 3) is the result of `tyres_drawn`.
     """
     out = np.zeros((tyres.shape[0], BINS))
     for j in range(tyres.shape[0]):

@@ -4,14 +4,18 @@ any estimator.
 The slip flag is the baseline for the detection of slippery road. It uses the recorded wheel speeds,
 accelerometers, yaw rate and steering, and the vehicle file.
 
-    reference speed  fastest wheel while braking, slowest while driving, else the median; it changes
-                     at most by the accelerometer's reading plus FREE; once the speeds of all wheels
-                     have agreed for AGREE_S, it is their speed
-    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i is
-                     the reference speed at wheel i, including the yaw rate; no slip below SLOWEST
-    yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
-    friction         |a| / g while a flag is set; while driving, divided by the driven axle's share
-                     of the load
+    reference speed  estimate v of the car's speed. While the car brakes, v follows the fastest
+                     wheel. While the car accelerates, v follows the slowest wheel. Otherwise v
+                     follows the median of the wheels. The rate of change of v differs from the
+                     measured a_x by at most FREE [m/s^2]. Once the speeds of all wheels have agreed
+                     for AGREE_S, v is their median.
+    slip flag        set if |R ω − v_i| > SLIP max(v, SLOWEST) at a wheel i for longer than SLIP_S.
+                     SLIP is SLIP_FRONT or SLIP_REAR; v_i is v plus the effect of the yaw rate at
+                     the wheel. A wheel is checked only if v or its own speed is above SLOWEST.
+    yaw flag         set if |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S, with
+                     yaw rate r, steering angle δ and wheelbase l
+    friction         |a| / g while a flag is set. While the car accelerates, a_x is first divided by
+                     the share of the load on the driven wheels, because only they use grip.
 """
 
 from __future__ import annotations

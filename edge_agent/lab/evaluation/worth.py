@@ -1,12 +1,17 @@
 """Benefit of the fuzzy sets and of the ant colony: interval scores on drives with inaccurate cars
 that were not used for tuning.
 
+Three mechanisms of the default estimator are switched on or off. Fuzzy rules decide how much of the
+evidence on friction is used, and adapt the measurement noise R to the innovations (measurement
+minus prediction). Strain, the deviation of the estimated vehicle and sensor states from their
+prior, also scales R. The consistency test detects measurements that contradict the model.
+
 Legend of the filter variants (for all scores, less is better)
     fuzzy        the default estimator with all its rules and the shipped vertices (corners of the
                  fuzzy sets)
-    sets_off     no fuzzy sets: a product of ramps decides the share of evidence, and R is not
-                 adapted to the innovations; strain (deviation of states from their prior) and the
-                 consistency test as in the default
+    sets_off     the default estimator without fuzzy sets: a fixed formula (`plain_share`) decides
+                 the share of the evidence that is used, and the innovations do not change R; strain
+                 and consistency test are on
     none         no rules, no strain, no consistency test (`ckf`)
     default      all rules with untuned vertices
     random       all rules with the vertices found by random search, mean over the searches
@@ -121,9 +126,11 @@ def ways() -> dict[str, list[MixtureDesign]]:
 
 
 def without_sets() -> MixtureDesign:
-    """Return the parameter tables of the default filter for the variant without fuzzy sets. This
-    variant keeps two parts of the default: it adapts the measurement noise R to strain (deviation
-    of states from their prior), and runs the consistency test.
+    """Return the parameter tables of the default filter for the variant without fuzzy sets.
+
+    This variant keeps two mechanisms. The measurement noise R depends on the strain: the distance
+    of the estimated vehicle and sensor states from their prior values. The consistency test detects
+    measurements that contradict the vehicle model.
     """
     design = design_of(Memberships(), adaptive=True)
     c = design.constants

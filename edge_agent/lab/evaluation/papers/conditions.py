@@ -2,9 +2,9 @@
 manoeuvres that they drive.
 
 A "matched" vehicle is a simulated vehicle ("plant") that has exactly the equations of the filter in
-the paper. Only in drives at constant speed are drag and rolling resistance simulated, and the
-filter knows them. Without them the tyres would have no longitudinal force there, and so no
-information on friction.
+the paper. It usually has neither air drag nor rolling resistance. Drives at constant speed are an
+exception: there both are simulated, and the filter knows them. Otherwise the car would need no
+driving force at constant speed, and its tyres would give no information on friction.
 """
 
 from __future__ import annotations

@@ -39,8 +39,12 @@ def number(value: float) -> str:
 
 
 def cells(row: PaperRow) -> list[str]:
-    """Return the cells of a table row of the report as text: printed number, matched conditions,
-    own vehicle model, realistic sensors, default estimator.
+    """Return the cells of a table row of the report as text: the number that the paper prints, and
+    four results of this project for comparison.
+
+    These are the result of the paper's filter on a simulated car that equals the filter's model,
+    and on the simulator's standard car. Two results with ordinary sensors and vehicle parameters
+    known to a few per cent follow: the paper's estimator, and the project's default estimator.
     """
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]

@@ -35,9 +35,11 @@ NEAR: Final = 0.1
 
 def seconds_near(batch: DriveSet, mu: FloatArray) -> tuple[float, float]:
     """Return two durations [s] until the estimated mean friction `mu` (T,) is within NEAR of the
-    true value. The first counts from the start of the drive, the second from the change of
-    friction. If the estimate never comes so near, a duration is the whole time before or after the
-    change.
+    true friction, which changes once during the drive.
+
+    The first duration counts from the start of the drive. If the estimate does not come so near
+    before the change, it is the time from the start to the change. The second duration counts from
+    the change. If the estimate does not come so near, it is the time from the change to the end.
     """
     t = batch.t[:, 0]
     truth = batch.mu[:, 0]
