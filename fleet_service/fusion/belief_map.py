@@ -36,7 +36,8 @@ class BeliefMap:
 
     Attributes:
         store: cells, recent observations per cell, records per vehicle and cell, and vehicles.
-        vote_weights: weights of the vehicles' votes, one record per epoch, the oldest first.
+        vote_weights: trust in the vehicles over time. Each item contains the weights of the
+            vehicles' reports from one minute (epoch) on; the oldest item comes first.
     """
 
     def __init__(self, store: Store, vote_weights: list[VoteWeights], weather: Weather) -> None:
@@ -98,9 +99,9 @@ class BeliefMap:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
         sector), (k, 32), at its last observation.
 
-        It is more cautious than the belief for other readers: reports of vehicles that used little
-        grip are assumed to be too low by more. The assumed error per unit of unused grip is the
-        upper end of its confidence range; see `shared`.
+        A vehicle that used little grip may report too low a friction. For alerts this error is
+        assumed to be larger than for other readers, so that an alert needs stronger evidence of
+        ice. The assumed error per unit of unused grip is `shared.Shape.alarm`.
         """
         return self._read_for_alerts(self._shape.alarm, slots)
 
@@ -134,11 +135,11 @@ class BeliefMap:
         return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: Side, since: IntArray | int) -> IntArray:
-        """Return the report times [ns] of the vehicles that corroborate ice or grip in each slot
-        (cell and heading sector), (k, SOURCES), newest first.
+        """Return the report times [ns] of the vehicles that reported ice or grip (`side`) in each
+        slot (cell and heading sector), (k, SOURCES), newest first.
 
-        Only vehicles count that are still trusted and reported `side` (grip or ice) after `since`
-        [ns]. At most SOURCES vehicles per slot are stored; time 0 means no vehicle.
+        Only reports after `since` [ns] by vehicles that are still trusted count. At most SOURCES
+        vehicles per slot are stored; time 0 means no vehicle.
         """
         _, when = self.find_sources(slots, side, since)
         return -np.sort(-when, axis=1)
@@ -146,7 +147,7 @@ class BeliefMap:
     def find_sources(
         self, slots: IntArray, side: Side, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that corroborate `side` (grip or ice) in the slots (one per cell and
+        """Return the vehicles that reported ice or grip (`side`) in the slots (one per cell and
         heading sector), as two arrays (k, SOURCES): index of the vehicle, and time of its report
         [ns]. The time is 0 if the service no longer trusts the vehicle, or if the report is not
         after `since` [ns].

@@ -77,8 +77,9 @@ class Fusion(BeliefMap):
     Args:
         lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
             L) is late, and is fused with an aged (less certain) likelihood.
-        enrolled: True if only vehicles of an enrolment file are fused; an unknown vehicle then has
-            full weight.
+        enrolled: True if the service accepts only vehicles on the operator's list. Then nobody can
+            invent a name, so a vehicle without a history is not given the small weight of a
+            newcomer (`trust.compute_vote_weights`).
 
     Attributes:
         reports: weather reports that a later update may still need.

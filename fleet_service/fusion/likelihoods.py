@@ -37,14 +37,18 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
     a description of the reported values.
 
     Args:
-        columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,),
-            NaN where absent.
+        columns: `log_likelihood` (n, 32); the sender's posterior as median `mu` and interval from
+            `mu_lower` to `mu_upper`; `mu_utilised`, the grip used. Except the first, each is (n,)
+            and NaN where absent.
         with_likelihood: (n,) True if the sender gave a likelihood.
 
-    A likelihood that falls towards the highest friction is called a value; any other is a lower
-    bound, see `level_above_used`. A posterior counts as a value if `mu_utilised ≥ 0.6·mu`. In all
-    other cases only the statement "μ is at least mu_utilised" is used. A visit without any of these
-    columns gives a flat likelihood.
+    If the sender gave a likelihood, it is used. It is a friction value if it falls towards the
+    highest friction. Otherwise it is only a lower bound and must not claim more than the grip used
+    (`level_above_used`).
+
+    If the sender gave no likelihood, the posterior is used as a friction value where `mu_utilised ≥
+    0.6·mu`. If less grip was used, or if `mu` is absent, only the lower bound "μ is at least
+    `mu_utilised`" is used. If `mu_utilised` is absent, the likelihood is flat.
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
@@ -135,8 +139,9 @@ def at_least(used: FloatArray) -> FloatArray:
 
 
 def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return the log-likelihoods (n, 32) of reports that consist of a median and 5 % and 95 %
-    bounds: normal, with one standard deviation below the median and one above.
+    """Return the log-likelihoods (n, 32) of reports that consist of a median `mu` and 5 % and 95 %
+    bounds `lower` and `upper`, each (n,). Each is a two-piece normal curve: below the median its
+    standard deviation follows from the lower bound, above the median from the upper bound.
     """
     below = _side_std(mu - lower)[:, None]
     above = _side_std(upper - mu)[:, None]

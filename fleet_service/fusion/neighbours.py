@@ -4,10 +4,11 @@ probabilities of a belief. Compiled.
 
 A surface rarely ends at the border of a cell: snow and ice cover stretches. So a cell with slippery
 neighbours is more probably slippery than a cell without any information. Each side of a cell
-(before, behind, and the other direction of the road) sends it one message, from the most
+(before, behind, and the other direction of the road) sends it one message m, from the most
 informative neighbour on that side:
 
-    m_i = 1 - w + w·n_i/p₀_i,    w = q·SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
+    m_i = 1 + q·w·(n_i/p₀_i - 1)
+    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀)
     q = exp(-SILENCE·max(v_n·min(k/k_n, 1) - v, 0))
 
 and a reader gets the normalised product K·(b·m₁·m₂·m₃).
@@ -17,28 +18,31 @@ information travels in a circle. They are computed when the map is read, so that
 belief depends on another's. The common error also applies to the neighbours' values, so K is
 applied once, at the end.
 
-Only slippery neighbours send messages. A message of grip would call an untested cell dry because
-others are dry. Cells without information send no message, because their s is below s₀. The least
-value of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a
-cell with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
-ended there. A cell that no vehicle has certainly visited (see `space`) receives no message.
+Only slippery neighbours send messages, because dry neighbours do not show that an unvisited cell is
+dry. A cell without information sends no message, because its s is below s₀. The least value of m is
+1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell with
+grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has ended
+there. A cell sends no message if no vehicle was in it with a probability of at least HERE_SHARE
+(positions are inaccurate, see `space`).
 
-Messages are weaker (factor q) if the cell's own visitors gave fewer friction values than those of
-the neighbour, because on the same slippery surface they would give about as many. This never lowers
-P(slippery) below UNSURE, because a visit without a value does not show grip. The weights v fade
+The factor q weakens a message if few visits to the cell itself gave a friction value. On the same
+slippery surface, about as many visits would give a value as in the neighbouring cell: v_n, or
+v_n·k/k_n if the cell had fewer visits. q falls below 1 if the cell has less than this. A visit
+without a value does not show grip, so q never lowers P(slippery) below UNSURE. The weights v fade
 with time, so that values from before a change of the road count little.
 
-Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here
-messages travel one step only.
+Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4. Here a
+neighbour's message goes directly to the cell, and cells do not pass messages on.
 
 Legend
     b      belief about the cell from its own reports                                     (32,)
     n      belief about the road of a neighbour from its own reports                       (32,)
-    s      P(slippery) of n
     p₀     prior of an unmeasured road of the region                                      (32,)
-    K      shared kernel, maps measured friction to that of the road, see `shared`        (32, 32)
-    d      distance in cells; 1 to the cell of the other direction
-    v, k   total weight of recent values, and number of visits, of the cell; v_n, k_n of neighbour n
+    s, s₀  P(slippery) of n, and of p₀
+    K      kernel that maps measured friction to that of the road, see `shared`        (32, 32)
+    d      distance of the neighbour in cells; 1 to the cells of the other direction
+    v, v_n total weight of recent values of the cell, and of the neighbour
+    k, k_n number of visits to the cell, and to the neighbour
 """
 
 from __future__ import annotations
@@ -105,10 +109,11 @@ class ReadRule(NamedTuple):
     """Parameters for the computation of beliefs about the road from stored beliefs.
 
     Attributes:
-        kernels: kernels (32, 32 each), which map a belief about measured friction to one about the
-            road, because all reports share an error; see `shared`.
-        silence: SILENCE, by which visits without a friction value weaken the messages of
-            neighbouring cells; 0 if they must not weaken them.
+        kernels: table of kernels, (kernels, 32, 32). A kernel maps a belief about measured friction
+            to a belief about the road; it adds the error that all reports in a cell share (see
+            `shared`).
+        silence: SILENCE if messages from neighbouring cells are weakened when few visits to a cell
+            gave a friction value (factor q of the module); 0 if such visits have no effect.
     """
 
     kernels: Float32Array
@@ -116,8 +121,8 @@ class ReadRule(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """Arguments of `road_beliefs`: the slots (one per cell and heading sector), the hash table that
-    finds them, the weather, and the rule by which beliefs are read.
+    """Arguments of `road_beliefs`: the state of the slots (one per cell and heading sector), the
+    hash table that finds slots by key, the weather, and the parameters of reading.
     """
 
     live: Rows
@@ -215,8 +220,11 @@ def _choose_message(
     parts: MapParts, asked: Asked, side: int, buffers: Buffers
 ) -> tuple[float, float]:
     """Write the message (factors on a belief) of the most informative neighbour on one side of a
-    cell to `buffers.message`. Return the message's weight w, 0 if no neighbour sends one. Also
-    return the factor q, which is below 1 if the cell's own visitors gave few friction values.
+    cell to `buffers.message`. Return the message's weight w, which is 0 if no neighbour on this
+    side sends a message.
+
+    Also return the factor q in (0, 1], by which the caller weakens the message: 1 + q·(m - 1)
+    replaces each factor m. It is below 1 if few visits to the cell itself gave friction values.
     """
     live = parts.live
     cells = live.cells
@@ -251,10 +259,13 @@ def _choose_message(
 
 @refcount_free_inlined
 def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
-    """Return the cell of the neighbour number `step` (from 1) on a side of `cell`; `there` is the
-    cell of the neighbour number `step` - 1. On the side of the road's other direction, neighbour 1
-    is the same cell (with the opposite heading), and the next two are the cells to its left and
-    right.
+    """Return the cell of a neighbour of `cell` on one side. `step` is the number of the neighbour,
+    counted from 1, and `sector` is the heading sector.
+
+    Before and behind the cell, neighbour k is k cells away. It is found from `there`, the cell of
+    neighbour `step` - 1 (at first `cell` itself). For the opposite direction of the road, neighbour
+    1 is in `cell` itself, because both directions may share a cell. Neighbours 2 and 3 are in the
+    cells to its left and right.
     """
     if side != _ACROSS:
         return next_cell(there, (sector + 2 * side) % grid.SECTORS)
@@ -291,9 +302,11 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
 
 @refcount_free_inlined
 def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
-    """Lower P(slippery) of a belief `road` (32,) in place to that of `quiet` (32,), the belief with
-    weaker messages, but not below UNSURE. The reason for the weaker messages is only that visits
-    gave no friction value, which does not show grip.
+    """Lower P(slippery) of a belief `road` (32,) in place to the P(slippery) of `quiet` (32,), but
+    not below UNSURE. `quiet` is the same belief computed with weakened messages from neighbours.
+
+    The messages were weakened only because visits gave no friction value. Such visits do not show
+    grip, so they may not make slippery road improbable.
     """
     told = _slippery_probability(road)
     least = _slippery_probability(quiet)
@@ -307,8 +320,9 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
 @refcount_free_inlined
 def _silence_factor(cells: RecordArray, row: int, neighbour: int, silence: float) -> float:
     """Return the factor q in (0, 1] by which the message (factors on a belief) of a slippery
-    neighbour is weakened. The factor is small if many visits to the cell in `row` gave no friction
-    value although visits to the neighbour did.
+    neighbour is weakened. From the neighbour's recent friction values and both numbers of visits, a
+    number of values is expected for the cell in `row`. The factor is below 1 if the cell has fewer
+    values.
     """
     visits = float(cells[row].visits) / max(float(cells[neighbour].visits), 1.0)
     lacking = _recent_values(cells, neighbour) * min(visits, 1.0) - _recent_values(cells, row)

@@ -1,5 +1,5 @@
-"""Error that all reports from one place have in common, and the belief after this error is
-integrated out. Pure (no I/O).
+"""Error that all reports from one place have in common, and the belief about the road that allows
+for this error. Pure (no I/O).
 
 Vehicles that do the same manoeuvre in the same place make the same error. One cause is the shape of
 the tyre's force curve, which each vehicle assumes: this error grows as the share of grip used
@@ -10,25 +10,27 @@ computes from p:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
-           where μ_j < μ_i
+           where the reading μ_j is lower than the road's μ_i
     σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  elsewhere
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
     n_eff = (Σ w_k)²/Σ w_k²
 
-The shape error is one-sided. A reading that is too low limits μ from above and so counts as a
-measurement; one that is too high counts only as a lower bound. The slope (error per unit of unused
-grip) is the estimate of `trust.shape_of` plus SHAPE_DOUBT. An alarm uses the upper end of the
-slope's confidence range, which narrows as the service compares more visits.
+The last term of σ₋² is the error from the tyre's force curve. It is only in σ₋, because a reading
+that is too low wrongly excludes higher friction. A reading that is too high excludes nothing,
+because the fusion uses it only as a lower bound of μ. The slope is this error per unit of unused
+grip: the estimate of `trust.shape_of` plus SHAPE_DOUBT. An alarm uses the upper end of the slope's
+confidence range, which narrows as the service compares more visits.
 
-The standard deviation that a sender states covers its whole error. A part of this error is common
-to all senders of the same manoeuvre, so a comparison of senders cannot show it: σ_s² =
+The standard deviation that a vehicle states covers its whole error. A part of this error, σ_s, is
+common to all vehicles with the same manoeuvre, so a comparison of vehicles cannot show it: σ_s² =
 SHARED_PART·stated² (relative, weighted mean of the cell's values).
 
 Legend
-    ū     mean grip used by the vehicles that gave values, weighted
-    a     SHARED_ALWAYS, the part of σ_s that other manoeuvres do not average out
-    n_eff effective number of kinds of manoeuvre
-    w_k   weight of the values of manoeuvre k; newer values replace older ones
+    ū      mean grip used by the vehicles that gave values, weighted
+    a      SHARED_ALWAYS, the part of σ_s² that other manoeuvres do not average out
+    n_eff  effective number of kinds of manoeuvre: 1 if all values come from one kind
+    w_k    weight of the values of manoeuvre k; newer values replace older ones
+    COMMON_…, SHARED_…    parts of the error, see `constants`
 """
 
 from __future__ import annotations
@@ -88,8 +90,9 @@ def shared_parts(reported: Float32Array) -> ByteArray:
 
 
 class Shape(NamedTuple):
-    """Error from the shape of the tyre's force curve: how far the fleet's friction values are too
-    low per unit of grip left unused (the slope), and the standard deviation of this slope.
+    """Error from the shape of the tyre's force curve. `slope` is the amount by which the fleet's
+    friction values are too low per unit of grip left unused. `std` is the standard deviation of the
+    estimated slope.
     """
 
     slope: float
@@ -108,8 +111,9 @@ class Shape(NamedTuple):
         assumes: the upper end of its one-sided 95 % interval.
 
         A new service assumes .5. After comparing many passages, a service assumes little more than
-        the slope for readers. On tuning seeds without misbehaving vehicles, .010 of the icy
-        cell-minutes had no alert; with .5 for all services, .044.
+        the slope for readers. In simulations without misbehaving vehicles (seeds for tuning), the
+        alerts missed a share of .010 of the icy cell-minutes. The share was .044 if services always
+        assumed .5.
         """
         return self.reader + Z_95 * self.std
 
@@ -127,9 +131,11 @@ def shared_kernel(
 
     Args:
         used: mean grip used by the vehicles that measured friction in the cell.
-        kinds: effective number of kinds of manoeuvre.
-        stated: shared part of the error that the vehicles state, relative.
-        slope: error per unit of unused grip.
+        kinds: effective number n_eff of kinds of manoeuvre in the cell's values: 1 if all values
+            come from one kind, larger if several kinds have similar weights.
+        stated: relative error σ_s (standard deviation) that the cell's values have in common, as
+            derived from the intervals that the vehicles reported (`shared_parts`).
+        slope: error of a value per unit of unused grip.
     """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
@@ -161,9 +167,13 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
 
 
 def _kernel_table(slope: float) -> Float32Array:
-    """Return all kernels (maps from a belief about measured friction to one about the road) for one
-    learned slope (error per unit of unused grip), (kernels, 32, 32); `kernel_of` gives the index.
-    Each kernel is transposed, so that the 32 bins of one belief are contiguous in memory.
+    """Return the kernels for one slope (error of a value per unit of unused grip), (kernels, 32,
+    32). A kernel maps a belief about measured friction to one about the road.
+
+    The first kernel is for cells without values. The others are for all combinations of mean grip
+    used, effective number of kinds of manoeuvre (KINDS) and shared error (STATED). `kernel_of`
+    gives the index. Each kernel is transposed, so that the 32 bins of one belief are contiguous in
+    memory.
     """
     rows = [
         shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
@@ -189,8 +199,9 @@ def shape_class(slope: float) -> int:
 
 @refcount_free_inlined
 def kernel_of(cells: RecordArray, row: int) -> int:
-    """Return the index of the kernel for the cell in row `row` of `cells`, in the table of kernels.
-    A kernel (32, 32) maps a belief about measured friction to one about the road.
+    """Return the index, in a table of `_kernel_table`, of the kernel that fits the values in the
+    cell in row `row` of `cells`. A kernel (32, 32) maps a belief about measured friction to one
+    about the road.
     """
     whole = 0.0
     squares = 0.0
@@ -237,11 +248,13 @@ def read_road(
 def note_value(
     cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float
 ) -> None:
-    """Add a friction value to the running means of its cell: grip used, the error that it shares
-    with other vehicles, and the weight of its kind of manoeuvre. Row `entry` of `entries` is the
-    observation; `strength` in [0, 1] is its weight in the belief.
+    """Update three weighted means of a cell for a new friction value, from which `kernel_of`
+    chooses the cell's kernel: `used` (grip used), `shared` (relative error that the values have in
+    common) and `manoeuvres` (weight per kind of manoeuvre).
 
-    The weight in the means is smaller if the vehicle used less grip or stated a wider interval.
+    Row `entry` of `entries` is the observation, and `strength` in [0, 1] is its weight in the
+    belief. Its weight in the means is smaller if the vehicle used little grip or if the value's
+    shared error is large.
     """
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED
@@ -272,9 +285,8 @@ def _moving_mean(before: int, new: float, part: float) -> np.uint8:
 
 @refcount_free
 def fade_weights(cells: RecordArray, row: int, begin: int, end: int) -> None:
-    """Reduce two kinds of numbers that fade with time, for the time from `begin` to `end` [ns]: the
-    weights of the kinds of manoeuvre in a cell, and the number of its reports by untrusted
-    vehicles.
+    """Reduce two numbers of a cell by their decay from `begin` to `end` [ns]: the weight of each
+    kind of manoeuvre, and the number of reports by untrusted vehicles.
     """
     borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
     if borders > 0:

@@ -16,10 +16,14 @@ values.
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
-    m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST
-    g    share of agreement, (a₀ + Σ m·ā) / (n₀ + Σ m); a₀, n₀: prior agreement and count
-    T    trust, clip((g - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
-    r    vote weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION)
+    m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST and at most 1
+    g    share of agreement, (n₀·a₀ + Σ m·ā) / (n₀ + Σ m). It starts as if the vehicle had met
+         n₀ = TRUST_PRIOR_PEERS others and had agreed with the share a₀ = TRUST_PRIOR of them
+    T    trust, from 0 at g = TRUST_NONE to 1 at g = TRUST_FULL, linear between them
+    ε    share of wrong values that is assumed for a known vehicle (one that has been compared with
+         at least ESTABLISHED_PEERS others): 1 - g, limited to the range from
+         CONTAMINATION_LEAST to CONTAMINATION; for other vehicles it is CONTAMINATION
+    r    weight of the vehicle's votes: T·(1 - ε) / (1 - CONTAMINATION)
 """
 
 from __future__ import annotations
@@ -156,11 +160,16 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how a vehicle's friction values in one cell change with the grip that the vehicle
-    used. Of two visits, `difference` is the difference of the values and `used` that of the grip
-    used, both relative to friction. `variance` is the variance of `difference`.
+    """Record how the friction values of one vehicle in one cell depend on the grip that the vehicle
+    used. The function compares two visits. A constant relative error of the vehicle cancels in the
+    difference.
 
-    A constant relative error of the vehicle cancels in these differences.
+    Args:
+        peers: comparison records (`PeersRecord`), one row per vehicle.
+        vehicle: index of the vehicle.
+        used: difference of the grip used in the two visits, divided by the mean of the two values.
+        difference: difference of the two friction values, divided by their mean.
+        variance: variance of `difference`.
     """
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)
@@ -180,14 +189,13 @@ def _own_variance(mean: float, std: float) -> float:
 
 @refcount_free
 def _pair_rank(vehicle: int, other: int) -> int:
-    """Return a fixed pseudo-random number of two vehicles, by which pairs are ranked. It is
-    computed from the permanent numbers of the two vehicles, so the order in which the vehicles
+    """Return a fixed pseudo-random number of two vehicles, by which pairs of vehicles are ranked.
+    It depends only on the permanent numbers of the two vehicles, so the order in which the vehicles
     report has no influence.
 
-    A vehicle's table of other vehicles has only PEERS places. If two others compete for a place,
-    the pair with the lower number keeps it. A vehicle that was met rarely is thus as likely to keep
-    its place as one that was met often. Without this rule, the vehicles that report most would
-    displace the rarely met ones.
+    A vehicle's record has only PEERS places for other vehicles. If two other vehicles need the same
+    place, the one with the lower number gets it. Without this rule, the vehicles that report most
+    often would displace the rarely met ones.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9

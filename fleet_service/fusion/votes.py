@@ -328,7 +328,7 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
     a slip controller (ABS, ESC, traction control) that the visit's friction value does not
     contradict.
 
-    An intervention while little grip is used corroborates the reports of other vehicles. The
+    An intervention while little grip is used confirms the reports of other vehicles. The
     intervention itself never changes the belief: the controller and the visit's likelihood observe
     the same sliding wheel, so this evidence would count twice.
     """
@@ -341,15 +341,20 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
     """Return the evidence [nat] that one observation (row `entry`) gives for ice (μ < SLIPPERY)
-    against grip (μ ≥ SLIPPERY), a log-likelihood ratio. The ratio allows for the tyre-shape error:
-    a vehicle that uses only a part of the grip may report too low a value.
+    against grip (μ ≥ SLIPPERY): the logarithm of the ratio of their largest likelihoods, at least
+    0.
 
-    On a road of friction μ on which the vehicle used the grip u, this error has the standard
-    deviation d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ is the error per unit of
-    unused grip that alerts assume for a fleet about which nothing has been learned. Let L(r) be the
-    reported likelihood of a reading r, scaled to maximum 1. The likelihood of ice is taken as this
-    maximum, 1. The likelihood of grip is the maximum of L(r)·exp(-½·((μ - r)/d(μ))²) over all μ ≥
-    SLIPPERY and r ≤ μ. The result is minus the logarithm of the likelihood of grip.
+    The ratio allows for the tyre-curve error. A vehicle that uses less than the share SHARED_SHARE
+    of the grip may report too low a value. If the vehicle used the grip u on a road of friction μ,
+    this error has the standard deviation d(μ) = μ·clip(λ·(SHARED_SHARE - u/μ), 0, SHARED_MOST). λ
+    is the error per unit of unused grip that alerts assume for a fleet about which nothing has been
+    learned (`shared.Shape.alarm`). SHARED_MOST is the largest relative standard deviation.
+
+    Let L(r) be the reported likelihood of a reading r, scaled to maximum 1. The likelihood of ice
+    is taken as 1. This is exact if the maximum of L is at ice; if it is at grip, the likelihood of
+    grip is also 1 and the result is 0. The likelihood of grip is the maximum of L(r)·exp(-½·((μ -
+    r)/d(μ))²) over all μ ≥ SLIPPERY and r ≤ μ. The result is minus the logarithm of the likelihood
+    of grip.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED

@@ -125,8 +125,9 @@ def _absorb_votes(
     scratch: Bins,
 ) -> int:
     """Add the votes (effects of observations on cells) to the lateness windows (recent
-    observations, sorted by time) of their cells, and fill the marks. Return the number of windows
-    whose belief must be computed again.
+    observations, sorted by time) of their cells. Record in `marks` the observations that were left
+    out, those that were accepted, and the windows whose belief must be computed again. Return the
+    number of these windows.
     """
     cells = state.live.cells
     windows = state.windows
@@ -195,11 +196,11 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch the memory that the votes from `begin` to `end` will access. Records whose row
-    number must first be read from memory come last.
+    """Prefetch the memory that the votes in rows `begin` to `end` of `votes` will access. Records
+    whose row number must first be read from memory come last.
 
-    No branch waits for memory, because a processor that mispredicts a branch discards its
-    prefetches.
+    The code uses `max` and `min` instead of branches on the values that it loads. A processor that
+    mispredicts a branch would discard its prefetches.
     """
     live = state.live
     base = state.base
@@ -317,8 +318,8 @@ def commit_windows(
 @refcount_free_inlined
 def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
     """Prefetch the memory that `commit_windows` will access for the lateness windows (recent
-    observations of cells) from `begin` to `end`. Records whose row number must first be read from
-    memory come last.
+    observations of cells) in rows `begin` to `end` of `due_windows`. Records whose row number must
+    first be read from memory come last.
     """
     live = state.live
     base = state.base

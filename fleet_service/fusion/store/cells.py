@@ -24,9 +24,12 @@ from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
-    """Stored state of each slot (cell and heading sector) as columns (n,) with the fields of
-    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4). `belief` (n, 32) contains the
-    probabilities as 16-bit integers, see `belief.unpack_belief`.
+    """State of all slots (one per cell and heading sector) as columns.
+
+    `belief` (n, 32) contains the probabilities of the friction bins as 16-bit integers, see
+    `belief.unpack_belief`. The other columns are the fields of `records.CellRecord`, which explains
+    them. They have the shape (n,), except `untrusted` (n, 2: bounds, values) and `manoeuvres` (n,
+    4: one weight per kind of manoeuvre).
     """
 
     belief: PackedArray
@@ -84,8 +87,9 @@ def begin_slot(live: Rows, slot: int, key: int) -> None:
 
 @refcount_free_inlined
 def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
-    """Copy the state of a cell from row `at` of `source` to row `to` of `target`. The target row
-    keeps its own references to recent observations and recent reporters.
+    """Copy the state of a cell from row `at` of `source` to row `to` of `target`. The target keeps
+    its own `window` and `reporters`, which are row numbers of the cell's recent observations and
+    recent reporters.
     """
     for i in range(mugrid.BINS):
         target.belief[to, i] = source.belief[at, i]
@@ -97,8 +101,8 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
 
 @refcount_free_inlined
 def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
-    """Copy the vehicles that corroborate ice or grip in a cell, from row `at` of `source` to row
-    `to` of `target`.
+    """Copy the list of vehicles that recently reported ice or grip in a cell, with the times of
+    their reports. The list moves from row `at` of `source` to row `to` of `target`.
     """
     for side in range(2):
         for k in range(SOURCES):

@@ -63,17 +63,19 @@ def grow_windows(state: State, most: int) -> State:
 
 
 def grow_pairs(state: State, most: int) -> State:
-    """Return the fusion's state with room for at least `most` active pairs (vehicles in cells)."""
+    """Return the fusion's state with room for at least `most` records of active pairs. An active
+    pair is one vehicle in one slot in which the vehicle has reported recently.
+    """
     return _move_pairs(state, max(int(state.used[PAIRS]), most), only_waiting=False)
 
 
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
-    """Return the fusion's state after two changes. All pairs (vehicles in cells) without an
-    observation in a window move to the settled pairs, which are sorted records without free space.
-    Reports that are too old to have an effect at `now` [s] are deleted.
+    """Return the fusion's state after old records have been moved to compact storage. A pair is the
+    record of one vehicle in one slot (cell and heading sector). All pairs whose observations are
+    final move from the hash table `State.pairs` to the sorted arrays `State.settled`. Reports that
+    are too old to have an effect at `now` [s] are deleted.
 
-    `names` (V,) are the records of the vehicles, and `size` is the number of slots (one per cell
-    and heading sector) in use.
+    `names` (V,) are the records of the vehicles, and `size` is the number of slots in use.
     """
     most = int(state.used[PAIRS])  # the table keeps its size, because as many pairs will follow
     reports, values = drop_reports(state, names, now)
@@ -100,9 +102,10 @@ def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
 
 
 def rebuild_reporters(state: State, size: int, least: int) -> State:
-    """Return the fusion's state without the lists of recent reporters whose last report was before
-    `least` [s]. Cells with observations that are not yet final keep their lists. `size` is the
-    number of slots (one per cell and heading sector) in use.
+    """Return the fusion's state without outdated lists of reporters. Each list belongs to one slot
+    (cell and heading sector) and contains the vehicles that recently reported there. A list is
+    deleted if its newest report is older than `least` [s] and all observations in its slot are
+    final. `size` is the number of slots in use.
     """
     live = state.live
     cells = live.cells[:size]
@@ -120,7 +123,7 @@ def rebuild_reporters(state: State, size: int, least: int) -> State:
 
 
 def no_pairs(places: int) -> RecordArray:
-    """Return an empty table of active pairs (records of a vehicle in a cell)."""
+    """Return an empty hash table of pair records (one vehicle in one slot each)."""
     pairs = rows_of_lines(places, PAIR)
     pairs["slot"] = NONE
     return pairs

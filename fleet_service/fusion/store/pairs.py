@@ -1,6 +1,9 @@
-"""Store of the earlier reports of an active pair, which is one vehicle in one cell. Recent reports
-form a linked list, because a late one may still come between them. One record sums up the older
-reports.
+"""Memory of the reports that one vehicle made in one cell. This combination of vehicle and cell is
+called a pair. A pair is active while the vehicle has reported in the cell recently; the module
+`settled` stores the reports of all other pairs.
+
+Recent reports of an active pair form a linked list in order of time, because a late report may
+still be inserted. One record (`PairRecord`) summarises the older reports.
 """
 
 from __future__ import annotations
@@ -32,8 +35,9 @@ def comes_before(entries: RecordArray, a: int, b: int) -> bool:
 
 @refcount_free_inlined
 def pair_of(state: State, slot: int, vehicle: int) -> int:
-    """Return the row of the active pair (record of a vehicle in a cell) of `slot` (cell and heading
-    sector) and `vehicle`. If the pair is not active, it becomes active.
+    """Return the row number of the record of a vehicle in a slot (cell and heading sector) in the
+    table of active pairs. If there is no such record, create one and copy the vehicle's settled
+    (earlier) reports in this slot into it.
     """
     pairs = state.pairs
     pair = pair_place(pairs, slot, vehicle)
@@ -91,9 +95,9 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_waiting: int) -> int:
-    """Move the records of active pairs (vehicles in cells) from the hash table `old` to the hash
-    table `new`. If `only_waiting` is 1, move only pairs with an observation in a window (recent
-    observations). Return the number of moved records.
+    """Move the records of active pairs (one vehicle in one slot each) from the hash table `old` to
+    the hash table `new`. If `only_waiting` is 1, move only pairs with an observation that is not
+    yet final. Return the number of moved records.
     """
     count = 0
     for begin in range(0, len(old), AHEAD):

@@ -75,22 +75,23 @@ class CellRecord:
         time: time of the latest observation in the belief [ns]; 0 before the first observation.
         first: time of the first observation [ns].
         returned: set of bits of the vehicles whose visits were forgotten, so that a returning
-            vehicle is not counted twice; see `pairs.returning_bit`.
+            vehicle is not counted twice; see `settled.returning_bit`.
         visits: number of observations.
         vehicles: number of distinct vehicles.
-        values: number of observations with a friction value; a repeated one of the same vehicle
-            counts as a fraction.
+        values: number of observations with a friction value. Each counts by its weight in the
+            belief, so a repeated value of one vehicle adds only a fraction.
         window: row of the slot's window in `State.windows`, or NONE.
-        reporters: row of its recent reporters in `Rows.reporters`, or NONE if no vehicle recently
-            gave a value or corroborated an alert.
-        aged: length of the time before `time` for which the belief has not been aged yet, in units
-            of 1/AGED s; the belief is aged in portions of FORGET_S.
+        reporters: row of the list of recent reporters in `Rows.reporters`, or NONE. A slot gets a
+            list when a vehicle gives a value or reports grip, or when a slip controller intervenes.
+        aged: part of the time before `time` that ageing of the belief has not covered yet, in units
+            of 1/AGED s. The belief is aged only when FORGET_S or more have passed.
         used: weighted mean grip used by the vehicles that gave values, in units of 1/USED.
         shared: weighted mean of the relative error that these values have in common (standard
             deviation), in units of 1/SHARED.
-        untrusted: number of bounds and of values from untrusted vehicles, fading with time, in
-            units of 1/UNTRUSTED.
-        manoeuvres: weight of the values by manoeuvre, see `shared`; in units of 1/WEIGHT.
+        untrusted: number of bounds, and number of values, from untrusted vehicles, in units of
+            1/UNTRUSTED. Both fade with time.
+        manoeuvres: weight of the values for each kind of manoeuvre (`shared.manoeuvre_of`), in
+            units of 1/WEIGHT. The weights fade with time.
     """
 
     key: int
@@ -204,19 +205,23 @@ class WindowRecord:
 
 
 class PairRecord:
-    """Active pair: summary of the reports of one vehicle in one slot that are older than the
-    checkpoint and therefore final. A record is half a cache line long, so that no record crosses
-    the border of a line.
+    """Active pair: summary of the final reports of one vehicle in one slot. Final reports are older
+    than the checkpoint. A record is half a cache line long, so that no record crosses the border of
+    a line.
+
+    The arrays `time`, `mean` and `spent` contain two numbers each: the first for lower bounds, the
+    second for values.
 
     Attributes:
         slot, vehicle: slot and index of the vehicle; a free place of the table has slot NONE.
-        last: row of the newest of the pair's entries in the window, or NONE.
+        last: row of the pair's newest entry in the window (observation that is not final), or NONE.
         waiting: number of the pair's entries in the window.
-        std: standard deviation of the last value (`EntryRecord.last_std`), in units of 1/FINE.
-        time: times [s] of the last bound and of the last value; 0 for none.
-        mean, spent: mean friction that stands for the vehicle's reports in the slot
-            (`EntryRecord.last_mean`), and number of votes that the vehicle has used up there. Each
-            has two numbers, for bounds and for values, in units of 1/FINE.
+        std: standard deviation of the vehicle's values (`EntryRecord.last_std`), in units of
+            1/FINE.
+        time: time [s] of the latest final report; 0 for none.
+        mean: running mean of the reported friction (`EntryRecord.last_mean`), in units of 1/FINE.
+        spent: number of votes that the vehicle has used up in the slot, out of at most VOTES
+            (`EntryRecord.spent`), in units of 1/FINE.
     """
 
     slot: np.int32
@@ -230,14 +235,16 @@ class PairRecord:
 
 
 class SettledRecord:
-    """Last report of one kind (value or lower bound) of a settled pair, which is one vehicle in one
-    slot without recent observations.
+    """Last report of one kind (value or lower bound) that a vehicle made in a slot. All reports of
+    the vehicle in this slot are final (a settled pair).
 
     Attributes:
         time: last 16 bits of the time [s] of the report; the module `settled` restores the other
             bits.
-        mean, spent: mean friction that stands for the vehicle's reports of this kind in the cell,
-            and number of votes that it has used up there, in units of 1/FINE.
+        mean: running mean of the friction in the vehicle's reports of this kind in the slot
+            (`EntryRecord.last_mean`), in units of 1/FINE.
+        spent: number of votes that the vehicle has used up in the slot, out of at most VOTES
+            (`EntryRecord.spent`), in units of 1/FINE.
     """
 
     time: np.uint16
@@ -246,8 +253,9 @@ class SettledRecord:
 
 
 class SourcesRecord:
-    """The last SOURCES vehicles that reported grip in a cell and heading sector, and the last that
-    reported ice, with the times of their reports [s].
+    """The sources of a cell and heading sector, which are vehicles with a clear report: the last
+    SOURCES vehicles that reported grip, and the last SOURCES vehicles that reported ice. The times
+    of their reports [s] are also stored.
     """
 
     source: Annotated[Int32Array, 2, SOURCES]
@@ -255,10 +263,12 @@ class SourcesRecord:
 
 
 class ReportersRecord:
-    """The recent reporters of a cell and heading sector: the last REPORTERS vehicles that gave a
-    value, with time [s], mean, standard deviation and grip used. The record also contains the last
-    SOURCES vehicles that reported grip there and the last that reported ice, with the times of
-    their reports [s].
+    """Vehicles that recently reported in a cell and heading sector, in two lists.
+
+    The first list contains the last REPORTERS vehicles that gave a friction value: index
+    (`reporter`), time [s], mean, standard deviation and grip used. The second list contains the
+    last SOURCES vehicles that reported grip, and the last SOURCES that reported ice: index
+    (`source`) and time [s].
     """
 
     reporter: Annotated[Int32Array, c.REPORTERS]
@@ -272,12 +282,13 @@ class ReportersRecord:
 
 class PeersRecord:
     """Comparisons of one vehicle's friction values with those of other vehicles, and with its own
-    earlier values.
+    earlier values. The record has PEERS places, each for one other vehicle.
 
     Attributes:
-        other: index of each other vehicle.
-        rank: pseudo-random number of each pair of vehicles; if two other vehicles compete for a
-            place, the one with the lower number gets it.
+        other: index of the other vehicle in each place.
+        rank: pseudo-random number of the vehicle and the other vehicle. If two other vehicles would
+            need the same place, the one with the lower number gets it, so that frequent reporters
+            have no advantage (`trust._pair_rank`).
         agreed, met: summed agreement, and number of comparisons, for each other vehicle.
         used_squares: weighted sum of squared differences in grip used between two visits of the
             vehicle to one cell.
@@ -336,17 +347,20 @@ FREE_WINDOWS, FREE_ENTRIES, PAIRS, REPORTERS_USED, SETTLED_SINCE, SETTLED_VEHICL
 
 
 class State(NamedTuple):
-    """State of the store in arrays, for compiled code.
+    """State of the store in arrays, for compiled code. The terms are defined in the module's
+    docstring.
 
     Attributes:
         live: the current slots.
-        base: for each row of `windows`, a copy of its slot (cell and heading sector) without the
-            effect of the recent observations; of the reporters only the sources are copied.
+        base: final state of each slot that has a window, in the rows of `windows`. Final means
+            without the observations in the window. For reporters it contains only the vehicles that
+            reported grip or ice (`SourcesRecord`).
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
-        pairs: hash table that contains the records of active pairs.
-        settled: `SettledRecord` of each report of the settled pairs, (k,), sorted by slot, vehicle
-            and kind.
+        pairs: hash table with the records of active pairs (vehicles that reported in a slot
+            recently).
+        settled: `SettledRecord` of each report of the settled pairs (all other pairs), (k,), sorted
+            by slot, vehicle and kind.
         settled_keys: vehicle and kind of each settled report, (k,): four times the vehicle's index,
             plus two times the kind, plus one if the pair is active again.
         settled_std: standard deviation (`PairRecord.std`) of the settled reports that are values,

@@ -1,6 +1,10 @@
-"""Settled pairs: the last reports of a vehicle in a slot (cell and heading sector), all of which
-are final, as sorted records without free space. A pair whose vehicle returns becomes active again
-(`pairs.pair_of`). Compiled.
+"""Compact storage for the reports of vehicles that have not returned to a cell recently. A pair is
+one vehicle in one slot (cell and heading sector). A pair can be settled (moved to this storage)
+once all its reports are final, so that no late report can change their order.
+
+The last report of each kind (value or lower bound) is stored in sorted arrays without free rows. If
+the vehicle reports in the slot again, its reports are copied back to the table of active pairs
+(`pairs.pair_of`). The functions are compiled.
 """
 
 from __future__ import annotations
@@ -44,25 +48,28 @@ def _to_int(number: np.unsignedinteger[Any]) -> int:
 
 @refcount_free_inlined
 def _make_key(vehicle: int, kind: int) -> np.uint32:
-    """Return the key of a settled report, one integer made from the index of the vehicle, the kind
-    of report (BOUND or VALUE), and the flag _MOVED, which is set if the vehicle reports in the cell
-    again.
+    """Return the sort key of a vehicle's report in `State.settled_keys`: 4·vehicle + 2·kind.
+    `vehicle` is the index of the vehicle, and `kind` is BOUND or VALUE.
+
+    The lowest bit, the flag _MOVED, is 0 here. It is set later if the vehicle reports in the cell
+    again. The report is then copied to `State.pairs`, and the stored one is invalid.
     """
     return np.uint32(4 * vehicle + 2 * kind)
 
 
 @refcount_free_inlined
 def _full_time(stored: np.uint16, since: int) -> int:
-    """Return the time [s] of a settled report from its last 16 bits. `since` [s] is at most 18 h
-    before it (`State.used[SETTLED_SINCE]`).
+    """Return the full time [s] of a report of which `SettledRecord.time` stores only the last 16
+    bits. `since` [s] is at most 18 h before this time (`State.used[SETTLED_SINCE]`).
     """
     return int(since + ((_to_int(stored) - since) & 0xFFFF))
 
 
 @refcount_free_inlined
 def guess_row(state: State, slot: int, vehicle: int) -> int:
-    """Return the row at which the settled reports of a vehicle in a slot probably begin, if there
-    are any. Rows are sorted by the vehicle's index, which is below `used[SETTLED_VEHICLES]`.
+    """Return the row of `State.settled` at which the reports of a vehicle in a slot probably begin,
+    if there are any. Rows are sorted by the vehicle's index, which is below
+    `used[SETTLED_VEHICLES]`.
     """
     begin = _to_int(state.settled_begin[slot, 0])
     rows = _to_int(state.settled_begin[slot + 1, 0]) - begin
@@ -72,9 +79,9 @@ def guess_row(state: State, slot: int, vehicle: int) -> int:
 
 @refcount_free_inlined
 def _find_first(state: State, slot: int, vehicle: int) -> int:
-    """Return the first row of a slot with settled reports of a vehicle. If there is none, return
-    the first row of a vehicle with a higher index. The search begins at the probable row and
-    doubles its steps, so that it reads few cache lines.
+    """Return the first row of a slot in `State.settled` with reports of a vehicle. If there is
+    none, return the first row of a vehicle with a higher index. The search begins at the probable
+    row and doubles its steps, so that it reads few cache lines.
     """
     keys = state.settled_keys
     begin = _to_int(state.settled_begin[slot, 0])
@@ -135,8 +142,9 @@ def activate_reports(state: State, pair: int) -> None:
 
 @refcount_free_inlined
 def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> int:
-    """Move a settled report from row `row` to row `to`. If it is a value, also move its standard
-    deviation, which has rows of its own. Return 1 for a value, else 0.
+    """Move a report within the arrays of settled reports (`State.settled`, `settled_keys`) from row
+    `row` to row `to`. If it is a value, also move its standard deviation in `State.settled_std`
+    from row `value` to row `to_value`. Return 1 for a value, else 0.
     """
     state.settled_keys[to] = state.settled_keys[row]
     state.settled[to] = state.settled[row]
@@ -148,10 +156,10 @@ def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> 
 
 @compiled
 def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
-    """Delete the settled reports that are too old to be remembered at `now` [s], and those of
-    vehicles that report in the same cell again. The remaining reports move to the beginning of the
-    arrays. Return the number of remaining reports, and the number of friction values among them.
-    `names` are the records of the vehicles.
+    """Delete two groups of reports from `State.settled`: reports that are too old to be remembered
+    at `now` [s], and reports of vehicles that report in the same cell again. The remaining reports
+    move to the beginning of the arrays. Return the number of remaining reports, and the number of
+    friction values among them. `names` are the records of the vehicles.
     """
     begins = state.settled_begin
     keys = state.settled_keys
@@ -185,8 +193,9 @@ def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
 
 @compiled
 def find_resting(pairs: RecordArray) -> IntArray:
-    """Return the rows of the active pairs (one vehicle in one slot each) that have no observation
-    in a lateness window, so that they can be settled.
+    """Return the rows of the pair records (one vehicle in one slot each) without an observation
+    that is still waiting to become final. These pairs can be settled, that is, moved to compact
+    storage.
     """
     out = np.empty(len(pairs), np.int64)
     count = 0
@@ -201,10 +210,12 @@ def find_resting(pairs: RecordArray) -> IntArray:
 def count_settling(
     state: State, names: RecordArray, resting: IntArray, now: int
 ) -> tuple[int, int]:
-    """Return two counts: the number of reports of inactive pairs (one vehicle in one slot each)
-    that are still remembered at `now` [s], and the number of friction values among them. `resting`
-    (k,) are the rows of the pairs. If a pair has no such report, record in its cell that the
-    vehicle has visited it.
+    """Return the number of reports that must be moved to the settled reports (compact storage), and
+    the number of friction values among them. `resting` (k,) are the rows of the pairs (one vehicle
+    in one slot each) that are moved.
+
+    Only reports that are still remembered at `now` [s] count. If a pair has no such report, record
+    in the cell that the vehicle was already counted there.
     """
     bounds = 0
     values = 0
@@ -224,7 +235,7 @@ def count_settling(
 def insert_reports(
     state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
 ) -> None:
-    """Merge the reports of inactive pairs (one vehicle in one slot each) into the sorted settled
+    """Insert the reports of pairs (one vehicle in one slot each) into the sorted arrays of settled
     reports. Reports that are no longer remembered at `now` [s] are left out.
 
     `resting` (k,) are the rows of the pairs, sorted by slot and vehicle. `reports` is the number of
@@ -287,8 +298,9 @@ def returning_bit(number: int) -> np.uint64:
 
 @refcount_free_inlined
 def _mark_returned(state: State, slot: int, number: int) -> None:
-    """Record in a cell that a vehicle (permanent number) has visited it. This is done before the
-    vehicle's reports there are deleted, so that a later report does not count it as a new vehicle.
+    """Record in a cell that a vehicle was counted there, before the vehicle's reports in the cell
+    are deleted. If the vehicle returns, it is then not counted as a new vehicle. `number` is the
+    permanent number of the vehicle.
     """
     bit = returning_bit(number)
     state.live.cells[slot].returned |= bit

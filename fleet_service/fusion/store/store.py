@@ -220,11 +220,14 @@ class Store:
             self.state = grow_pairs(self.state, int(used[PAIRS]) + rows)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Delete old data, once per quarter of an hour of the checkpoint time: reports of a vehicle
-        in a cell that no longer have an effect (`settled.oldest_remembered`), and lists of a cell's
-        recent reporters older than an hour. At these times, and whenever they are many, also move
-        pairs (vehicles in cells) without recent observations to the settled pairs, which need less
-        memory.
+        """Delete old data and move inactive data to compact storage. `checkpoint_s` [s] is the time
+        before which observations are final.
+
+        When this time enters a new quarter of an hour, two kinds of data are deleted: reports that
+        no longer have an effect (`settled.oldest_remembered`), and lists of a cell's recent
+        reporters that are more than an hour old. The records of vehicles in cells where all their
+        observations are final are moved then (`settle_pairs`), and also whenever many such records
+        exist.
         """
         now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
         state = self.state
