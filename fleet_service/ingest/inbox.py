@@ -335,9 +335,12 @@ class BatchIntake:
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
         """Return the stream of a (vehicle, start, region, day): the record of its accepted batches
-        (messages with records). Return None if the key for the vehicle's pseudonym cannot be read,
-        or if the vehicle opens too many streams. The vehicle then keeps its batch and sends it
-        again; it is accepted when the disk works again, or in the next hour.
+        (messages with records). Return None in two cases, in which the vehicle keeps its batch and
+        sends it again later:
+
+        - The key for the vehicle's pseudonym cannot be read. A batch is accepted when the disk
+        works again.
+        - The vehicle has opened too many streams. It may open STREAMS_PER_HOUR more every hour.
         """
         vehicle, boot, region, _ = name
         try:

@@ -63,17 +63,18 @@ RANGES: Final = {
 
 
 class Clock(NamedTuple):
-    """Time according to the service, and how far the time of a record may be before or after it,
-    all in ns.
+    """Time of the service, and limits for the time of a record, all in ns. A record is accepted if
+    its time is at most `now` + `ahead` and at least `horizon`.
 
     Attributes:
         now: time of the service.
         ahead: how much later than `now` the time of an accepted record may be.
-        oldest: how much earlier than `now` (or `least`, if that is earlier) the time of an accepted
-            record may be.
+        oldest: largest age of an accepted record. Ages are counted from `now`, or from `least` if
+            that is earlier.
         doubt: records that are later than `now` + `ahead`, by at most this much, are neither
             accepted nor refused; their senders repeat them.
-        least: lower bound of the true time; None if it is `now`.
+        least: earliest time that the true time may be, if the service's clock may be wrong; None if
+            the clock is reliable.
     """
 
     now: int

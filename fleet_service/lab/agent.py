@@ -7,15 +7,18 @@ Legend
     k      relative error that all vehicles share in one place                         (n,)
     s      share of the grip used in a visit                                           (n,)
     ρ      relative noise of a visit, smaller if more of the grip is used              (n,)
-    σ(m)   hypot(NOISE_ABSOLUTE, ρ·m): noise of forces scales with the grip, of sensors not
+    σ(m)   standard deviation of the noise, hypot(NOISE_ABSOLUTE, ρ·m): the noise of forces is
+           proportional to the grip, and the noise of sensors is constant
     m, z   m = μ·(1 + b + k) + a, and the reading z = m + σ(m)·e                       (n,)
     e      a standard normal, correlated along a drive                                 (n,)
 
 A visit (pass through one cell) with s ≥ .6 ("excited") sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln
 σ(μ). Except for the errors b, a and k, this likelihood is calibrated, because the e of each single
-visit is standard normal. Any other visit sends a lower bound, the grip used. Above the bound its
-likelihood has a slope of at most half a nat, which differs between vehicles (`schemas/mugrid.py`
-defines the log-likelihood). Both likelihoods are rounded to bytes as in the messages.
+visit is standard normal.
+
+Any other visit sends a lower bound, the grip used. Above the bound, this log-likelihood rises or
+falls linearly, by at most half a nat. Each vehicle has its own constant slope. `schemas/mugrid.py`
+defines the log-likelihood. Both likelihoods are rounded to bytes as in the messages.
 """
 
 from __future__ import annotations

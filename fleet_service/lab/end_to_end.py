@@ -96,9 +96,11 @@ def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
 
 def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
     """Return figures of the map after one simulated drive, by name. Only cells that at least
-    SEVERAL vehicles visited are judged. The figures include the share of these cells whose 90 %
-    interval contains the true friction, and the error of μ in those in which friction was measured.
-    They also include the numbers of alerts and observations.
+    SEVERAL vehicles visited are judged.
+
+    One figure is the share of the judged cells whose 90 % interval contains the true friction.
+    Another is the error of μ in the judged cells where the map contains a measurement, not only a
+    lower bound. The numbers of alerts and observations are also included.
     """
     folder = folder / world.prefix.removeprefix("fusion.")
     drive(folder)

@@ -1,11 +1,14 @@
-"""Evaluation of the map with simulated fleets. The errors of one fleet follow the assumptions of
-the fusion (the map's computation); those of the other fleets differ from them. Pure (no I/O).
+"""Evaluation of the map with simulated fleets. Pure (no I/O).
+
+The fleets differ in the measurement errors of their vehicles. Those of the fleet "clean" follow the
+assumptions of the fusion (the map's computation). Those of the other fleets in MODELS deviate from
+these assumptions. One more fleet has no error model: its vehicles have the errors that the real
+estimator made on simulated drives (`measure_real`, `resampled`).
 
 Each fleet first drives on half of the roads, so that the service can compare its vehicles and give
 them trust. Then it drives on the other half, which no vehicle visited before, and the map of these
 roads is judged. Towns, drives and errors are drawn with random seeds that are used only for
-judging, not for tuning. The errors of one fleet are not drawn from an error model: they are those
-of the real estimator on simulated drives (`resampled`).
+judging, not for tuning.
 """
 
 from __future__ import annotations

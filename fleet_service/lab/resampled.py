@@ -1,14 +1,15 @@
 """Simulated visits (passages of cells) in a town, with reports that have the errors of the real
 estimator: each report is drawn from the estimator's own reports on simulated drives. Pure (no I/O).
 
-The errors that `agent` draws are those that the service assumes, so a map of its reports looks too
-good. Therefore this module uses real ones.
+The errors that `agent` draws follow the assumptions of the service, so a map of its reports looks
+too good. This module therefore uses errors that the real estimator made.
 
 A town vehicle drives in the town; a source vehicle comes from the simulated drives. Each town
-vehicle gets the reports of one source vehicle, and so its persistent errors (offsets, a tilted
-sensor, tyres). For each town visit, a visit of the source vehicle with nearly the same friction is
-drawn; if it has none, a visit of another one. Both visits are "excited" (enough grip was used to
-measure the friction), or neither is. The report is then scaled to the town's friction:
+vehicle is assigned one source vehicle, so that all its reports have the same persistent errors
+(offsets, a tilted sensor, tyres). The report for a town visit is that of a visit of the source
+vehicle to a road of nearly the same friction. If the source vehicle has no such visit, a visit of
+any source vehicle is drawn. Both visits are "excited" (enough grip was used to measure the
+friction), or neither is. The report is then scaled to the town's friction:
 
     μ, μ_w   friction of the road in the town visit, and in the source visit             (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
@@ -109,9 +110,10 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
     """Return the visits (passages of cells) in a town with reports drawn from the simulated drives
-    `ways`. Each of the `vehicles` vehicles of the town gets the reports of one vehicle of the
-    drives, if this has visits with similar friction. If the drives have enough vehicles, each is
-    assigned at most once.
+    `ways`. Each of the `vehicles` vehicles of the town is assigned one vehicle of the drives and
+    gets reports of this vehicle. Where that vehicle visited no road of similar friction, a report
+    of any vehicle of the drives is used. If the drives have enough vehicles, each is assigned at
+    most once.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))

@@ -1,10 +1,10 @@
 """Simple rules that combine the reports of vehicles into a map, for comparison with the service's
 map. Each rule stores a mean and a variance of the friction per cell. Pure (no I/O), compiled.
 
-A rule gets the reports that a vehicle in a system with this rule would send: the *posterior* (m, P)
-of the vehicle's own filter, which also contains information from the previous cell. Between
-reports, the variance of each rule grows with time. "Added" below means that the rule adds 1/P to
-its own inverse variance.
+Each simulated vehicle has a Kalman filter of its own (`vehicle_posteriors`). After each passage of
+a cell, the vehicle sends the filter's *posterior* (m, P), which also contains information from the
+previous cell. Between reports, the variance of each rule grows with time. "Added" below means that
+the rule adds 1/P to its own inverse variance.
 
     newest report         the last posterior
     inverse variance      each pass sends SAMPLES equal posteriors, and all of them are added
@@ -56,9 +56,15 @@ _NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(_KALMAN)
 def vehicle_posteriors(
     vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int
 ) -> FloatArray:
-    """Return the posterior (mean m, variance P) that the vehicle's own filter sends at each visit
-    (passage of a cell), (n, 2). Before each visit the filter's variance grows, at most to that of
-    the prior (belief before any measurement).
+    """Return the posterior (mean m, variance P) that each vehicle's own Kalman filter has after
+    each visit (passage of a cell), (n, 2). Before each visit the filter's variance grows, at most
+    to that of the prior (belief before any measurement).
+
+    Args:
+        vehicle: number of the vehicle in each visit, (n,).
+        reading: friction that the vehicle measured in the visit, (n,); NaN without a measurement.
+        std: standard deviation of the reading, (n,).
+        vehicles: number of vehicles.
     """
     mean = np.full(vehicles, PRIOR_MEAN)
     variance = np.full(vehicles, PRIOR_VAR)
@@ -85,12 +91,18 @@ def fuse_by_rules(
     asked: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return mean and variance of μ by the first five of the simple rules in each cell at each time
-    in `asked` [s], (times, 5, cells, 2).
+    """Return mean and variance of μ in each cell at the times `asked`, (times, 5, cells, 2), by
+    five simple rules: the rules of RULES except the median, in the same order.
 
-    A visit k (passage of a cell) is in the cell `place[k]` at the time `seconds[k]`. The filter of
-    the vehicle has the mean and variance `sent[k]`; the reading of the visit is `readings[0][k]`
-    with standard deviation `readings[1][k]`.
+    Args:
+        place: cell of each visit (passage of a cell), (n,).
+        seconds: time of each visit [s], (n,).
+        sent: posterior (mean, variance) of the vehicle's own filter after each visit, (n, 2). All
+            rules but "federated reset" use it.
+        readings: friction measured in each visit alone, and its standard deviation, (n,) each. Only
+            "federated reset" uses it.
+        asked: times [s] at which the maps are read, (times,).
+        cells: number of cells.
     """
     reading, std = readings
     mean = np.full((5, cells), PRIOR_MEAN)

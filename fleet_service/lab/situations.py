@@ -42,11 +42,14 @@ VALUED: Final = 0.3
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Return how far the lower end of the map's interval of friction lies above the larger of two
-    numbers: the grip that was used, and the prior's lower end.
+    """Return by how much the map overestimates the certain grip of a cell after BOUNDED vehicles
+    drove through it. Each vehicle used the grip `used` and did not measure the friction. The result
+    is the lower end of the map's interval of friction, minus the larger of `used` and the lower end
+    of the prior's interval.
 
-    BOUNDED vehicles have used the grip `used`. `path` is the form in which they report it: protobuf
-    or JSON, as posterior or as likelihood.
+    `path` consists of the encoding ("protobuf" or "json") and the content of the reports.
+    "posterior" means a median with an interval; "likelihood" means log-likelihoods on the friction
+    grid.
     """
     n = BOUNDED
     nan = float("nan")
@@ -106,10 +109,10 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest amount by which the lower end of the map's interval of friction exceeds
-    the level that the reports support (`bound_excess`). It is the maximum over all values of the
-    grip used in USED, and over all forms of the report: protobuf or JSON, as posterior or as
-    likelihood.
+    """Return the largest amount by which the map overestimates the certain grip of a cell after
+    reports that are only lower bounds (`bound_excess`). It is the maximum over all grips used in
+    USED, over both encodings (protobuf, JSON), and over both contents of the reports (posterior,
+    likelihood).
     """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
@@ -117,8 +120,11 @@ def lower_excess() -> float:
 
 def backlog_fused(rng: Generator) -> float:
     """Return the share of late observations that still affect the map after an outage of the
-    network. In this situation, one vehicle was connected for the whole hour, and the observations
-    of all other vehicles arrive together after it.
+    network.
+
+    In this situation, vehicles drive for an hour. One vehicle is connected all the time, so that
+    its observations make older ones of others late. BACKLOG other vehicles have no connection in
+    this hour, and their observations arrive together at its end.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

@@ -1,9 +1,9 @@
 """Limit on the connections of the web server, with a time limit for half-open connections.
 
 A connection is closed if it has not sent the complete head of a request within HEAD_S. When the
-maximum number of connections is open, a new connection replaces the oldest connection without a
-request, or else one of the address with the most connections. Repeated messages of the web server
-are logged once per LOG_S.
+maximum number of connections is open, a new connection replaces an old one: the oldest connection
+without a request. If every connection has a request, the oldest connection of the address with the
+most connections is replaced. Repeated messages of the web server are logged once per LOG_S.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ class BoundedProtocol(H11Protocol):
             super().connection_lost(exc)
 
     def _make_place(self) -> bool:
-        """Make room for a new connection of a browser: close a connection without a request, or
-        else a connection of the address that has the most connections. Return False if no
-        connection may be closed.
+        """Make room for a new connection of a browser by closing the oldest connection without a
+        request. If every connection has a request, close the oldest connection of the address that
+        has the most connections. Return False if no connection may be closed.
         """
         others = [one for one in self.connections if isinstance(one, BoundedProtocol)]
         found = [one for one in others if one.is_silent]
