@@ -153,7 +153,9 @@ class ServiceToken(NamedTuple):
     long as the service runs.
 
     Attributes:
-        region: key expression, chunks of 4, 3 and 3 digits or `*`.
+        region: key expression of the region, three chunks separated by slashes. The chunks have 4,
+            3 and 3 quadkey digits (0 to 3). `*` in place of a chunk stands for any digits, for
+            example `1200/320/*`.
         service: name of the service.
         start: identifier that differs for each start of the service.
     """

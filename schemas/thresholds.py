@@ -1,11 +1,12 @@
-"""Numbers that several packages must agree on; each is defined only here.
+"""Numbers that several packages must agree on; each is defined only here. The mark "(contract)"
+means that the number belongs to the definition of messages between vehicles, service and clients.
 
 EXCITED_SHARE       share of the available grip μ that a vehicle must use for its value of μ to
                     count as measured, and not only as a lower bound (contract)
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
-SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka
-                    2012, ch. 1)
-CALLED_SHARE        P(μ < SLIPPERY_MU) above which a road counts as reported slippery
+SLIPPERY_MU         a road is slippery if its μ is below this: packed snow has .2–.35, wet asphalt
+                    .5–.8 (Pacejka 2012, ch. 1)
+CALLED_SHARE        a road is reported as slippery if P(μ < SLIPPERY_MU) is above this
 SURFACES            kinds of road by their range of μ: above the first number, up to the second;
                     intervals are evaluated for each kind separately
 Z_95                95 % quantile of the standard normal distribution: half the width of a 90 %

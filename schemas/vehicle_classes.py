@@ -3,9 +3,11 @@
 The values are typical of production cars with one or two persons. Cornering stiffness is per wheel,
 at static load, relative to the angle of the rim. It includes the compliance of steering and
 suspension bushes, and the effect of roll. Therefore the front axle is softer than the rear axle and
-every car understeers, by 20 to 35 mrad per g. Six measured cars (such as Volvo S90 and VW Golf)
-have 10 to 17 times the load per radian at the front axle, and 15 to 25 times at the rear axle.
-Masses and dimensions follow manufacturers' data sheets of cars of each class.
+every car understeers, by 20 to 35 mrad per g.
+
+Six cars, such as Volvo S90 and VW Golf, were measured. Their cornering stiffness per radian is 10
+to 17 times the wheel load at the front axle, and 15 to 25 times at the rear axle. Masses and
+dimensions follow manufacturers' data sheets of cars of each class.
 """
 
 from __future__ import annotations

@@ -182,13 +182,14 @@ class Reader:
                 self._world.touch(tile, now)
 
     def _sees_services(self) -> bool:
-        """Return True if at least one fleet service is connected, for whatever region. The Zenoh
-        liveliness token of a service shows this.
+        """Return True if at least one fleet service is connected, no matter which region it serves.
+        The Zenoh liveliness token of a service shows this.
 
-        If tokens are hidden, the router is asked. It matches only services that answer for all of a
-        key expression: a service of the whole world by the expression for any tile, a service of a
-        region only by a region that the page knows. Before the page knows any tile, only a reply to
-        a query shows a service.
+        If the access list hides tokens, the page asks the router which queries a service could
+        answer. The router reports only services that can answer all keys of a query. A service of
+        the whole world is found by a query for any tile. A service of some regions is found only by
+        a query for one of its regions, which the page must already know. While the page knows no
+        tile, it queries the whole map instead, and any reply shows a service.
         """
         if self._names["shard"] or self._regions.is_any_answered:
             return True

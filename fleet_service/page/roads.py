@@ -117,11 +117,13 @@ def learned_lines(cell: IntArray, sector: IntArray) -> list[Line]:
 
 
 def _merge_side_by_side(cells: list[tuple[int, int]], heading: int) -> dict[int, list[float]]:
-    """Return the positions of roads across the heading, for each step (number of cells) along it. A
-    step has several positions if several roads are parallel.
+    """Merge cells that lie side by side in one lane. Return a dictionary from the position along
+    the heading to the positions of the lanes across the heading, both counted in cells. Parallel
+    roads have several positions across.
 
-    The error of the satellite receiver spreads one lane over neighbouring cells. Therefore cells of
-    one step that are at most AHEAD apart become one position, their mean.
+    The error of the satellite receiver spreads one lane over neighbouring cells. Therefore cells at
+    the same position along the heading are sorted across. If neighbours in this order are at most
+    AHEAD cells apart, they belong to one lane, whose position is their mean.
     """
     dx, dy = _STEP[heading]
     columns: dict[int, list[int]] = {}

@@ -31,10 +31,17 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
     service returned.
 
     Returns:
-        `length_m`; `share` of the length by basis (measured, bound, borrowed from neighbouring
-        cells, or unknown); `stretches` with from_m, to_m, middle, basis and, where measured, mu,
-        its quantiles, P(slippery), age_s and safe speeds [m/s] by sight distance [m]; `worst`:
-        index of the stretch with the lowest lower bound, or None.
+        a dictionary with four keys.
+        length_m: length of the route.
+        share: share of the length by basis of the value: "measured", "bound" (not measured, only
+            bounds), "borrowed" (estimated from neighbouring cells) or "unknown".
+        stretches: list of dictionaries in driving order. Each has `from_m` and `to_m` (distance
+            from the start), `longitude` and `latitude` of the middle of the stretch, and `basis`.
+            Unless the basis is "unknown", values of the map cell follow, such as `mu_lower`,
+            `mu_upper`, `p_slippery` and `age_s` (time since the last observation). Measured
+            stretches also have `mu`, and `safe_speed` (highest safe speed [m/s] for each sight
+            distance [m]).
+        worst: index of the measured stretch with the lowest `mu_lower`, or None.
 
     Raises:
         InputError: the route is too long or not valid.

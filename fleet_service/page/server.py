@@ -46,9 +46,11 @@ class PageSettings:
     Attributes:
         connection: connection settings for the router.
         host, port: listen address; port 0 selects a free port.
-        names: host names under which a proxy forwards requests; if empty, any name is accepted
-            unless the page listens on loopback.
-        archive: folder of a service's archive, for the past; None without an archive.
+        names: host names under which browsers may request the page, for example the name of a
+            proxy. Loopback names are then accepted too. If empty, a page on the loopback interface
+            accepts only loopback names, and any other page accepts all names.
+        archive: folder of a service's archive, from which the page shows maps of past moments; None
+            without an archive.
         metrics: addresses at which services publish their metrics, for the health view.
         overlay: Parquet file of cell, sector and mu to draw over the map.
         base_map: tiles below the roads; None without a base map.

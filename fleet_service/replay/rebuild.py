@@ -149,6 +149,10 @@ class Since(NamedTuple):
     def near(self) -> Box | None:
         """Return `box` enlarged by 2·MARGIN_DEG on each side [deg]; None if `box` is None. A replay
         must read the files of all zones (map squares of zoom 7) that touch the enlarged box.
+
+        The first margin is that of the selected rows (see `Since`). The second is needed because
+        files are divided by the cell of a row, and rows are selected by position. The two may lie
+        in different zones.
         """
         if self.box is None:
             return None
@@ -178,8 +182,8 @@ Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Return a context that does nothing; a replay uses this function if its caller follows no
-    observations.
+    """Return a context that does nothing. `replay` uses this function as `heard` if its caller
+    needs no access to the observations.
     """
     return nullcontext()
 
@@ -209,11 +213,13 @@ def past_fusion(
     most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:
-    """Return the fusion (beliefs about the friction of the cells) after everything that was
-    received until the time `until` [ns], near a box (west, south, east, north [deg]).
+    """Return the fusion (beliefs about the friction of the cells) at a past moment, near a box
+    (west, south, east, north [deg]). It contains everything that the service had received until the
+    time `until` [ns].
 
-    `listener` is called with the fusion, to follow it. It returns a function that gives the context
-    in which each group of observations is fused.
+    A caller can build other data together with the fusion, for example the public copy of the
+    cells. For this purpose, `listener` is called once, with the new fusion. It returns the function
+    that `replay` uses as `heard`.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -250,18 +256,20 @@ def replay(
     damaged: Damaged = skip_damaged,
     heard: Heard = ignore_observations,
 ) -> Iterator[Updated]:
-    """Replay the archive into `fusion` in order of time. It uses the trust in vehicles that the
-    service recorded when it first processed the rows. Yield once per epoch (minute) of the fusion.
+    """Replay archived observations into `fusion` in order of time. Yield once per epoch (minute) of
+    the fusion. Each row is fused with the trust in its vehicle (vote weight) that the service
+    recorded with the row.
 
     One day is read at a time, a large day in parts, so that memory does not grow with the archive.
 
     Args:
         root: folder of the archive.
-        fusion: a new fusion (beliefs about the friction of all cells), or one that contains
-            everything before `since`.
+        fusion: beliefs about the friction of all cells: empty, or restored from a checkpoint (saved
+            state) that contains all rows before `since.begin`.
         since: selection of the rows to replay.
         damaged: called with each damaged file.
-        heard: function that returns the context in which a group of observations is fused.
+        heard: called with the observations of an epoch; they are fused inside the context that it
+            returns. With this, the caller can update other data together with the fusion.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -321,8 +329,8 @@ def _join_parts(
 def _select_rows(
     o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
 ) -> tuple[Observations, RecordedResult]:
-    """Return those of the archived observations and their recorded results (lateness and vote
-    weight) that `rows` selects.
+    """Return a selection of archived observations (n,) and of their recorded results (lateness and
+    vote weight). `rows` is a mask, an array of indices, or a slice.
     """
     return o.take(rows), RecordedResult(
         before.late[rows], before.late_by[rows], before.weight[rows]
@@ -349,11 +357,11 @@ def _fuse_epochs(
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
     """Yield the rows of the archive files in `listing` in chunks of about CHUNK_ROWS, in order of
-    time. A chunk ends between two epochs (minutes).
+    time. A chunk ends between two epochs (minutes). Vehicles are given as numbers.
 
-    A file is read once. If a day has more than PART_ROWS rows, its files are read once per part of
-    the day. Vehicles are given as numbers. If the number of rows is not limited, a part is read
-    while the previous one is used.
+    A day with more than PART_ROWS rows is processed in parts, and its files are read again for each
+    part. Without the limit `most`, a thread reads the next part while the caller uses the present
+    one. With the limit, parts are read one after the other.
 
     Raises:
         InputError: there are more than `most` rows.
@@ -492,8 +500,9 @@ def _with_numbers(table: pa.Table) -> pa.Table:
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
-    """Return an upper bound of the number of rows that `past_fusion` would read, from file footers
-    alone. Counting stops beyond `most`.
+    """Return an upper bound of the number of rows that `past_fusion` would read, from file sizes
+    and footers alone. If more than `most` rows are found, counting stops: the result is then above
+    `most`, but not an upper bound.
 
     Raises:
         OSError: the archive cannot be read.

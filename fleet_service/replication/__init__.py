@@ -5,26 +5,30 @@ bucket, lets the `replica` synchronise folder and bucket, and writes a `fence` (
 objects) before it serves. `archive/` does not import this package: the segment log (files of new
 rows) calls `BucketReplica.upload_segments` through a callback.
 
-**States of one service.** A turn is one renewal of the lease; a token announces a live service.
-HINT is the share of `lease_s` that suffices if the holder's token is gone.
+**States of one service.** The holder renews its lease several times within `lease_s`, the lease
+time. A token announces a live service. If the holder's token has disappeared, another service may
+take over after a shorter time, HINT · `lease_s`.
 
 | state | event | next state | action |
 |---|---|---|---|
-| waiting | no lease, or released for this service or for any | taking | create the next number |
-| waiting | an earlier start of this folder held the lease | taking | create the next number |
-| waiting | same turn for `lease_s` (HINT of it: token gone) | taking | create the next number |
-| waiting | any other check | waiting | a standby downloads new objects |
-| taking | another service created the number first | waiting | |
-| taking | created, and the former holder's turn has not changed | joining | |
-| taking | created, but the former holder renewed meanwhile | joining | wait for `lease_s` first |
+| waiting | no lease, or released for this service or for any | taking | create the next lease |
+| waiting | the holder is an earlier start of this folder | taking | create the next lease |
+| waiting | no renewal for `lease_s` | taking | create the next lease |
+| waiting | no renewal for HINT · `lease_s`, token is gone | taking | create the next lease |
+| waiting | none of these events | waiting | a standby downloads new objects |
+| taking | another service created the same lease first | waiting | none |
+| taking | lease created, no renewal by the former holder meanwhile | joining | synchronise |
+| taking | lease created, but the former holder renewed meanwhile | joining | first wait `lease_s` |
 | joining | folder and bucket are equal, fence is written | holding | serve and acknowledge |
-| joining | a higher number exists | waiting | |
+| joining | a later lease exists | waiting | none |
 | joining | the bucket does not answer | joining | a standby retries, another service stops |
-| holding | renewed within `lease_s / 2` | holding | |
+| holding | last valid renewal less than `lease_s / 2` ago | holding | serve and acknowledge |
 | holding | no valid renewal for `lease_s / 2` | silent | renew and upload, acknowledge nothing |
-| silent | a renewal is valid again | holding | |
-| holding, silent | a higher number exists, or (silent) a successor's tokens appear | lost | stop |
-| holding, silent | the service stops or hands over | released | write `released`, for any or one |
+| silent | a renewal is valid again | holding | serve and acknowledge |
+| silent | tokens of another service for the same regions appear | lost | stop |
+| holding, silent | a later lease exists | lost | stop |
+| holding, silent | the service stops | released | release the lease for any service |
+| holding, silent | the service hands over | released | release the lease for the named service |
 
 **Invariants.** (1) At most one service may acknowledge, and only in state `holding`. (2) Every
 acknowledged row is in the bucket before the next owner lists it. (3) Objects of a former owner that

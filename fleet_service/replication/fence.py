@@ -2,15 +2,19 @@
 is the time during which one service owns the copy. An epoch is a number in file names; it is larger
 in each later term.
 
-    fence/NUMBER-TURN       in the bucket, {"epoch", "names"}: the highest is valid
-    ARCHIVE/term            the epoch of the service that owns the folder
+    fence/NUMBER-TURN       in the bucket: {"epoch", "names"}, epoch of the term and list of valid
+                            objects. NUMBER is the owner's lease number, TURN the count of fences
+                            that this owner has written. The fence with the highest name is valid.
+    ARCHIVE/term            epoch of the service that owns the folder
 
 An object is valid in three cases: it has the epoch of the current term or a later one, the fence
-lists it, or its name contains no epoch. The owner writes the list when no former owner can
-acknowledge any more, and before it acknowledges anything itself. A former owner that was frozen may
-wake up and upload more objects. They have an older epoch and are not on the list, so all later
-readers of the bucket ignore them. No data are lost: these objects were never acknowledged, so the
-vehicles send their content again.
+lists it, or its name contains no epoch.
+
+The owner writes the fence at the start of its term, after the last time at which a former owner
+may acknowledge data. The owner itself acknowledges nothing before the fence is written. A former
+owner that was frozen may wake up and upload more objects. They have an older epoch and are not in
+the list, so all later readers of the bucket ignore them. No data are lost: these objects were never
+acknowledged, so the vehicles send their content again.
 """
 
 from __future__ import annotations
@@ -54,8 +58,8 @@ class Fence(NamedTuple):
 
 def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> None:
     """Upload the fence (list of valid objects) to the bucket. Its name contains the `number` of the
-    owner's lease and the `turn` (count of renewals), so that a delayed upload never replaces a
-    later fence.
+    owner's lease and `turn`, the count of fences that this owner has written. Therefore a delayed
+    upload never replaces a later fence.
 
     Raises:
         CopyError: it is unknown whether the upload succeeded.

@@ -32,9 +32,14 @@ class FencedBucket:
         self._turn = 0
 
     def attach_lease(self, may_write: Callable[[], bool], assert_alone: Callable[[], None]) -> None:
-        """Allow writes to the bucket from now on only while this service has the lease (ownership
-        of the archive). The attributes `may_write` and `assert_alone` are the functions that check
-        this.
+        """From now on, check the lease (ownership of the archive) before files in the bucket are
+        changed or deleted.
+
+        Args:
+            may_write: returns True while this service certainly has the lease; makes no request to
+                the bucket.
+            assert_alone: checks in the bucket that no later lease exists, and raises CopyError if
+                one exists or the check fails.
         """
         self.may_write = may_write
         self.assert_alone = assert_alone
@@ -60,10 +65,14 @@ class FencedBucket:
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def raise_fence(self, term: Term, names: Iterable[str]) -> None:
-        """Write the fence (list of valid objects) of this `term` of ownership, and delete all
-        invalid objects. The list contains those of the archive's files `names` whose epoch (number
-        in the file name) is older than that of the term. Objects that appear later are valid only
-        if their epoch is that of the term or a later one.
+        """Write the fence (list of valid objects) of a new owner, and delete all objects that are
+        not valid.
+
+        Args:
+            term: lease number and epoch (number in file names) of the new owner.
+            names: names of all files of the archive. Files of former owners have an older epoch, so
+                the fence lists them. All other files are valid without the list: they have the
+                epoch of the new owner or a later one, or none.
         """
         older = [name for name in names if (layout.term_of(name) or term.epoch) < term.epoch]
         fence = Fence(term.epoch, frozenset(older))
@@ -74,9 +83,9 @@ class FencedBucket:
                 self.objects.delete(name)
 
     def admit_objects(self, names: Iterable[str]) -> None:
-        """Add uploaded objects to the fence (list of valid objects) if they are not valid yet. Such
-        a file was compacted (merged from others) by a service that started earlier, so its name has
-        an older epoch (number of the owner's term).
+        """Add to the fence (list of valid objects) those of the owner's uploaded objects that are
+        not valid yet. Such an object was written by a compaction (merge of files) that started
+        before the owner's term. Its name therefore has an older epoch (number of a term).
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))

@@ -1,26 +1,38 @@
 """Lease of an archive's bucket copy: at most one service owns the copy. The bucket needs only one
 special operation, conditional create (an object is written only if its name is new).
 
-    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to",
-                            "lease_s"}: the highest number is the current holder
+    lease/NUMBER.json       lease object; the object with the highest number states the holder
     ARCHIVE/holder.json     identity of this folder, kept over restarts
 
-A service takes over by creating the next number; the bucket lets only one service do so. The holder
-renews by writing its own object again with the next turn (count of renewals), and then checking
-that no higher number exists. A token (Zenoh liveliness token) shows that a service is alive. The
-epoch is a number in the names of all files that a holder writes. The clocks of different machines
-are never compared.
+Fields of a lease object:
+
+    holder, service     identity of the holder's folder, and name of the service that runs on it
+    epoch               number in the names of all files that the holder writes
+    turn                count of renewals of this lease
+    released, to        true after a release, and the service that may take over then ("" for any)
+    before              names of the earlier holders
+    lease_s             lease time [s]
+
+A service takes over by creating the object with the next number; the bucket lets only one service
+do so. The holder renews its lease in two steps. It writes its own object again with the next turn,
+and then checks that no higher number exists. A token (Zenoh liveliness token) shows that a service
+is alive. The clocks of different machines are never compared.
+
+A service may take over at once if the lease was released, and otherwise when it has seen the same
+turn for `lease_s`. If the holder had a token and the token has disappeared, HINT · `lease_s`
+suffices. HINT is a constant between 0.5 and 1.
 
 **No acknowledged data are lost.** Let A be the holder, and let B create the next number at time T.
 
 - A acknowledges only data that are already in the bucket, and only within `lease_s / 2` after it
-  *began* a valid renewal. A valid renewal found no higher number, so it began before T.
-- B takes over when it has seen the same turn for `lease_s` (or for HINT of it, if A's token is
-  gone). Then A's last renewal began before B saw this turn first, and A's right to acknowledge
-  ended before T.
-- If the turn has changed after T, a renewal succeeded in between. B then waits for another
-  `lease_s`, which is twice the time in which A may acknowledge, so A's clock may be slower than
-  B's.
+  *began* a valid renewal. A renewal is valid if A found no higher number at its end. Every valid
+  renewal therefore began before T.
+- Assume first that A did not renew after B saw A's turn for the first time. A's last renewal then
+  began before that moment. B waited for more than `lease_s / 2` from that moment until T, so A's
+  right to acknowledge ended before T.
+- Assume now that A renewed after B's last look before T. B reads A's object again after T and
+  finds that the turn has changed. B then waits for another `lease_s`, which is twice the time in
+  which A may acknowledge. This suffices even if A's clock is slower than B's.
 - A turn is written at most once, even if the write failed. A failed write may take effect late, and
   a later renewal with the same content could not be distinguished from it. Therefore the bucket
   client must not repeat requests (`retries=0`).
@@ -32,10 +44,11 @@ are never compared.
 - A deletes a file only after it has uploaded the replacement and found no higher number, so B finds
   the replacement.
 
-**No data count twice.** The valid files are one set, and B reads it completely before it accepts
-new data. B therefore knows a batch that A archived without acknowledging, and acknowledges it
-again. Rows of A outside this set are sent again and accepted once. A's folder is synchronised with
-the bucket before A serves again.
+**No data count twice.** The valid files are one set, and B reads this set completely before it
+accepts new data. If A archived a batch without acknowledging it, B therefore knows the batch when
+the vehicle sends it again, and only acknowledges it. Files of A outside the set are ignored, so
+their rows are sent again and accepted once. A's folder is synchronised with the bucket before A
+serves again.
 
 The proof requires the same `lease_s` on all machines, so the value is stored in the object. A
 service with another value does not start while a holder is alive. Unknown fields are ignored; the
@@ -211,8 +224,8 @@ class Lease:
         return self.left_s > 0.0
 
     def assert_not_superseded(self) -> None:
-        """Check that no other service has taken over. If the check passes, every later holder will
-        find all data that were uploaded before it.
+        """Check in the bucket that no other service has taken over. If the check passes, every
+        later holder of the lease will find all data that this service uploaded before the check.
 
         Raises:
             CopyError: another service has taken over, or the bucket does not answer.

@@ -129,17 +129,18 @@ def acquire_archive(
     say: Callable[[str], None],
     signs: Signs | None = None,
 ) -> Ownership | None:
-    """Lock an archive and wait for the lease (ownership) of its copy, if it has a copy. Return None
-    if `stop` is set.
+    """Lock an archive and, if it has a copy, wait for the lease (ownership) of the copy. Return the
+    ownership of both, or None if `stop` is set first.
 
     Args:
         config: settings.
         root: folder of the archive.
         stop: event that ends the wait.
         say: called with a line of text whenever the reason for waiting changes.
-        signs: three functions of a standby service; None if this service is no standby. The first
-            returns True if a router is reachable, the second if the service of a name is alive. The
-            third is called at each check of the lease.
+        signs: three functions of a standby (waiting) service, from `serving.standby_signs`; None if
+            this service is no standby. The first returns True if a router is reachable. The second
+            returns True if the service with the given name is alive. The third is called at each
+            check of the lease, so that a watchdog can detect a standby that hangs.
 
     Raises:
         InputError: another service has the folder or the copy, or the copy cannot be used with

@@ -99,8 +99,9 @@ class BucketReplica:
         (ownership): files that a former holder of the lease uploads later are ignored.
 
         Args:
-            service: name of the service; None for a standby (waiting service), which follows the
-                owner of the bucket.
+            service: name of the service. The bucket must belong to this name, or to no service yet.
+                None skips this check, because a standby (waiting service) takes over the bucket of
+                a service with another name.
             term: lease number and epoch (number in file names); None without a lease.
             succeeds: True if another machine had the lease before. Data that only this folder has
                 were then never acknowledged and are removed.
@@ -141,9 +142,9 @@ class BucketReplica:
         self._transfer.download_missing(self.bucket.list_valid())
 
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
-        """Remove the archive's files that are not among the valid objects `there` (names and sizes)
-        or differ in size. Also remove the entries in the journal (list of uploaded files) of files
-        that do not exist.
+        """Remove files of the archive's folder that the bucket does not contain with the same size.
+        `there` has names and sizes of the bucket's valid objects. Then remove the journal entries
+        (list of uploaded files) of all files that the folder does not contain.
         """
         for name, stamp in self._files.list_files().items():
             if there.get(name) != stamp.size:
@@ -153,8 +154,9 @@ class BucketReplica:
                 self._journal.remove(name)
 
     def upload_segments(self, segments: Iterable[Path]) -> None:
-        """Upload written segments (files of new rows) and the keys; all of them are in the bucket
-        when this returns.
+        """Upload written segments (files of new rows), and the files of the folder `keys` that are
+        new or have changed. These contain the secret keys for pseudonyms, and vehicle identities.
+        All of them are in the bucket when this returns.
 
         Raises:
             CopyError: some files are not in the bucket; the next call continues and uploads no file

@@ -53,7 +53,10 @@ class ReplicaFiles:
 
     def list_files(self, folders: Iterable[str] = FOLDERS) -> dict[str, Stamp]:
         """Return name and stamp (size and time of the last write) of each file that is copied to
-        the bucket, in the order of the folders.
+        the bucket.
+
+        The folders are listed in the given order. In the order of FOLDERS, a row that compaction
+        moves to another folder during the listing is always found.
         """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self.root / one).rglob("*")))

@@ -122,9 +122,12 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
     def _is_admitted(self, slot: int, time: int) -> bool:
-        """Return True if the limit for idle roads (roads that no third vehicle has reported)
-        permits an alert. On other roads there is no limit. On an idle road, enough vehicles must
-        report the ice that have not recently supported alerts in too many other places.
+        """Return True if the limit for idle roads permits an alert. A road is idle if fewer than
+        OTHERS_NEEDED vehicles have ever reported it. On other roads there is no limit.
+
+        On an idle road, at least LEAST_SOURCES vehicles must have reported the ice that have not
+        reached their own limit. A vehicle has reached its limit if its reports have recently led to
+        alerts on idle roads in several other areas (see `IdleRoads`).
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -136,12 +139,17 @@ class Alerts:
 
     def _suspects(self, slots: IntArray) -> IntArray:
         """Return the slots (one per cell and heading sector) that are candidates for a new alert. A
-        "source" is a vehicle whose report supports the alert. The updated `slots` (k,) that have a
-        source are checked, and all slots on the same stretches of slippery road.
+        "source" of a slot is a vehicle that reported ice there within the hour before the slot's
+        last report.
 
-        Two conditions must hold. First, enough vehicles are sources, in the slot itself or on the
-        stretch. Second, the slot has a source of its own and is probably slippery by its own
-        reports, or it lies between two slots with sources.
+        Among the updated `slots` (k,), those with a source are checked. The other slots on the same
+        slippery stretches of road are checked too. Slots with an active alert are left out. A slot
+        becomes a candidate if both conditions hold:
+
+        - Enough vehicles are sources, of the slot itself or of the stretch. More are needed in a
+          slot where vehicles also reported grip.
+        - The slot has a source of its own, and its own reports make slippery road probable. Or the
+          stretch has sources both before and behind the slot.
         """
         fusion = self._fusion
         slots = slots[self._own_sources(slots, Side.ICE)[:, 0] > 0]
@@ -169,8 +177,11 @@ class Alerts:
     def _can_clear(self, slots: IntArray) -> BoolArray:
         """Return a mask of slots (one per cell and heading sector), (k,): True if the alert may be
         cleared. Within the hour before the last report, at least two more vehicles must have
-        reported grip than ice. The map remembers at most SOURCES vehicles per cell and side, so
-        SOURCES reports of grip are always enough.
+        reported grip than ice.
+
+        The map remembers at most SOURCES vehicles per slot that reported grip, and at most SOURCES
+        that reported ice. Therefore SOURCES vehicles that reported grip always suffice, because a
+        larger number cannot be recorded.
         """
         grip = (self._own_sources(slots, Side.GRIP) > 0).sum(axis=1)
         ice = (self._own_sources(slots, Side.ICE) > 0).sum(axis=1)

@@ -1,10 +1,13 @@
 """Limit on alerts that two vehicles raise alone, on roads without other vehicles. Pure (no I/O).
 
 Two enrolled vehicles that collude could report ice anywhere along plausible paths. On a road with
-other traffic, other vehicles contradict them; on an idle road, which no third vehicle has reported,
-nobody does. Therefore each vehicle may support such alerts in at most MOST_AREAS areas of AREA_M
-within AREA_NS. Beyond this limit a third vehicle is needed; until then the map shows the ice, but
-no alert is raised.
+other traffic, other vehicles contradict them. A road is idle if fewer than OTHERS_NEEDED (three)
+vehicles have ever reported it; there, nobody contradicts them.
+
+A vehicle supports an alert if it has reported the ice. On idle roads, the support of a vehicle
+counts in at most MOST_AREAS areas of radius AREA_M within AREA_NS. A vehicle that has reached this
+limit supports no alert in a further area. Then the map shows the ice, but an alert needs other
+vehicles.
 """
 
 from __future__ import annotations
@@ -28,20 +31,23 @@ VEHICLES: Final = 100_000  # largest number of vehicles that are remembered
 
 
 class IdleRoads:
-    """Record of the areas in which each vehicle has recently supported alerts on idle roads (roads
-    that no third vehicle has reported).
+    """Record of the areas in which each vehicle has recently supported alerts on idle roads. A
+    vehicle supports an alert by reporting the ice. A road is idle if fewer than OTHERS_NEEDED
+    vehicles have ever reported it.
     """
 
     def __init__(self) -> None:
         self._areas: dict[int, list[tuple[int, FloatArray]]] = {}
 
     def admit(self, cell: int, witnesses: Sequence[int], time: int, needed: int) -> bool:
-        """Return True if an alert on an idle road may be raised; in this case, record the area for
-        its supporting vehicles.
+        """Return True if an alert on an idle road (a road that fewer than OTHERS_NEEDED vehicles
+        have ever reported) may be raised. In this case, record the area for the vehicles that
+        support the alert.
 
         Args:
             cell: cell of the alert.
-            witnesses: numbers of the vehicles that support the alert.
+            witnesses: numbers of the vehicles that support the alert, that is, have reported the
+                ice.
             time: time of the alert [ns].
             needed: minimum number of supporting vehicles that have not reached their limit.
         """

@@ -1,12 +1,14 @@
 """Estimates for unvisited cells from visited neighbours ("borrowed" values): they have wider
 intervals and are marked as estimated. Pure (no I/O).
 
-A neighbour may be another kind of road (a bridge, the other side of a shadow), so half of the
-estimated belief is the prior (belief before any measurement). Along a route the order of cells is
-known. There a cell borrows from the nearest visited cells before and behind it, up to REACH cells
-away, and the share of the prior grows with the distance. If both sides are visited, each side has
-its share. Two different surfaces therefore give a wide belief, and not a belief about a surface in
-the middle.
+A neighbour may be another kind of road (a bridge, the other side of a shadow). Therefore an
+estimate is a weighted mean of the neighbours' beliefs and the prior (belief before any
+measurement). The prior has at least half the weight.
+
+Along a route the order of cells is known. There a cell borrows from the nearest visited cells
+before and behind it, up to REACH cells away, and the prior's weight grows with the distance. If
+there is a visited cell on both sides, the result contains the beliefs of both. Two different
+surfaces therefore give a wide belief, and not a belief about a surface in the middle.
 """
 
 from __future__ import annotations
@@ -34,10 +36,13 @@ def impute_cells(
     (one per cell and heading sector), in the same sector. With a `route`, only cells along it are
     returned.
 
-    A belief is half the prior (belief before any measurement) and half the mean of the visited
-    neighbours; the farther the neighbours along a route, the larger the share of the prior.
-    `vehicles` is the minimum over these neighbours, so that an estimated value is never more public
-    than its sources. `first` and `last` are the oldest and the newest time of the neighbours.
+    Each estimated belief is a weighted mean of the prior (belief before any measurement) and the
+    neighbours' beliefs. The prior has the weight PRIOR_SHARE if a neighbour is adjacent. If the
+    nearest neighbour along a route is farther away, the prior has more weight.
+
+    The result counts as many `vehicles` as the neighbour with the fewest, so that readers never see
+    an estimate whose source is hidden from them. `first` and `last` are the oldest and the newest
+    time of an observation of the neighbours [ns].
     """
     live = source.live
     slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
@@ -88,12 +93,15 @@ def impute_cells(
 def _route_gaps(
     source: Readable, route: IntArray, tile: int, known: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return three arrays (k,) about the unvisited cells of a route in a tile: the key of the cell
-    (cell and heading sector), the slot of the nearest visited cell before or behind it, and the
-    share of this visited cell in the estimate, [0, 1].
+    """Return the visited cells from which the unvisited cells of a route in a tile are estimated.
 
-    A key appears once for each side with a visited cell at most REACH cells away. A visited cell
-    directly next to it is excluded, because `impute_cells` handles it as a neighbour.
+    The result consists of three arrays (k,). The first contains keys of unvisited cells (cell and
+    heading sector). The second contains the slot of the nearest visited cell before or behind this
+    cell on the route. The third contains the weight of this visited cell in the estimate, [0, 1].
+
+    A key appears once per side (before, behind) that has a visited cell at most REACH positions
+    away. A visited cell at the next position of the route is left out, because `impute_cells`
+    already handles it as an adjacent cell.
     """
     slots = source.slots_of(route // grid.SECTORS, route % grid.SECTORS)
     slots = np.where(np.isin(slots, known), slots, -1)

@@ -1,17 +1,18 @@
-"""Cells that readers may see if persons are kept private: the passage of a single vehicle changes
-nothing that is visible. Pure (no I/O).
+"""Cells that readers may see in a service that protects the privacy of persons: the passage of a
+single vehicle changes nothing that is visible. Pure (no I/O).
 
-Readers see a copy of the map. Copies are made only at fixed times (every PERIOD_NS). A cell is
-copied if at least LEAST vehicles have visited it since its last copy, and as many have been in its
-tile within the current hour. So neither the cell nor the time of the copy points to one vehicle.
-Between copies, readers see the cell without the newer visits, with its belief predicted to the time
-of reading. There is one exception for safety: a cell that has become more slippery than shown is
-copied at once.
+Readers see a copy of the map. Cells are copied only at fixed times (every PERIOD_NS). A cell is
+copied on two conditions. At least LEAST vehicles have visited the cell since its last copy, and at
+least LEAST vehicles have been in its tile within the current hour. So neither the cell nor the time
+of the copy points to one vehicle. Between copies, readers see the cell without the newer visits,
+with its belief predicted to the time of reading. There is one exception for safety: a cell that has
+become more slippery than shown is copied at once.
 
 Legend
-    k        LEAST, `public_vehicles` of the settings
+    LEAST    minimum number of vehicles: `public_vehicles` in the settings
     shown    True if a cell is public
-    pending  vehicles that visited a cell since it was copied, as bits
+    pending  set of the vehicles that visited a cell since its last copy, one bit per vehicle; a few
+             vehicles may have the same bit
 """
 
 from __future__ import annotations
@@ -153,8 +154,9 @@ class PublicCells:
         self._size = len(stay)
 
     def publish(self, now: int) -> None:
-        """Copy the cells that enough vehicles have visited, if a copy time has passed by `now`
-        [ns].
+        """Copy the cells that enough vehicles have visited to the public copy, which readers see.
+        Do this once in each period of PERIOD_NS: if no period has ended since the last call, change
+        nothing. `now` is the present time [ns].
         """
         self._add_slots()
         if now // PERIOD_NS <= self._period:

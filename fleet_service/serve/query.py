@@ -34,7 +34,7 @@ def answer_query(
         query: parameters of the query.
         wanted: function that returns True if a tile's key matches the query's key.
         now: time [ns] for which beliefs (probability of each friction value) and ages are computed.
-        only: the only matching tile, if the query's key names it.
+        only: the only matching tile, if the query's key names a single tile.
 
     Raises:
         InputError: the route is too long.
@@ -61,9 +61,14 @@ class AnswerSize(NamedTuple):
 def size_asked(
     cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
-    """Return an upper bound of the size of a query's answer: that of all tiles that must be read.
-    `cache` contains the tiles, `wanted` returns True for tiles that match the query's key, and
-    `only` is that tile if the key names exactly one.
+    """Return an upper bound of the size of the answer to a query: the number of the tiles that must
+    be read, and the number of all their cells.
+
+    Args:
+        cache: the tiles of the map.
+        query: parameters of the query.
+        wanted: function that returns True if a tile's key matches the query's key.
+        only: the only matching tile, if the query's key names a single tile.
     """
     route = keys_along(query.route) if query.route else None
     tiles = [
@@ -118,12 +123,13 @@ def _view_tile(
 
 
 def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
-    """Return the rows of the tile's cells, as a slice or a mask, that enough vehicles have visited
-    and that touch the query's box.
+    """Return the rows of those cells of the tile that touch the query's box and that enough
+    vehicles have visited. The result is a slice if all rows between two positions are selected,
+    else a mask.
 
-    Usually this is a complete tile, or a contiguous part of it. Cells are compared one by one only
-    if necessary, because each such step releases the interpreter lock, and may wait for it ten
-    times as long as the step takes.
+    A slice is found with a few comparisons. The mask needs comparisons of whole arrays, each of
+    which releases the interpreter lock. Waiting until the lock is free again may take ten times as
+    long as the comparison.
     """
     columns = shown.columns
     run = slice(0, len(shown.cells))

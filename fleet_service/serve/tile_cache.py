@@ -39,12 +39,14 @@ class ShownTile(NamedTuple):
     Attributes:
         cells: cells in the schema of the map.
         columns: the columns by which a query selects cells (SELECTED_BY), as arrays (k,).
-        payload: all cells as an Arrow stream, from south to north, which shares memory with
-            `cells`; empty if the cells have another order and are used for one query only.
-        least: number of vehicles of the cell that the fewest vehicles visited.
-        common: test in the form of a box (west, south, east, north) [deg]: a query's box that
-            touches it overlaps all cells in longitude. If the cells are not ordered from south to
-            north, no box touches it.
+        payload: all cells as an Arrow stream, ordered from south to north. It shares memory with
+            `cells`. It is empty if the cells have another order and are used for one query only.
+        least: smallest number of vehicles of any cell. If a query requires no more vehicles, it
+            selects every cell.
+        common: box (west, south, east, north) [deg] for a quick test. A query's box that touches
+            `common` overlaps every cell in longitude, so cells must be selected only by latitude.
+            If the cells are not ordered from south to north, `common` is NOTHING, which no box
+            touches.
         made: time at which this tile was made [ns].
         change: number of the newest change of the map that this tile includes.
     """
@@ -65,7 +67,8 @@ class TileCache:
         state: the map.
         guard: lock that is held while the map is read, but not while Arrow data are written.
         least: minimum number of vehicles that have ever visited a public cell.
-        public: public copy of the cells if persons are kept private; None to show everything.
+        public: public copy of the cells, in which no single vehicle's passage is visible; None to
+            show everything.
     """
 
     def __init__(
@@ -119,14 +122,15 @@ class TileCache:
 
     @property
     def source(self) -> Readable:
-        """Return the object from which readers' cells are read: the public copy if persons are kept
-        private, otherwise the fusion (the true beliefs about friction) itself.
+        """Return the object from which readers' cells are read. This is the public copy of the
+        cells if the cache has one (for privacy), else the fusion (the true beliefs about friction).
         """
         return self.state.fusion if self._public is None else self._public
 
     def coarse(self, cells: CellView) -> CellView:
-        """Return the cells with times and counts rounded for privacy, if persons are kept
-        private.
+        """Return the cells as readers may see them. If the cache has a public copy of the cells
+        (for privacy), counts of vehicles and observations and their times are rounded down. Without
+        a public copy, the cells are returned unchanged.
         """
         return cells if self._public is None else coarsen_cells(cells)
 
@@ -173,7 +177,8 @@ def _common_bounds(
 
 
 def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """Return the columns that decide if a cell of a tile belongs to the answer to a query (its box
-    and its number of vehicles, see SELECTED_BY), as arrays (k,) by name.
+    """Return the columns by which a query selects cells, as arrays (k,) by name: `vehicles` (number
+    of vehicles that visited the cell), and `west`, `south`, `east`, `north` (edges of the cell
+    [deg]).
     """
     return {name: cells[name].to_numpy() for name in SELECTED_BY}

@@ -70,8 +70,9 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
 def hand_over(
     session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
 ) -> HandoverResult | None:
-    """Ask the service of a region to hand over to a standby (a waiting service), and wait. Return
-    the result, or None if the standby already serves the region.
+    """Ask the service of a region to hand over to a standby (a waiting service), and wait until the
+    standby serves the region. Return the name of the former service and the duration of the
+    interruption, or None if the standby already serves the region.
 
     Args:
         session: Zenoh session of a client with a service certificate.

@@ -178,8 +178,9 @@ def list_processor_lines() -> list[str]:
 
 
 def kernel_cache(package: str) -> str:
-    """Return the folder in the user's cache for a package's compiled functions. Folders of older
-    sources may be deleted at any time.
+    """Return the folder in the user's cache for a package's compiled functions. The folder's name
+    contains a digest of the source files, so that each version of the sources has a folder of its
+    own. Folders of older versions may be deleted at any time.
     """
     return str((cache_root() or Path()) / describe_sources(package))
 

@@ -143,9 +143,17 @@ def _is_truth(kind: Any) -> bool:
 
 
 def _register(function: Any, arguments: int, given: Any, result: Any, lower: Any) -> None:
-    """Register a code generator with Numba: `lower` then generates the code of `function` (for
-    example of an operator) for calls in which at least one argument has the type `given` (vector or
-    mask). The other arguments may be single numbers or truth values.
+    """Register a code generator with Numba.
+
+    Args:
+        function: function or operator for whose calls code is generated, for example
+            `operator.add`.
+        arguments: number of its arguments.
+        given: vector or mask type. The registration applies to calls in which at least one argument
+            has this type; the others may be single numbers or truth values.
+        result: type of the result.
+        lower: code generator, called with the LLVM builder and the LLVM values of the arguments.
+            All arguments have been converted to the type `given`.
     """
     fits: Callable[[Any], bool] = _is_number if given is LANES_TYPE else _is_truth
 

@@ -27,8 +27,15 @@ READ_S: Final = 5.0  # longest time for receiving a request; then the connection
 
 
 class Metric(NamedTuple):
-    """Metric with one or several values. The keys of `values` are values of the OpenMetrics label
-    named `label`. For a metric with a single value, `label` is "".
+    """Metric in OpenMetrics format, with one or several values.
+
+    Attributes:
+        name: name without the prefix of this program.
+        kind: "counter" (never falls) or "gauge" (rises and falls).
+        help: one line of explanation.
+        values: number by value of the label. A metric with the label `outcome`, for example, has
+            one number per outcome. The only key of a metric without label is "".
+        label: name of the OpenMetrics label; "" for a metric without label.
     """
 
     name: str

@@ -98,12 +98,13 @@ def _compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 def _stop_before_machine_code() -> None:
-    """Make Numba, for the rest of this process, stop each compilation after its LLVM code. Numba
-    then does not link or optimise this code and makes no machine code.
+    """Make Numba, for the rest of this process, stop each compilation after it has generated the
+    LLVM code. Numba then neither optimises nor links this code, and makes no machine code.
 
-    The kernel itself has been compiled before this call. Its code must not be optimised a second
-    time: the optimiser may fuse other multiplications and additions, which changes the last bit of
-    results.
+    The kernels are compiled completely before this call. Their adapters (functions that call the
+    kernels, see `_Adapter`) are compiled afterwards. Otherwise Numba would optimise a kernel's code
+    again as part of its adapter. A second optimisation may choose other pairs of multiplication and
+    addition to fuse, which changes the last bit of results.
     """
     library: Any = codegen.JITCodeLibrary
     library.finalize = _mark_finalized
@@ -134,8 +135,9 @@ def _float_of(context: Any, word: Any) -> Any:  # noqa: ARG001
 
 
 class _Adapter:
-    """Source text of a function ("adapter") that builds a kernel's arguments from a row of 64-bit
-    words (see `native_kernels`) and calls the kernel.
+    """Source text of a function ("adapter") that calls a kernel (compiled numerical function). The
+    adapter's only argument is an array of 64-bit words (see `native_kernels`), from which it builds
+    the kernel's arguments.
     """
 
     def __init__(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
@@ -149,8 +151,9 @@ class _Adapter:
         self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
 
     def make_function(self, *, returns: bool) -> Callable[..., Any]:
-        """Return the adapter as a Python function of the row of words. It calls the kernel, stores
-        the kernel's result (if any) in word 1, and sets word 0 to 1 as mark of completion.
+        """Return the adapter as a Python function with one argument, the array of 64-bit words. The
+        function calls the kernel, stores the kernel's result (if any) in word 1, and sets word 0 to
+        1 to mark completion.
         """
         result = "words[1] = " if returns else ""
         text = f"def {ADAPTER}(words):\n    {result}{self._call}\n    words[0] = 1\n"
@@ -167,9 +170,9 @@ class _Adapter:
         return name
 
     def _expression(self, value: Any) -> str:
-        """Return the source text of an expression that builds one argument of the kernel from the
-        next unused words of the row. The argument has the type of `value`. `describe_type`
-        determines the order of the words.
+        """Return the source text of an expression that builds one argument of the kernel, of the
+        type of `value`. The expression reads the argument from the next words of the adapter's
+        array that no earlier argument uses. `describe_type` determines the order of the words.
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))

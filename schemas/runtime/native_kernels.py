@@ -3,9 +3,9 @@ before the program was started. They run without Numba and LLVM, whose import ta
 second.
 
 Each function of the library is one kernel for fixed types of arguments; the types are part of the
-function's name. Its only argument is the address of a row of 64-bit words: a mark that the kernel
-has completed, its result, and then the parts of its arguments. For a call with other types, Numba
-compiles the kernel.
+function's name. Its only argument is the address of an array of 64-bit words. These are a mark that
+the kernel has completed, its result, and then the parts of its arguments. For a call with other
+types, Numba compiles the kernel.
 """
 
 from __future__ import annotations

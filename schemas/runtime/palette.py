@@ -1,14 +1,18 @@
 """Colours of all plots and pages, distinguishable with three kinds of colour blindness and in
-greyscale.
+greyscale. The live page, HTML reports, images and QGIS use them.
 
-The live page, HTML reports, images and QGIS use them. `FOUR` are the colours of four classes where
-the friction is precisely known, and `TWO` those of two classes where it is roughly known. `LITTLE`
-is the colour where too little is known for a class.
+The class of a place depends on how precisely its friction is known:
 
-The classes have an order: ice, snow, rather slippery, wet, rather not slippery, good grip. From ice
-to good grip, lightness rises on a light background and falls on a dark one. Therefore ice, the most
-dangerous class, stands out most. `GRIP` is a colour scale through `FOUR` at the values of
-`SURFACES`, in steps of equal lightness. No colour is green, because green would promise safety.
+- Precisely known: ice, snow, wet or good grip, with the four colours `FOUR`.
+- Roughly known: rather slippery or rather not slippery, with the two colours `TWO`.
+- Less known: no class, with the colour `LITTLE`.
+
+From most to least dangerous, the order is ice, snow, rather slippery, wet, rather not slippery,
+good grip. In this order, lightness rises on a light background and falls on a dark one. Therefore
+ice, the most dangerous class, stands out most.
+
+`GRIP` is a colour scale through `FOUR` at the values of `SURFACES`, in steps of equal lightness. No
+colour is green, because green would promise safety.
 """
 
 from __future__ import annotations

@@ -5,12 +5,14 @@ replaces a built-in name.
     mine = "my_package.estimators:bank"
 
 group                   object that the entry point must load
-gripmap.estimators      bank(vehicles) with `advance` as in EstimatorBank
-gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array;
-                        `--estimator aco-fckf@name`
-gripmap.sources         blocks(address), an iterator of edge_agent.Block; used by `--source
-                        name:address`
-gripmap.questions       a fleet_service.analytics.questions.Question
+gripmap.estimators      function bank(vehicles) that returns an object with the method `advance` of
+                        EstimatorBank; selected by `--estimator NAME`
+gripmap.tyre_curves     function curve(theta) that returns tyre force / largest tyre force, for an
+                        array `theta` of slips normalised as in `edge_agent.dynamics.tyres`;
+                        selected with an estimator, for example by `--estimator aco-fckf@NAME`
+gripmap.sources         function blocks(address) that returns an iterator of edge_agent.Block;
+                        selected by `--source NAME:ADDRESS`
+gripmap.questions       object of the class fleet_service.analytics.questions.Question
 """
 
 from __future__ import annotations

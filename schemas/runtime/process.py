@@ -122,8 +122,9 @@ def print_line(line: str, stream: TextIO) -> None:
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
     """Return a function that prints log lines on `stream`, as text or as JSON depending on `form`.
-    A JSON line contains the time, the process id, the values `who` (which identify the process),
-    and the first word of the text as name of the event.
+    A JSON line contains the time, the process id, and the values `who`, which identify the process.
+    Its field `event` has the text before the first colon, or the first word of a text without
+    colon.
     """
 
     def text(line: str) -> None:
@@ -140,8 +141,9 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
 
 def log_as(form: Form, stream: TextIO, **who: object) -> None:
-    """Write warnings that the program and its libraries log to `stream`, as text or as JSON
-    depending on `form`. JSON lines contain the values `who`, which identify the process.
+    """Set up logging: write the warnings and errors of the program and its libraries to `stream`,
+    as text or as JSON depending on `form`. JSON lines contain the values `who`, which identify the
+    process.
     """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(

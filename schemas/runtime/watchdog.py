@@ -27,12 +27,14 @@ def notify_alive() -> None:
 
 def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
     """Start a thread that repeatedly notifies systemd that the process works. Use it while the
-    process (a standby service, for example) waits and cannot call `notify_alive` regularly. The
-    thread ends at the process's next call of `notify_alive`.
+    process (a standby service, for example) waits and cannot call `notify_alive` regularly.
 
     Returns:
-        a function that the waiting code must call repeatedly. The thread stops `most_s` seconds
-        after its last call; systemd then restarts the process, because the waiting code hangs.
+        a function "beat" that the waiting code must call repeatedly.
+
+    The thread ends in two cases. First, the process calls `notify_alive`, because the wait is over.
+    Second, "beat" has not been called for `most_s` seconds, because the waiting code hangs; systemd
+    then restarts the process.
     """
     last = time.monotonic()
     every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4

@@ -234,9 +234,16 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
 
 
 def complete(found: Decoded, sent: PresentColumns) -> Decoded:
-    """Fill the columns of decoded batches that follow from the pose (position and yaw), and return
-    the batches. `sent` states which columns were sent. Move two kinds of batches to the errors:
-    those that need a position but have none, and those with a number that does not fit its column.
+    """Fill missing columns of decoded batches: leaving time, cell and heading sector, and the
+    region in the head of a batch. Return the batches.
+
+    Some batches are refused: they are removed from the result, and an error is added to its
+    `errors`. A batch is refused if it needs a position but has none, or if a number does not fit
+    its column.
+
+    Args:
+        found: decoded batches; columns that were not sent contain default values.
+        sent: table that states which columns each batch contained when it was received.
     """
     kind = sent.kind
     columns = found.columns
