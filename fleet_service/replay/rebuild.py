@@ -150,9 +150,8 @@ class Since(NamedTuple):
         """Return `box` enlarged by 2·MARGIN_DEG on each side [deg]; None if `box` is None. A replay
         must read the files of all zones (map squares of zoom 7) that touch the enlarged box.
 
-        The first margin is that of the selected rows (see `Since`). The second is needed because
-        files are divided by the cell of a row, and rows are selected by position. The two may lie
-        in different zones.
+        The first margin is that of the selected rows (see `Since`). The second is needed because a
+        row is selected by its position but stored by its cell, which may lie in another zone.
         """
         if self.box is None:
             return None
@@ -182,9 +181,7 @@ Heard = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Return a context that does nothing. `replay` uses this function as `heard` if its caller
-    needs no access to the observations.
-    """
+    """Return a context that does nothing: the default for the argument `heard` of `replay`."""
     return nullcontext()
 
 
@@ -194,8 +191,8 @@ def too_much() -> InputError:
 
 
 def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
-    """Return a fusion (beliefs about the friction of all cells) with the weather received until the
-    time `until` [ns], and without observations.
+    """Return a fusion (beliefs about the friction of all cells) that contains the weather received
+    until the time `until` [ns], and no observations.
 
     Raises:
         OSError: the archive cannot be read.
@@ -217,9 +214,8 @@ def past_fusion(
     (west, south, east, north [deg]). It contains everything that the service had received until the
     time `until` [ns].
 
-    A caller can build other data together with the fusion, for example the public copy of the
-    cells. For this purpose, `listener` is called once, with the new fusion. It returns the function
-    that `replay` uses as `heard`.
+    To build other data together with the fusion, a caller gives a `listener`. It is called once,
+    with the new fusion, and returns the function that `replay` uses as `heard`.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -501,8 +497,8 @@ def _with_numbers(table: pa.Table) -> pa.Table:
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
     """Return an upper bound of the number of rows that `past_fusion` would read, from file sizes
-    and footers alone. If more than `most` rows are found, counting stops: the result is then above
-    `most`, but not an upper bound.
+    and footers alone. Beyond `most` rows, counting stops and the result is only some number above
+    `most`.
 
     Raises:
         OSError: the archive cannot be read.
