@@ -121,8 +121,8 @@ class ReadRule(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """Arguments of `road_beliefs`: the state of the slots (one per cell and heading sector), the
-    hash table that finds slots by key, the weather, and the parameters of reading.
+    """Arguments of `road_beliefs`: state of the slots (one per cell and heading sector), hash table
+    that finds slots by key, weather, and parameters for reading beliefs (`ReadRule`).
     """
 
     live: Rows

@@ -101,8 +101,8 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
 
 @refcount_free_inlined
 def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
-    """Copy the list of vehicles that recently reported ice or grip in a cell, with the times of
-    their reports. The list moves from row `at` of `source` to row `to` of `target`.
+    """Copy a cell's sources, which are the vehicles that recently reported ice or grip there, and
+    the times of their reports. The copy is from row `at` of `source` to row `to` of `target`.
     """
     for side in range(2):
         for k in range(SOURCES):
