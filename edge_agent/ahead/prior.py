@@ -24,7 +24,7 @@ Legend
     β, β'   probability that the map is wrong here, before and after the measurements
 
 h is the total variation distance between the map's beliefs about the last cell and this cell. If
-the map knows only this cell, h is BLIND.
+the map knows only this cell, h is BLIND. Otherwise h is at least LEAST_CHANGE.
 
 β' follows from Bayes' rule: β' = β·Z_W/(β·Z_W + (1 - β)·Z_M) with Z_M = Σ q·L and Z_W = Σ w⁻·L. In
 the first cell β is SHARE, its lowest value. At each later border β = SHARE + KEPT·(β' - SHARE).

@@ -135,10 +135,10 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     `plausible_loss` counts in full. A node whose friction is below the grip in use gets a penalty
     that does not depend on the factor.
 
-    All log-likelihoods become 0, so that no node gains probability, in two cases. In the first, the
-    consistency test (`trust.py`) has found that the measurements contradict the model. In the
-    second, accelerations, yaw rate or steering are missing. Sliding then cannot be distinguished
-    from rolling.
+    All log-likelihoods become 0, so that no node gains probability, in three cases. (1) The
+    consistency test (`trust.py`) has found that the measurements contradict the model. (2)
+    Accelerations, yaw rate or steering are missing, so that sliding cannot be distinguished from
+    rolling. (3) The car is too slow for a meaningful slip.
     """
     constants = design.constants
     features = scratch.features
