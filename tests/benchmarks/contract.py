@@ -46,8 +46,8 @@ def contract() -> list[Figure]:
 
 
 def parquet_bytes() -> list[Figure]:
-    """Measure bytes per observation of an archive, as its service writes it, and after its rows
-    were sorted by cell (compaction).
+    """Measure the size of an observation in an archive's Parquet files [bytes]. Return two figures:
+    after compaction, which sorts the rows by cell, and before it.
     """
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

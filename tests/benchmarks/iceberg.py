@@ -32,8 +32,9 @@ def table_of(uri: str, kind: Kind) -> Table:
 
 
 def rows_different(root: Path, uri: str) -> int:
-    """Return the number of rows that occur more often in the archive's compacted (sorted) files
-    than in the Iceberg tables, or less often. Rows are equal if all columns are.
+    """Return the number of rows that differ between the archive's compacted (sorted) files and the
+    Iceberg tables. If a row occurs more often on one side, each additional copy counts. Rows are
+    equal if all columns are.
     """
     different = 0
     for kind in Kind:

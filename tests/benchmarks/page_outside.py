@@ -80,8 +80,8 @@ def is_over(record: ET.Element) -> bool:
 
 
 def is_valid() -> Callable[[bytes], bool] | None:
-    """Return the function that checks that a DATEX II publication follows the schema. Return None
-    if the schema is not installed.
+    """Return a function that takes the bytes of a DATEX II publication, and returns True if they
+    follow the schema. Return None if the schema is not installed.
     """
     if not SCHEMA.exists():
         print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
@@ -93,10 +93,12 @@ def is_valid() -> Callable[[bytes], bool] | None:
 
 
 def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
-    """Make STEPS DATEX II publications of simulated alerts that begin and end at random, and check
-    each with the function `valid`. Return the number of invalid publications, and the difference
-    between the numbers of open situations and of stretches with an active alert, summed over all
-    publications.
+    """Make STEPS DATEX II publications of simulated alerts that begin and end at random. Check each
+    publication with the function `valid`.
+
+    Return two sums over all publications: the number of invalid publications, and the error of the
+    number of open situations. A publication must have one open situation per road stretch with an
+    active alert.
 
     Both are NaN if fewer than LEAST_ENDED situations ended. The first is also NaN if `valid` is
     None, because the schema is not installed.

@@ -103,8 +103,10 @@ class Town:
         return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
     def change_cells(self, tile: int, cells: int, number: int) -> bytes:
-        """Change `cells` cells of a tile and set its marker (cell that identifies the publication)
-        to `number`. Return the tile's bytes for publication.
+        """Change `cells` random cells of a map tile, and return the tile's bytes for publication.
+
+        The vehicle count of the tile's marker cell is set to `number`, the number of the
+        publication. A test that reads the tile thus knows which publication it received.
         """
         columns = self.tiles[tile]
         which = self.rng.choice(len(columns["cell"]) - 1, cells, replace=False) + 1

@@ -90,9 +90,12 @@ def count_operations(interval: float) -> float:
 
 
 def _count_rows() -> int:
-    """Return the floating-point operations of one node (filter of one friction hypothesis) that
-    compute its measurement residuals. Residuals are computed at the mean, with steering and wheel
-    radii changed, and at the cubature points; forces at the mean and with three states changed.
+    """Return the number of floating-point operations that one node (filter of one friction
+    hypothesis) needs for its six measurement residuals and their derivatives.
+
+    Slips and residuals are computed at the mean, at the cubature points, with a changed steering
+    angle, and with changed wheel radii. Forces are computed at the mean, and once for each of three
+    changed states.
     """
     stiffness = 4 * (EXPONENTIAL + 1) + 8
     slip = 8 + AXLES * stiffness + WHEELS * 15
@@ -106,9 +109,12 @@ def _count_rows() -> int:
 
 
 def _count_covariances() -> int:
-    """Return the floating-point operations of one node (filter of one friction hypothesis) for its
-    covariance: first columns of its factor, covariances with the measurements, updates by the
-    measurements and by two velocities, prediction, and moments.
+    """Return the number of floating-point operations that one node (filter of one friction
+    hypothesis) needs for its covariance.
+
+    The steps are Cholesky factor, covariance of states and measurements, update, and prediction.
+    The update uses six measurements and two velocities of the rolling wheels. A last step adds the
+    node to the covariance of the whole mixture.
     """
     half = STATES * (STATES + 1) // 2
     factor = FUSED * STATES * CURVED * (CURVED - 1) // 2

@@ -53,9 +53,15 @@ def simulate_traffic(sumo: Sumo, seed: int) -> Traffic:
 
 
 def judge_join(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
-    """Join the positions of vehicles to road links by map place (cell and heading sector). Return
-    by name the shares of positions with the right link and with the right street, and the best
-    share that one link per map place could reach. Return also the numbers of positions and links.
+    """Join vehicle positions to road links by map place (map cell and heading sector), and compare
+    the result with the true links. One map place may have several links.
+
+    Return by name:
+        fixes: number of positions.
+        join_right: share of positions for which a joined link is the right one.
+        street_right: share of positions for which a joined link is on the right street.
+        best_single: share of right positions if each map place had only its most frequent link.
+        links_per_place: mean number of links that are joined to a position.
     """
     rng = np.random.default_rng(seed)
     east = METRES_PER_DEGREE * np.cos(np.radians(traffic.latitude))

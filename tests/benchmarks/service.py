@@ -98,8 +98,8 @@ def put_batch(session: zenoh.Session, one: Batch) -> None:
 
 
 def load(endpoint: str) -> None:
-    """Send RATE observations per second, in all of which the tyres used little friction, until this
-    process is ended.
+    """Send RATE observations per second to the service until this process is ended. Every
+    observation reports a small used friction and no ice.
     """
     rng = np.random.default_rng(0)
     seq = 0

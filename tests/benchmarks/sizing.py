@@ -85,9 +85,11 @@ def main(vehicles: int, messages: int) -> None:
 
 
 def make_message(vehicle: int, number: int, area: int, end: int) -> Message:
-    """Return message `number` of a vehicle that drives straight east, one cell per second, in one
-    of the areas; its last visit (pass through a cell) ends at `end` [ns]. One visit in seven
-    measures the friction.
+    """Return the message number `number` of a vehicle that drives straight east through the region
+    number `area`, one cell per second.
+
+    A message reports ROWS visits (passes through map cells), and the last visit ends at `end` [ns].
+    The next message begins ROWS cells further east. One visit in seven measures the friction.
     """
     group, lane = divmod(vehicle // AREAS, LANES)
     x, y = corner_of_region(area)

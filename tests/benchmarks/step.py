@@ -33,9 +33,9 @@ AGREE = 1e-6
 
 
 class Drive:
-    """Simulated manoeuvre in two forms: all 18 signals for the estimator, and those 11 of these
-    signals that the C kernel reads ("readings"). A caller can repeat the manoeuvre as often as
-    needed.
+    """Simulated manoeuvre in two tables. `signals` has all 18 signals, for the estimator.
+    `readings` has 11 of these signals, for the filter in C. A caller can repeat the manoeuvre as
+    often as needed.
     """
 
     def __init__(self) -> None:
@@ -61,9 +61,9 @@ class Drive:
     def repeat_samples(
         self, samples: int, vehicles: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return times (T, N), all signals (T, N, 18), and the readings (T, N, 11), which are the
-        signals that the C kernel uses, for T samples of N vehicles. The manoeuvre is repeated if it
-        is shorter than T samples.
+        """Return T samples of N vehicles: times (T, N), all signals (T, N, 18), and the readings
+        (T, N, 11). The readings are those signals that the filter in C uses. The manoeuvre is
+        repeated if it is shorter than T samples.
         """
         index = np.arange(samples) % len(self.t)
         t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
@@ -154,8 +154,11 @@ def call_s(bank: EstimatorBank, t: FloatArray, signals: FloatArray) -> float:
 
 
 def bank() -> list[Figure]:
-    """Compare a filter bank of many vehicles on two threads with C on the same number of threads,
-    and measure its cost per vehicle as their number grows.
+    """Measure the time of a filter bank (filters of many vehicles, computed together).
+
+    Compare the bank with the same filter in C, both on two threads, and with vectorised C on one
+    thread. Compare also the bank's time per vehicle and sample for 100 000 vehicles with that for
+    100.
     """
     drive = Drive()
     speed = same_filter(drive)

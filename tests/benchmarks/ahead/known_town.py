@@ -20,7 +20,8 @@ SPREAD = 0.06  # standard deviation that the map states for a cell, and that of 
 
 
 class KnownPlaces(NamedTuple):
-    """Map places (one per cell and heading sector) on the lanes of a scenario, each contained once.
+    """Friction of the map places on the lanes of a scenario. A map place is a map cell with one of
+    four heading sectors. No place occurs twice.
 
     Attributes:
         key: (n,) cell·4 + heading sector of each place.
@@ -32,8 +33,8 @@ class KnownPlaces(NamedTuple):
 
 
 def places_of(scenario: Scenario, t: float) -> KnownPlaces:
-    """Return the map places (one per cell and heading sector) of a scenario's lanes, with their
-    friction at t [s].
+    """Return the friction at t [s] in the map places on a scenario's lanes. A map place is a map
+    cell with one of four heading sectors.
     """
     points = scenario.network.points
     x = points[:, LanePoint.X]
@@ -49,8 +50,8 @@ def places_of(scenario: Scenario, t: float) -> KnownPlaces:
 def map_of_places(
     places: KnownPlaces, now: int, rng: np.random.Generator | None = None
 ) -> LocalMap:
-    """Return the map of a car that has received all `places` (one per map cell and heading sector)
-    from the service at the time `now` [ns].
+    """Return the map of a car that has received all `places` from the service at the time `now`
+    [ns]. A place is a map cell with one of four heading sectors.
 
     The friction in the map is the true one. If a random generator `rng` is given, errors of
     standard deviation SPREAD are added.

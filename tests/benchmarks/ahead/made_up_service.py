@@ -96,7 +96,7 @@ class MadeUpService:
         self.session.close()
 
     def put(self, alert: Alert) -> None:
-        """Publish an alert as a service does when it begins or ends."""
+        """Publish the beginning or the end of an alert (`alert.raised`) as the service does."""
         tile = int(grid.tile_of(alert.cell))
         self.session.put(
             keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING

@@ -225,8 +225,9 @@ def _watch_parts(parts: Sequence[Part], services: Sequence[Service], sender: Par
 
 
 def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
-    """Return, for each process in `parts` except the last (the sender), the smaller of two memory
-    sizes [MB]: the smallest one so far, `before`, and the one now.
+    """Return, for each process in `parts`, the smaller of its entry in `before` and its present
+    memory size [MB]. Repeated calls thus give the minimum over an interval. The last process, the
+    sender, is left out.
     """
     return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
@@ -254,9 +255,12 @@ def _save_course(folder: Path, looks: Sequence[Look]) -> None:
 
 
 def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
-    """Return figures of the time from sending to acknowledgement of the batches that were sent in
-    the measured ten minutes: over all batches, and the slowest region's divided by the fastest
-    region's.
+    """Return figures of the acknowledgement delay, the time from sending a batch to its
+    acknowledgement. Only batches sent in the measured ten minutes count.
+
+    The figures are the sending rate, and the maximum, the 99th percentile and the median of the
+    delay over all batches. For median and 99th percentile, another figure gives the ratio of the
+    slowest region to the fastest region.
     """
     measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
     waits = np.where(np.isnan(wait), np.inf, wait)

@@ -4,7 +4,8 @@
                zone; the r-th region of a zone has a number of vehicles proportional to 1/sqrt(r)
     towns      four in a region
     vehicles   each repeats a part of the drive of one vehicle of the city, shifted by whole tiles;
-               those that share a drive in one town are spread evenly over it
+               if several vehicles in a town repeat the same drive, their starting points are
+               spread evenly over the drive
     reports    each vehicle sends ROWS visits (passes through map cells) every PERIOD_S, and these
                visits last PERIOD_S, as in slow traffic
 
@@ -51,8 +52,8 @@ class Chunk(NamedTuple):
         x, y: column and row of each position, counted in cells from the north-western tile of the
             town, with fractions.
         cell_x, cell_y: column and row of the reported cells, counted from the same tile.
-        enter, leave: time from each visit's begin and end to the end of the last visit, divided by
-            the duration of all visits.
+        enter, leave: begin and end of each visit, as the share of the batch's duration that remains
+            until the last visit ends: 1 at the begin of the first visit, 0 at the end of the last.
     """
 
     message: Any

@@ -23,8 +23,11 @@ CARS: Final = 5  # drives with accurate sensors, and the same number with inaccu
 
 
 def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Figure]:
-    """Return the figures of all parts. Files are written into `folder`; the CAN log `recorded` is
-    decoded as well.
+    """Run the evaluations of file import, signal doctor (a check of recorded signals), calibration
+    and live sources. Return their figures.
+
+    Files are written into `folder`. If the CAN log `recorded` is given, its frames are decoded as
+    well. If `quick` is True, drives are fewer and shorter.
     """
     rows: list[Callable[[], list[Figure]]] = [
         lambda: imports.figures(folder, FIGURES, recorded, QUICK_S if quick else imports.DRIVE_S),

@@ -66,8 +66,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
 
 
 def _recorded_frames(log: Log, message: Any) -> list[bytes]:  # noqa: ANN401 cantools has no types
-    """Return the data bytes of each frame in a recorded CAN log, on any bus, that has the
-    identifier of the CAN message `message`.
+    """Return the data bytes of all frames in a recorded CAN log whose identifier is that of the CAN
+    message `message`. The frames may be from any bus.
     """
     wanted = (message.frame_id, message.is_extended_frame)
     return [

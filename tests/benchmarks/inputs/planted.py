@@ -108,8 +108,8 @@ def swap_columns(one: Sequence[int], other: Sequence[int]) -> Spoil:
 
 
 def status_bits(drive: Recorded) -> Recorded:
-    """Return the drive with an error as of a wrongly decoded message: an upper bit of a wheel speed
-    is really a status bit. This bit is set in two of seven readings of one wheel.
+    """Return the drive with the fault of a wrongly decoded CAN message: a status bit is read as an
+    upper bit of a wheel speed. The bit is set in two of seven readings of one wheel.
     """
     signals = drive.signals.copy()
     signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
@@ -220,11 +220,13 @@ def doctor_verdict(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Return two shares for accurate and inaccurate cars: added faults that the signal doctor (a
-    check of recorded signals) finds, and drives that it declares free of faults.
+    """Return figures of the signal doctor (a check of recorded signals), measured on simulated
+    drives. The drives are in the demonstration town and in a winter town, `count` with accurate
+    cars and `count` with inaccurate cars each.
 
-    The second share, on drives without a fault, shows the false alarms. The same shares are
-    measured in a winter town.
+    Drives with an added fault give the share of faults that the doctor names, and the number of
+    drives that it passes wrongly. Drives without a fault give the share of channels with a false
+    report, and the share of drives that pass.
     """
     cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
     cold = [

@@ -61,8 +61,11 @@ def _count_and_send(parcels: list[Parcel], link: AmqpLink, parcel: Parcel) -> No
 
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     """Simulate hazard events (DENM) that begin, change and end, and restart the gateway after each
-    step. Return as figures the invalid messages, the events that were duplicated or never ended,
-    the events selected by a wrong area, and the message rates.
+    step.
+
+    Return as figures the numbers of invalid messages and of events that were duplicated or never
+    ended, and the message rates. A further figure counts errors of the filter `quadTree`, with
+    which a receiver selects the events in a map square.
     """
     from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 

@@ -1,6 +1,8 @@
-"""Benchmarks of three interfaces: foreign DENM (hazard messages of other parties) that report ice
-where there is none, the Kuksa provider with a server of the published protocol, and readers of MCAP
-files.
+"""Benchmarks of three interfaces to other systems.
+
+DENM     hazard messages of other parties report ice where there is none
+Kuksa    the agent writes signals to a stub server with the interface kuksa.val.v2
+MCAP     the readers of the official library read a file of estimates
 """
 
 from __future__ import annotations
@@ -173,9 +175,12 @@ def _number(point: Any) -> float | None:  # noqa: ANN401 the wheel's modules hav
 
 @contextmanager
 def _broker() -> Iterator[tuple[int, dict[str, Any]]]:
-    """Run the stub of a Kuksa databroker: a gRPC server that implements only `PublishValue` of
-    kuksa.val.v2 and rejects unknown paths and wrong types, as VSS defines them. Yield its port, and
-    the data points that it has received, by path.
+    """Run a stub of a Kuksa databroker: a gRPC server that implements only `PublishValue` of
+    kuksa.val.v2.
+
+    Like a real broker, it accepts a value only if the VSS path is known and the value has the type
+    of this path. The known paths are those of the road friction signals. Yield the port, and the
+    received data points by path.
     """
     import grpc
     from kuksa.val.v2 import val_pb2, val_pb2_grpc  # type: ignore[import-not-found]

@@ -41,8 +41,8 @@ class StreetTown:
     streets: list[tuple[int, int]]
 
     def line(self, street: tuple[int, int]) -> routing.RoadLine:
-        """Return the street between two crossings as a polyline in this direction. The computation
-        of route costs takes streets in this form.
+        """Return a street as the polyline that the computation of route costs takes. `street` is a
+        pair of crossing indices. The polyline runs from the first crossing to the second.
         """
         first, last = self.crossings[list(street)]
         return routing.RoadLine(np.array([first[0], last[0]]), np.array([first[1], last[1]]))
