@@ -60,8 +60,10 @@ class MadeUp:
 def estimates(
     samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1
 ) -> MadeUp:
-    """Return made-up estimates: random ones, or with `mu` a narrow interval around this friction.
-    Every sample has a random log-likelihood of friction.
+    """Return made-up estimates of N = `vehicles` vehicles. The friction of each sample is `mu`, or
+    random if `mu` is None. The friction interval is this value ± 0.05.
+
+    Every sample has a random log-likelihood of friction. `used` is the friction that the tyres use.
     """
     rng = np.random.default_rng(seed)
     shape = (samples, vehicles)

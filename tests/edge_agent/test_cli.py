@@ -514,8 +514,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_estimates_of_a_split_or_odd_log_stay_finite(drive: Path, tmp_path: Path) -> None:
-    """Estimates must be finite, and some must have a health flag, for a log without torques and
-    rear steering angles in which every second speed reading of the front left wheel is missing.
+    """A log has no torques and no rear steering angles. Every second reading of the front left
+    wheel speed is missing. All estimates must be finite, and some must have a health flag.
     """
     log = pq.read_table(drive / "log.parquet")
     gone = [n for n in log.column_names if n.startswith(("torque", "delta_r", "true"))]

@@ -122,8 +122,10 @@ def test_a_process_that_the_system_ends_is_an_error_and_no_hang(
 
 
 def has_ended(process: subprocess.Popen[str], pipe: Path) -> bool:
-    """Return True if a process has ended. Also open and close the named pipe, so that processes
-    that wait for its content read its end.
+    """Return True if a process has ended.
+
+    The function also opens the named pipe `pipe` for writing and closes it. A process that waits
+    for data from this pipe then reads the end of the file, and continues.
     """
     with suppress(OSError):  # no process waits
         os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))

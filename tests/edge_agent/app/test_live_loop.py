@@ -131,9 +131,10 @@ def run(
 def test_a_simulated_source_hands_its_context_to_the_observations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """One simulated car brakes with ABS now and then: its published observations must contain the
-    ABS flag. A second car's flag is always on, and so carries no information; the others have no
-    flag. Their published flag must be unknown.
+    """Car 0 brakes with ABS now and then. Its published observations must contain the ABS flag.
+
+    The flag of car 1 is always on, so it carries no information. Car 2 sends no flag. The published
+    flag of both cars must be unknown.
     """
     fleet, parts = fleet_blocks(300)
     for place, block in enumerate(parts):

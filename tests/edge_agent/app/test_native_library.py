@@ -87,9 +87,10 @@ def run_python(code: str, *words: str) -> list[str]:
 @pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """The shared library and Numba must give the same estimates, records and beliefs of a drive,
-    bit by bit. The process that uses the library must not import the modules in HEAVY. At first,
-    the folder `kernels` contains an invalid library, made from other source files according to its
-    name. The agent must not load it.
+    bit by bit. The process that uses the library must not import the modules in HEAVY.
+
+    At first, the folder `kernels` contains a file that is no valid library. According to the digits
+    in its name, it was built from other source files. The agent must not load it.
     """
     write_library(tmp_path / "kernels", f"edge_agent-0123456789abcdef-{LEVEL}.so")
     t, signals = SimulatedFleet("hills", VEHICLES, 3, 100.0, rough=0.5, winter=0.5).step(2000)

@@ -51,7 +51,7 @@ def drive_over_joints() -> tuple[FloatArray, FloatArray, Vehicle]:
     torque signals. The road has joints. At each joint the wheel speeds of an axle jump by 3 to 4 %
     for 50 ms.
 
-    The recorded minute tests/data/rav4.blf has such jumps at 1.7 and 38.4 s.
+    The recording of a real drive in tests/data/rav4.blf has such jumps at 1.7 and 38.4 s.
     """
     vehicle = drive("straight", 0.85)[2]
     rng = np.random.default_rng(4)

@@ -1,6 +1,8 @@
-"""Tests of properties that every available estimator must have. Its outputs must depend on past
-samples only, and must not change by a bit for any division of the samples into calls. Without
-excitation its intervals must be wide. No output may be NaN.
+"""Tests of properties that every available estimator must have.
+
+The estimates must depend on past samples only. They must be the same bit by bit if a caller passes
+the samples in one call or in many. If a drive needs little grip, the friction intervals must be
+wide. No output may be NaN.
 """
 
 from __future__ import annotations

@@ -102,9 +102,11 @@ def test_rows_taken_one_by_one_are_the_textbook_update(seed: int, missing: tuple
 def take_all_rows(
     features: BlockFeatures, mean: FloatArray, covariance: FloatArray, node: NodeWorkspace
 ) -> None:
-    """Update mean and covariance of each node (filter of one friction hypothesis) by all
-    measurement rows, and write the loss (negative log-likelihood) that results for each node into
-    `node.gain`.
+    """Update mean and covariance of each node (filter of one friction hypothesis) with all six
+    measurements (four wheels, two axles).
+
+    Write the resulting loss (negative log-likelihood) of each node into `node.gain`, where the test
+    reads it.
     """
     put_lanes(node.gain, 0, take_rows(features, mean, covariance, node, 0.0))
 

@@ -58,8 +58,9 @@ class Bend:
         counts as new, that is, differs from the usual.
 
         Args:
-            slip: lateral slip, given as the force at which the filter expects it.
-            force: lateral force; both forces are divided by the load.
+            slip: lateral slip, expressed as the side force over load of a linear tyre with this
+                slip.
+            force: measured side force over load.
             seconds: duration.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]

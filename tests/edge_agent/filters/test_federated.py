@@ -74,8 +74,9 @@ def test_fusing_adds_information() -> None:
 
 
 def test_federated_filter_with_halved_shared_rows_is_the_kalman_filter() -> None:
-    """Two sub-filters with measurements [z1, z2] and [z2] run ten steps of a linear system. The
-    result must equal the textbook Kalman filter.
+    """Two sub-filters with measurements [z1, z2] and [z2] run ten steps of a linear system. Both
+    double the variance of the shared measurement z2, so that each uses half of its information. The
+    fused result must equal the textbook Kalman filter.
     """
     rng = np.random.default_rng(3)
     n = 3

@@ -18,8 +18,8 @@ VEHICLE = DATA / "rav4.json"
 
 
 def frames(most: int | None = None) -> list[can.Message]:
-    """Return the first `most` frames of the recorded minute, with times in whole microseconds as
-    most loggers store them.
+    """Return the first `most` CAN frames of the recording. Their times are in whole microseconds,
+    as most loggers store them.
     """
     with can.BLFReader(BLF) as reader:
         found = [message for _, message in zip(range(most or 10**9), reader, strict=False)]

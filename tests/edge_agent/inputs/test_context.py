@@ -233,7 +233,10 @@ def test_a_table_fills_the_context_and_keeps_its_rows(tmp_path: Path) -> None:
 
 def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Profile) -> FloatArray:
     """Return the context signals (T, 5) in the first `blocks` blocks that `LiveRows` makes from a
-    live source. The source sends messages at 50 Hz, and `values` in every `every`-th of them.
+    simulated live source.
+
+    The source sends 50 messages per second. One message in `every` also contains the context
+    signals `values`, given by name.
     """
     clock = Steered()
     feed = Scripted("bus", clock)

@@ -1,5 +1,6 @@
-"""Tests of the signal doctor (a check of recorded signals). It must name faults that the test adds,
-accept correct drives and the recorded minute, and propose right corrections.
+"""Tests of the signal doctor (a check of recorded signals). It must name the faults that the tests
+add to simulated drives, and propose corrections that remove these faults. It must accept drives
+without faults and a recorded minute of real driving.
 """
 
 from __future__ import annotations
@@ -154,7 +155,9 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
 
 @pytest.mark.timeout(600)  # time to compile the default estimator's kernels
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
-    """Run the commands of the tutorial on the recorded minute; every command must succeed."""
+    """Run the commands of the tutorial `first-drive.md` on its recording, one minute of real
+    driving. Every command must succeed.
+    """
     log, page, out = (
         str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet")
     )

@@ -355,8 +355,10 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
 
 
 def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
-    """Return the bytes `data` of a file, damaged in the way `kind`, as by a failing or hostile
-    recorder.
+    """Return the bytes `data` of a file, damaged as a failing or hostile recorder may damage it.
+
+    If `kind` is "cut", the file ends early. If it is "full", eight bytes have all bits set.
+    Otherwise 20 bytes are random.
     """
     if kind == "cut":
         return data[: int(rng.integers(len(data)))]

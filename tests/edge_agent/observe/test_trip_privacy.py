@@ -22,8 +22,8 @@ def states(time: IntArray, vehicle: int = 0) -> RecordBlock:
 
 
 def list_passed_times(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
-    """Return the times [s] of the states that the filter `ends` publishes. The simulated trip lasts
-    `seconds` at SPEED, with one state per second.
+    """Simulate a trip of `seconds` at SPEED, with one state record per second. Return the times [s]
+    of the records that pass the filter `ends`, which removes records near both ends of a trip.
     """
     out = []
     steps = round(1.0 / 0.1 * block_s)

@@ -1,6 +1,9 @@
-"""Tests of the outbox, the agent's store of unacknowledged messages. They cover consecutive
-numbers, storage on disk first, settlement (removal after an answer) by ranges, retries at growing
-intervals, a size limit, and use by one agent only.
+"""Tests of the outbox, the agent's store of unacknowledged messages on disk.
+
+The numbers of the messages must have no gap, and the outbox must store a message before the agent
+sends it. When the service acknowledges or refuses ranges of numbers, these messages must be
+removed. Unanswered messages must be sent again at growing intervals. The size of the outbox must be
+limited, and only one agent may use it.
 """
 
 from __future__ import annotations

@@ -150,9 +150,12 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
 
 
 def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
-    """The oracle is an estimator that is given everything except the quantities which the vehicle
-    file and the data sheet leave open. Its speed error must be similar to the error that the wheel
-    radius in the vehicle file causes. Its friction error must be below 0.1.
+    """The oracle is an estimator that knows all true values, except those that the vehicle file and
+    the sensors' data sheet leave open. Unknown are for example the errors of wheel radius, tyre
+    stiffness and sensor offsets.
+
+    Its speed error must be similar to the error that the wheel radius in the vehicle file causes.
+    Its friction error must be below 0.1.
     """
     seeds = range(FIGURES, FIGURES + 4)
     speeds = oracle.speed(seeds)

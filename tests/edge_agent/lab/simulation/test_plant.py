@@ -1,5 +1,7 @@
-"""Tests that the simulated vehicle (plant) obeys mechanics: Newton's laws, friction circle, energy,
-steady circles and signs. Further tests check its limits.
+"""Tests that the simulated vehicle (plant) obeys mechanics: Newton's laws, the friction circle, the
+energy balance, and the centripetal acceleration in a steady circle. Steering and acceleration must
+change motion and wheel loads in the right direction. Further tests check standstill, locked wheels
+and the time step.
 """
 
 from __future__ import annotations

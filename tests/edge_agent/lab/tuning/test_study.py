@@ -1,5 +1,6 @@
-"""Tests of the study of paper 004's tuning. Drives for the search and for judging must be separate,
-the noise must follow the stated schedule, and the command must run from end to end.
+"""Tests of the study of paper 004's tuning. The drives for the search and for the final evaluation
+must be separate. The variance of the simulated sensor noise must follow table 2 of the paper. The
+command must run from end to end.
 """
 
 from __future__ import annotations
