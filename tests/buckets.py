@@ -56,8 +56,8 @@ class BucketServer:
             self._process = None
 
     def take_away(self, how: str) -> None:
-        """Make the server unavailable: `how` is "stopped", or "frozen" (it accepts connections but
-        does not answer).
+        """Make the server unavailable. If `how` is "stopped", the process ends. If it is "frozen",
+        the server accepts connections but does not answer.
         """
         if how == "stopped":
             self.stop()
@@ -66,7 +66,9 @@ class BucketServer:
             self._process.send_signal(signal.SIGSTOP)
 
     def bring_back(self, how: str) -> None:
-        """Make the server available again after `take_away` with the same `how`."""
+        """Make the server available again after a call of `take_away`. `how` ("stopped" or
+        "frozen") must be the same as in that call.
+        """
         if how == "stopped":
             self.start()
         else:

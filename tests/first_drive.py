@@ -31,8 +31,9 @@ def read_commands() -> list[str]:
 
 
 def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
-    """Start a new router and service. Publish the recorded minute of driving once under each of
-    several vehicle names. Return the cells of the map and the keys of the alerts.
+    """Start a new router and service. Publish the tutorial's recording, one minute of real driving,
+    once under each of several vehicle names. Return the cells of the map and the keys of the
+    alerts.
     """
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
@@ -44,8 +45,8 @@ def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
 
 
 def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
-    """Import, check and replay the recorded minute of driving, and publish it under each vehicle
-    name. Return the cells of the map and the keys of the alerts.
+    """Import, check and replay the tutorial's recording, and publish it under each vehicle name.
+    Return the cells of the map and the keys of the alerts.
     """
     car = ["--vehicle", str(VEHICLE)]
     out = str(log.with_suffix(".csv"))

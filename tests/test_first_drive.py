@@ -12,8 +12,8 @@ MOST_COMMANDS = 5
 
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
-    """Publish the tutorial's recorded minute of driving. Return the cells of the map and the keys
-    of the alerts.
+    """Publish the tutorial's recording, one minute of real driving. Return the cells of the map and
+    the keys of the alerts.
     """
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 

@@ -7,8 +7,8 @@ Kubernetes' schemas, and the commands of their pods are started.
 A pod is simulated on this machine by processes, one per container, with the command and the
 environment of the manifest. The container's mounts are folders in the pod's temporary folder, and
 pod names and ports are replaced by addresses of this machine. Nothing is applied to a cluster.
-Objects that only a cluster has (kinds of volumes, policies, load balancers) are only checked in the
-text.
+Objects that need a real cluster (kinds of volumes, policies, load balancers) are validated but not
+simulated.
 """
 
 from __future__ import annotations
@@ -221,8 +221,8 @@ class Cluster:
                     self._unpack_certificates(pod, container, folder)
 
     def _unpack_certificates(self, pod: Pod, container: Manifest, folder: Path) -> None:
-        """Write the certificates that the documentation's command puts into a secret, as files into
-        the folder of the mount.
+        """Write a pod's certificates as files into `folder`, which stands for the mount of a
+        secret. The documentation has the command that puts the same files into the secret.
         """
         of = pod.name.rpartition("-")[0]
         for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:

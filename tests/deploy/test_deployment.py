@@ -1,5 +1,5 @@
-"""Tests of the shipped systemd units, compose file and configurations. Tools of systemd and others
-check them, and their commands are started.
+"""Tests of the shipped systemd units, compose file and configurations. The tests check the files
+with standard tools such as systemd-analyze, and start the commands of the units.
 
 The files' texts are used without change, except for folders and ports.
 """
@@ -266,8 +266,10 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.campaign
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
-    """Two routers, a service, an agent and a reader, started from the units with new certificates,
-    must work together. Each process must end in time when it is stopped as systemd does.
+    """Two routers, a service and an agent must work together, and a client must be able to read the
+    map. They are started by the commands of the systemd units, with new certificates.
+
+    At the end each process receives SIGTERM, as from systemd, and must end within ten seconds.
     """
     etc = site.root / "etc"
     enrol = [

@@ -51,7 +51,9 @@ def register_attempt(function: Attempt) -> Attempt:
 
 
 def can_open(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
-    """Return True if the router accepts a session as `name` with the TLS settings `changed`."""
+    """Return True if the router accepts a session of the enrolled participant `name`. The TLS
+    settings `changed` replace those of this participant, for example its certificate.
+    """
     try:
         with ground.network.open_session(name, router, **changed):
             return True
@@ -127,7 +129,9 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if a vehicle connects to a false router with the certificate `name`."""
+    """Return True if a vehicle connects to a false router, which identifies itself with the
+    certificate `folder`/`name`.pem.
+    """
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),

@@ -61,8 +61,9 @@ class Made:
             self.queue.append(batch)
 
     def store_queued(self, now: float) -> list[tuple[str, bytes]]:
-        """Ingest as many queued batches as one step allows, write them to disk, and return
-        (vehicle, acknowledgement) pairs.
+        """Ingest queued batches, write them to disk, and return (vehicle, acknowledgement) pairs.
+        The number of batches is limited to what the service processes in one time step of the
+        simulation, STEP_S.
         """
         if not self.up:
             return []

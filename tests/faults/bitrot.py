@@ -100,9 +100,11 @@ def _flip_bit(path: Path, random_: random.Random) -> int:
 
 
 def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
-    """Start a service from the archive `root`. If `root` is not `whole`, it is a damaged copy: then
-    send every batch again, because rows may be lost. Return the service's map, its rows, and the
-    number of damages counted.
+    """Start a service from the archive in the folder `root`. Return a dictionary with the service's
+    map (`map`), its rows (`rows`), and the number of detected damages (`counted`).
+
+    `whole` is the folder of the undamaged archive. If `root` is another folder, it is a damaged
+    copy, in which rows may be missing. The function then sends every batch again.
     """
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):

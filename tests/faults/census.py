@@ -114,9 +114,8 @@ def compare_with_archive(journals: Iterable[Path], archive: Path) -> Census:
 
 
 def _doubled_outside(archive: Path) -> int:
-    """Read all compacted (sorted) files of an archive directly, as a program would that does not
-    know the rules of the archive format. Return the number of rows that this program would read
-    twice.
+    """Return the number of rows that an outside program would read twice. Such a program reads all
+    compacted (sorted) files of an archive, and does not apply the rules of the archive format.
     """
     paths = list(layout.compacted_files(archive, Kind.OBSERVATION))
     whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]

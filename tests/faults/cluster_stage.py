@@ -69,8 +69,9 @@ def write_town_archive(root: Path) -> str:
 
 
 class Journals:
-    """Reader of the load generators' journals (lists of stored and acknowledged batches): times of
-    acknowledged batches, updated as acknowledgements arrive.
+    """Reader of the load generators' journals (lists of stored and acknowledged batches). The
+    object has the times of all acknowledgements. Each call of `read_new_times` adds those that are
+    new.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -442,8 +443,8 @@ def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> flo
 
 
 def drain_loads(parts: list[Part]) -> None:
-    """Stop the load generators' new observations, and wait until all of them are acknowledged or no
-    more acknowledgements arrive.
+    """Signal the load generators to make no new observations. Wait until the service has
+    acknowledged or refused all existing observations, but at most PATIENCE_S.
     """
     for part in parts:
         part.send_signal(signal.SIGUSR1)
