@@ -62,8 +62,8 @@ class Made:
 
     def store_queued(self, now: float) -> list[tuple[str, bytes]]:
         """Ingest queued batches, write them to disk, and return (vehicle, acknowledgement) pairs.
-        The number of batches is limited to what the service processes in one time step of the
-        simulation, STEP_S.
+        The simulation calls this method once per time step, STEP_S. Each call takes at most
+        TAKEN_PER_S · STEP_S batches per car.
         """
         if not self.up:
             return []
