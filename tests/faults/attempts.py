@@ -1,6 +1,4 @@
-"""Attacks on a fleet secured by TLS and an access list. Each function returns True if its attack
-succeeded; in a secured fleet all must return False.
-"""
+"""Attacks on a fleet secured by TLS and access list. Each returns True on success; none may."""
 
 from __future__ import annotations
 
@@ -129,9 +127,7 @@ def plain_tcp(ground: Ground) -> bool:
 
 
 def can_lure_vehicle(ground: Ground, folder: Path, name: str) -> bool:
-    """Return True if a vehicle connects to a false router, which identifies itself with the
-    certificate `folder`/`name`.pem.
-    """
+    """Return True if a vehicle accepts a false router whose certificate is `folder`/`name`.pem."""
     tls = {
         "root_ca_certificate": str(folder / "trust.pem"),
         "listen_certificate": str(folder / f"{name}.pem"),
