@@ -1,4 +1,4 @@
-"""Attacks on a fleet secured by TLS and access list. Each returns True on success; none may."""
+"""Attacks on a fleet secured by TLS and an access list. Each returns False if the attack fails."""
 
 from __future__ import annotations
 
