@@ -156,7 +156,9 @@ def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArra
     """Compute the friction `mu` (4,) of the wheels at an unscented point x (7,) of the state,
     limited to the possible range of friction.
 
-    The deviation of the point's friction from that of `mean` (7,) is first multiplied by `share`.
+    First multiply the deviation of the point's friction from that of `mean` (7,) by `share` (0 to
+    1). `share` is small at small tyre forces. Such forces hardly depend on friction, so the filter
+    may learn only little about friction from them.
     """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel

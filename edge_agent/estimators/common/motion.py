@@ -1,4 +1,4 @@
-"""Test for a diverged motion estimate, and the health flag for sliding wheels."""
+"""Test for a diverged motion estimate, and for wheels that slide (health flag SLIDING)."""
 
 from __future__ import annotations
 

@@ -149,8 +149,9 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
 
 @compiled
 def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Compute the friction interval, the grip used in the last second, and the health flag for
-    sliding wheels, and store them in `memory`.
+    """Compute the friction interval and the grip used in the last second, and store them in
+    `memory`. Set the health flag SLIDING if a wheel spins or is locked, so that its normalised slip
+    exceeds SLIDING_THETA.
     """
     _find_friction(memory, design, scratch)
     note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))

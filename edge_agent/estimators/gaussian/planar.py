@@ -88,14 +88,14 @@ def propagate_points(
     cubature point, and is changed in place.
 
     Inputs change linearly from the previous sample to the current sample. `step` selects the source
-    of the longitudinal forces:
+    of the longitudinal tyre forces:
 
-    - `by_torque`: the wheels' torques. The last state z is the yaw acceleration, and friction (4,)
-      is given. The velocity is integrated from the states a_x and a_y alone; the measurements
-      correct these states for drag and slopes.
-    - `by_motor`: the torque of each axle's motor, half to each wheel; z is the friction of all
-      wheels.
-    - neither: the slip; z is the friction of all wheels.
+    - `by_torque`: the torques of the four wheels. The last state z is the yaw acceleration, and the
+      wheels' friction (4,) is given. The velocity is integrated from the states a_x and a_y. The
+      accelerometers correct these two states, so that they include drag and road slope.
+    - `by_motor`: the torque of each axle's motor, divided equally between the two wheels. The last
+      state z is the friction of all wheels.
+    - Neither flag: the slip of the wheels. The last state z is the friction of all wheels.
     """
     slowest = abs(columns[0, 0])
     for p in range(1, POINTS):

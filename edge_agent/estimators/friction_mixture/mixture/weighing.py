@@ -205,10 +205,11 @@ def update_novelty(
     memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures, vx: float, vy: float
 ) -> None:
     """Compute two fuzzy truth values, 0 to 1: features.new ("forces or slips have just changed")
-    and memory.slip.axle_ended ("a slide of an axle has ended"). Update the moving averages of the
-    forces and slips, which serve as their usual values.
+    and memory.slip.axle_ended ("a slide of an axle has ended").
 
-    (vx, vy) [m/s] is the mean velocity in the block (0.05 s).
+    features.new is large if forces or slips differ from their usual values, which are moving
+    averages over the last seconds. The function also updates these averages. (vx, vy) [m/s] is the
+    mean velocity in the block (0.05 s).
     """
     constants = design.constants
     keep = math.exp(-features.duration / constants.steady_time)
@@ -255,8 +256,9 @@ def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
 
 @compiled
 def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, axle: int) -> float:
-    """Return the lateral slip of an axle at the velocity (vx, vy) [m/s], expressed as the force
-    over load [1] of a linear tyre; NaN if its lateral force is unknown.
+    """Return the lateral slip of an axle at the velocity (vx, vy) [m/s]; NaN if its lateral force
+    is unknown. Slip is expressed as the force over load [1] that a tyre of constant stiffness would
+    have at this slip.
     """
     if math.isnan(features.side[axle]):
         return math.nan

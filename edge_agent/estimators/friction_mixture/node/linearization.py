@@ -216,17 +216,18 @@ def weigh_slopes(
 
 @inlined
 def slope_along(slope: float, ratio: float, square: float, whole: float) -> float:
-    """Return the derivative [1] of the tyre's force along one direction by the slip along this
-    direction, with slip expressed as the force of a linear tyre.
+    """Return the slope [1] of the tyre curve in one direction (longitudinal or lateral): derivative
+    of the force over load in this direction by the slip in the same direction.
 
-    The derivative is 1 at small slip and decreases towards the flat part of the curve. It is
-    limited to at least FLATTEST.
+    Slip is multiplied by the stiffness at small slip, so that slip and force of a linear tyre
+    (constant stiffness) are equal. Therefore the slope is 1 at small slip. It decreases towards the
+    flat part of the curve, and is limited to at least FLATTEST.
 
     Args:
-        slope: slope of the tyre curve at the slip [1].
-        ratio: force over that of a linear tyre [1].
-        square: squared slip in the direction, as linear force over load [1].
-        whole: squared slip in all directions [1].
+        slope: slope of the tyre curve at the total slip [1].
+        ratio: force divided by the force of a linear tyre at the same slip [1].
+        square: squared slip in the direction [1].
+        whole: squared total slip, over both directions [1].
     """
     mean = (slope * square + ratio * (whole - square)) * inverse_of(whole)
     return select(whole < TINY, 1.0, max(mean, FLATTEST))

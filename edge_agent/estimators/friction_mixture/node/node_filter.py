@@ -2,20 +2,23 @@
 Kalman filter of the vehicle, for given friction under its left and right wheels.
 
 Legend
-    m, P        mean (n,) and covariance (n, n)
-    B           measurement deviations of the cubature points, in the axes of the first CURVED
-                columns of the factor of P                             (CURVED, 6)
-    D           derivatives of the measurements by the states that they depend on linearly
-    h           covariance of the states with one measurement           (n,)
-    S           covariance of the measurements without noise            (6, 6)
+    m, P        mean (n,) and covariance (n, n) of the states
+    L           first CURVED columns of the lower-triangular factor of P        (n, CURVED)
+    B           column k: change of the measurements if the states move by column k of L,
+                computed at the cubature points; node.curved is B'              (6, CURVED)
+    D           derivatives of the measurements by the states that enter linearly, 0 for the others;
+                node.derivative is D'                                           (6, n)
+    h           covariance of the states with the measurements                  (n, 6)
+    S           covariance of the measurements without noise                    (6, 6)
 
-The six measurements (four wheels, two axles) are nonlinear only in velocity and stiffness.
-Therefore the third-degree cubature rule is applied in these four dimensions. The measurements are
-linear in the other states: leak (gravity that a tilted accelerometer measures), steering error,
-shape of the tyre curve and gain of torque. These enter exactly, by the derivative D (a
-Rao-Blackwellised rule). With L the first columns of the factor, h = L*B' + P*D' and S = B*(B +
-D*L)' + D*h. The measurements are applied one after the other, so that the noise of each may differ
-from node to node.
+The six measurements (four wheels, two axles) are nonlinear in only four states: two velocities and
+two stiffnesses. Therefore the third-degree cubature rule is applied in these four dimensions. The
+measurements are linear in the other states, such as steering error, gain of torque and leak
+(gravity that a tilted accelerometer measures). For the linear states the derivative D is exact, so
+no cubature points are needed (a Rao-Blackwellised rule).
+
+The covariances are h = L*B' + P*D' and S = B*(B + D*L)' + D*h. The measurements are applied one
+after the other, so that the noise of each may differ from node to node.
 """
 
 from __future__ import annotations
@@ -132,14 +135,23 @@ def weigh_rows(
     share: float,
     inflation: float,
 ) -> float:
-    """Compute innovation, variance and inflated noise of each of the six measurements (four wheels,
-    two axles). Add them to the sums of the block (0.05 s), weighted by the nodes' probabilities
-    `share`. Return the log-likelihood with the measurement noise R as it is before inflation.
+    """Compute the innovation (measurement minus prediction) of the six measurements (four wheels,
+    two axles) and its variance with increased noise. Return the log-likelihood [nat] of the
+    measurements without any increase of their noise R.
 
-    The noise of the axles is increased further if their measurements contradict the model, and
-    while the inputs are steady. With steady inputs, errors of the tyre curve and of offsets repeat
-    from block to block. With the smaller noise, the filter would adapt stiffness and shape to these
-    errors.
+    The function increases R for these reasons:
+
+    - Errors are correlated over several blocks (of 0.05 s). Therefore R is multiplied by
+      `inflation`.
+    - The innovation is an outlier.
+    - Only axles: the measurements contradict the model.
+    - Only axles: the inputs are steady. Errors of the tyre curve and of offsets then repeat from
+      block to block. With a small R, the filter would adapt stiffness and shape of the tyres to
+      them.
+    - Only at the rear: the front axle is already on another surface.
+
+    Squared innovations and their variances without the increase are added to the sums of the block,
+    weighted by the nodes' probabilities `share`.
     """
     constants = design.constants
     features = scratch.features
@@ -189,12 +201,15 @@ def spread_points(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Evaluate the residuals at the cubature points (sample states) of a group of nodes (friction
-    hypotheses).
+    """Evaluate the residuals of the six measurements at the cubature points (sample states around
+    the mean) of a group of nodes (friction hypotheses).
 
-    Results: node.curved, the deviations of the residuals along each column of node.root (the first
-    columns of the covariances' factors); node.residual, their mean; and node.nonlinearity, the
-    variance caused by nonlinearity.
+    The results for each residual are:
+
+    - node.residual: mean over the points.
+    - node.curved: for each column of node.root, change of the residual if the states move by this
+      column. node.root is the first columns of the lower-triangular factor of the covariance.
+    - node.nonlinearity: variance caused by nonlinearity.
     """
     scale = math.sqrt(CURVED)
     slip = node.moved_slip
@@ -328,9 +343,12 @@ def take_rows(
 
 @inlined
 def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
-    """Condition the measurements after measurement r on measurement r, whose innovation variance is
-    1/per: update their innovations, their covariances with each other, and their covariances with
-    the states.
+    """Correct the remaining measurements, those after measurement r, for the fact that the filter
+    has already used measurement r.
+
+    Their innovations (node.residual), the covariances of these innovations (node.spread) and their
+    covariances with the states (node.cross) become those given measurement r. `per` is the inverse
+    of the innovation variance of measurement r.
     """
     for q in range(r + 1, ROWS):
         share = lanes_at(node.spread, (q, r)) * per
@@ -346,8 +364,11 @@ def _condition_rows(node: NodeWorkspace, r: int, per: float) -> None:
 
 @inlined
 def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Subtract from the state covariances the part that the measurements explain. For each
-    measurement it is h*h'*gain, where h is the covariance of the states with the measurement.
+    """Reduce the state covariances P of a group of nodes by the information of all measurements:
+    subtract the sum of h*h'*gain over the measurements.
+
+    For each measurement, h (n,) is its covariance with the states (in node.cross). gain is the
+    inverse of its innovation variance (in node.gain), or 0 if the measurement is missing.
     """
     for i in range(STATES):
         for r in range(ROWS):

@@ -3,19 +3,21 @@ force from the tyre curve, by total least squares.
 
 Legend
     mu          friction of the node under the wheel's side [1]
-    g_x, g_y    linear force over load, slope*stiffness factor*slip [1]
+    g_x, g_y    slips, given as the force over load of a linear tyre (constant stiffness):
+                slope*stiffness factor*slip [1]
     theta       hypot(g_x, g_y)/mu, normalised slip
-    e_b         force minus the tyre's force at the measured slip, over load [1]
-    e_a         slip at the measured force by the inverse tyre, minus the measured slip, as linear
-                force over load [1]
+    e_b         measured force minus the force of the tyre curve at the measured slip, over load [1]
+    e_a         slip of the tyre curve at the measured force, minus the measured slip; both slips
+                given as for g_x [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
-Measurements ("rows"): the longitudinal residuals of four wheels, then the lateral residuals of two
-axles. In the linear range e weights slip and force equally. On the flat part and beyond the peak
-only the force counts, so the row of a sliding wheel measures its friction (errata, section "what
-made the difference", item 1). An axle has one mean slip; its wheels share the lateral force in
-proportion to load. The states of a node (gravity leaking into a_y, gain of torque, shape of the
-tyre) correct the measured force.
+There are six measurements ("rows"): the longitudinal residuals e of four wheels, then the lateral
+residuals of two axles. In the linear range e weights slip and force equally. On the flat part and
+beyond the peak, e depends only on the force. The force of a sliding wheel is friction times load,
+so its residual measures the friction (errata, section "what made the difference", item 1).
+
+An axle has one mean slip; its wheels share the lateral force in proportion to load. The states of a
+node (gravity leaking into a_y, gain of torque, shape of the tyre) correct the measured force.
 
 All functions compute a group of nodes at once (`schemas.runtime.lanes`).
 """
@@ -188,8 +190,15 @@ def find_slips(
 def find_ratios(
     curve: TyreCurve, features: BlockFeatures, node: NodeWorkspace, slip: NodeSlip
 ) -> None:
-    """Compute the forces that the tyre curve gives at the slips in `slip`, and write them there.
-    For each wheel this is the ratio to the force of a linear tyre, for each axle the lateral force.
+    """Compute the tyre forces at the slips in `slip` from the tyre curve, and write the results to
+    `slip`.
+
+    - slip.ratio, for each wheel: force divided by the force of a linear tyre (constant stiffness)
+      at the same slip.
+    - slip.size and slip.place, for each wheel: total slip, and its position in the tables of the
+      tyre curve.
+    - slip.axle_force, for each axle: lateral force over load.
+    - slip.axle_slip, for each axle: mean lateral slip of its wheels, weighted by load.
     """
     for axle in range(2):
         model = 0.0
@@ -327,11 +336,12 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 @inlined
 def _slip_at_force(curve: TyreCurve, mu: float, per_mu: float, force: float, other: float) -> float:
-    """Return the slip at which a tyre of friction `mu` has the force over load `force` [1] in one
-    direction, while its force over load at right angles is `other` [1]; per_mu is 1/mu.
+    """Return the slip in one direction at which a tyre of friction `mu` has two given forces over
+    load [1]: `force` in this direction, and `other` at right angles.
 
-    The slip is given as the force over load [1] that a linear tyre would have at it; it is infinite
-    at or beyond the peak of the curve.
+    The returned slip is multiplied by the stiffness at small slip [1], so that slip and force of a
+    linear tyre are equal. It is infinite if the total force reaches or exceeds the grip. `per_mu`
+    is 1/mu.
     """
     square = force * force + other * other
     per_size = inverse_root_of(square)

@@ -1,12 +1,15 @@
 """Velocity of the car without a tyre model, in three cases: all wheels stand, all wheels roll
 alike, or the rear axle does not slide.
 
-A tyre beyond its peak does not keep a constant slip: it locks or spins up within a tenth of a
-second unless a controller acts, and four tyres never do so alike. Therefore, if four wheels agree
-for a second, the speed is computed from them with the slip that their force needs. Without this
-rule, a lasting accelerometer offset could lead the filter to assume that four wheels slide on ice.
-This assumption fits any data, so the filter would keep it forever. In the same way, a rear axle
-with hardly any lateral force does not slide sideways, so the lateral velocity is computed from it.
+- Rolling wheels: if the wheel speeds agree for a second, the wheels do not slide. The speed of the
+  car is computed from them, corrected for the slip that their force needs. Reason: a tyre beyond
+  its peak locks or spins up within a tenth of a second unless a controller acts. Four tyres never
+  do so alike.
+- Rear axle: with little lateral force, the rear axle does not slide sideways. The lateral velocity
+  of the car is computed from its yaw rate and the small slip of the rear axle.
+
+Without these rules, a lasting accelerometer offset could lead the filter to assume that all four
+wheels slide on ice. This assumption fits any data, so the filter would keep it forever.
 """
 
 from __future__ import annotations
@@ -197,12 +200,15 @@ def _take_velocity(
     reading: tuple[float, float],
 ) -> float:
     """Apply a measured velocity along `direction` (x, y) to the filters of a group of nodes
-    (friction hypotheses). `innovation` [m/s] is the measured velocity minus that of each node.
+    (friction hypotheses). Return half of the squared innovation over its variance [nat].
 
-    `reading` is the variance and the threshold of the Huber function, which limits outliers. `row`
-    (n, LANES) is scratch memory.
-
-    Return half of the squared innovation over its variance [nat].
+    Args:
+        mean, covariance: means and covariances of the nodes' states, updated in place.
+        row: scratch memory (n, LANES).
+        direction: unit vector in the vehicle axes.
+        innovation: measured velocity minus that of each node [m/s].
+        reading: variance of the measured velocity, and threshold of the Huber function. If the
+            innovation exceeds this number of standard deviations, the variance is increased.
     """
     x, y = direction
     variance, huber = reading

@@ -1,9 +1,12 @@
-"""Operations on vectors (called rows) with one number per measurement (ROWS = 6: four wheels, two
-axles).
+"""Operations on vectors (called rows) with one number per measurement. There are ROWS = 6
+measurements: four wheels and two axles.
 
-The vectors are tuples, so that the compiler keeps them in registers during a loop. Elements of an
-array would be read from memory again after each write to any array. Each number stands for LANES
-values, one per node (friction hypothesis) of a group.
+An array `rows` (n, ROWS, LANES) contains n vectors, rows[0] to rows[n - 1], for each of LANES nodes
+(friction hypotheses). Every operation applies to all LANES nodes at once, each with its own
+numbers.
+
+A single vector is a tuple, so that the compiler keeps it in registers during a loop. Elements of an
+array would be read from memory again after each write to any array.
 """
 
 from __future__ import annotations
@@ -19,8 +22,10 @@ Row: TypeAlias = tuple[float, float, float, float, float, float]
 
 @inlined
 def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
-    """Return `factor` times vector i of `rows` (n, ROWS, LANES). A vector has one number per
-    measurement.
+    """Return `factor` times the vector rows[i], for each of LANES nodes (friction hypotheses).
+
+    `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
+    wheels, two axles).
     """
     return (
         factor * lanes_at(rows, (i, 0)),
@@ -34,7 +39,12 @@ def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
 
 @inlined
 def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
-    """Return the vector `total` plus `factor` times vector i of `rows` (n, ROWS, LANES)."""
+    """Return the vector `total` plus `factor` times the vector rows[i], for each of LANES nodes
+    (friction hypotheses).
+
+    `rows` has the shape (n, ROWS, LANES). A vector, such as `total` and the result, has one number
+    per measurement (ROWS = 6: four wheels, two axles).
+    """
     return (
         total[0] + factor * lanes_at(rows, (i, 0)),
         total[1] + factor * lanes_at(rows, (i, 1)),
@@ -47,7 +57,12 @@ def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
 
 @inlined
 def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
-    """Return the scalar product of the vector `row` and vector i of `rows` (n, ROWS, LANES)."""
+    """Return the scalar product of the vectors `row` and rows[i], one number for each of LANES
+    nodes (friction hypotheses).
+
+    `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
+    wheels, two axles).
+    """
     first = row[0] * lanes_at(rows, (i, 0)) + row[1] * lanes_at(rows, (i, 1))
     middle = row[2] * lanes_at(rows, (i, 2)) + row[3] * lanes_at(rows, (i, 3))
     last = row[4] * lanes_at(rows, (i, 4)) + row[5] * lanes_at(rows, (i, 5))
@@ -56,7 +71,11 @@ def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
 
 @inlined
 def put_row(rows: FloatArray, i: int, row: Row) -> None:
-    """Write the vector `row` to rows[i]; `rows` has the shape (n, ROWS, LANES)."""
+    """Write the vector `row` to rows[i], for each of LANES nodes (friction hypotheses).
+
+    `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
+    wheels, two axles).
+    """
     put_lanes(rows, (i, 0), row[0])
     put_lanes(rows, (i, 1), row[1])
     put_lanes(rows, (i, 2), row[2])

@@ -54,8 +54,13 @@ def find_interval(
     """Compute median, interval and P(mu < SLIPPERY_MU) of friction from the probabilities `weight`
     (NODES,) of the friction hypotheses.
 
-    `patch` (PATCH_NODES,) are the probabilities that the car is on an ice patch. `blended` (NODES,)
-    is scratch memory. `likeness`, 0 to 1, is the agreement of the car with its vehicle file.
+    The car may also be on a short ice patch. `patch` (PATCH_NODES,) is the probability of a patch
+    with the friction of each of the first PATCH_NODES hypotheses. Only the lower end of the
+    interval uses `patch`. For it, `weight` is multiplied by 1 minus the sum of `patch`, and `patch`
+    is added.
+
+    `likeness`, 0 to 1, is the agreement of the car with its vehicle file. `blended` (NODES,) is
+    scratch memory.
     """
     friction.median = quantile(design.mu, design.prior, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)

@@ -1,12 +1,12 @@
 """Friction jumps inside a visit (passage of one map cell): their detection, and the evidence of the
 part of the visit before the surface changed.
 
-The friction belief of a visit starts from the prior and follows the road, so at the end it
-describes only the last surface. In addition, the filter keeps the most informative belief of the
-visit so far; D measures the information. If almost all of the current belief lies at frictions that
-this kept belief excludes, the friction has jumped. Then the kept belief becomes the evidence of the
-part that ends, and the next part begins. A belief in transition between the two surfaces neither
-replaces the kept belief nor counts as a jump.
+The friction belief (node probabilities) of a visit starts from the prior and follows the road. At
+the end it describes only the last surface. In addition, the filter keeps the belief with the most
+information so far; D measures the information. If almost all of the current belief lies at
+frictions that the kept belief excludes, the friction has jumped. Then the kept belief becomes the
+evidence of the part that ends, and the next part begins. A belief in transition between the two
+surfaces neither replaces the kept belief nor counts as a jump.
 
 Legend
     w, s       probabilities of the nodes in the visit, and those of the kept belief   (K,)
@@ -47,9 +47,13 @@ def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Update the most informative belief of the visit (passage of one map cell). If friction has
-    jumped, write the evidence (32,) of the part (stretch on one surface) that ends, and begin the
-    next part.
+    """Test at the end of a block (0.05 s) for a friction jump inside the visit (passage of one map
+    cell). A jump ends the current part (stretch on one surface) of the visit and begins the next
+    part.
+
+    If friction has jumped, write the log-likelihood of the part that ends to `evidence` (32,), at
+    the friction values CENTRES. If not, keep the current node probabilities if they contain more
+    information on friction than those kept before.
     """
     if memory.split:
         return

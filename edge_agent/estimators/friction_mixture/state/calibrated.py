@@ -34,8 +34,9 @@ EACH_COMPLIANCE: Final = 0.003
 
 
 def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
-    """Return the standard deviations (N, STATES) of the states' priors: `std` (STATES,), reduced
-    for those states that a vehicle's calibration has measured.
+    """Return the standard deviation of the prior of every filter state for every vehicle, (N,
+    STATES). It is the common value `std` (STATES,), or a smaller one for a state that the vehicle's
+    calibration has measured.
 
     The means of the priors are not changed, because `inputs.correct` has already corrected the
     signals by the calibration.
@@ -54,11 +55,12 @@ def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
 
 
 def means_of(vehicles: Sequence[Vehicle], mean: FloatArray) -> FloatArray:
-    """Return the means (N, STATES) of the states' priors: `mean` (STATES,), with the vehicle's own
-    understeer where it is known.
+    """Return the mean of the prior of every filter state for every vehicle, (N, STATES). It is the
+    common mean `mean` (STATES,) for every state except understeer (state COMPLIANCE).
 
-    Understeer learned from drives takes precedence over the value computed from the axle data of
-    the vehicle file. If neither exists, the mean over all vehicles is used.
+    The understeer of a vehicle is the value learned from its drives. If there is none, it is
+    computed from the axle data of the vehicle file. Without axle data, understeer also has the
+    common mean.
     """
     means = np.repeat(mean[None, :STATES], len(vehicles), axis=0)
     for row, vehicle in zip(means, vehicles, strict=True):

@@ -70,11 +70,16 @@ class Constants(NamedTuple):
     reason.
 
     Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
-    (separable CMA-ES) on drives of two simulators. It minimised the interval score and the missed
-    and false reports of ice under four conditions: delayed steering signals still count as a
-    contradiction of the model, tilted sensors count as strain (deviation from the prior), split
-    roads are covered, and logs of real cars pass. Values with which less ice was found on long
-    drives in towns were not adopted. For a study, `Constants(name=value)` replaces one value.
+    (separable CMA-ES) on drives of two simulators. The search minimised the interval score and the
+    missed and false reports of ice. The values had to meet these conditions:
+
+    - The filter still reports a contradiction of the model if the steering signal is delayed.
+    - Tilted sensors increase the strain (deviation of the states from their prior).
+    - On split roads, the friction interval contains the true friction.
+    - The checks with logs of real cars pass.
+    - On long drives in towns, no less ice is found than before.
+
+    For a study, `Constants(name=value)` replaces one value.
     """
 
     # --- Time constants of the measurement update ---

@@ -34,9 +34,14 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RoadChange(NamedTuple):
-    """Probabilities that the friction changes within a step. `hazard`: a change from any node
-    (friction hypothesis) to any friction. `leaving`: additional probability of such a change, for
-    nodes without neighbours. `drift`: approximate probability of a change to a neighbouring node.
+    """Probabilities that the friction changes within a step.
+
+    Attributes:
+        hazard: change from any node (friction hypothesis) to a friction drawn from the prior.
+        leaving: additional probability of such a change for nodes of split roads (different
+            friction left and right).
+        drift: approximate probability of a change to the node with the next lower or higher
+            friction. Only nodes with one friction for both sides have such neighbours.
     """
 
     hazard: float
@@ -55,9 +60,15 @@ def change_road(
     """Compute the probabilities `out` (K,) of K nodes (friction hypotheses) after a possible road
     change; before it they were `w`.
 
-    The first `chain` nodes exchange probability with their neighbours (`change.drift`). The
-    exchange does not change probabilities that equal the prior. The other nodes have no neighbours;
-    they lose the share `change.leaving`, which goes to all nodes.
+    Every node loses the share `change.hazard`, which goes to all nodes in proportion to `prior`.
+    The nodes are of two kinds:
+
+    - The first `chain` nodes assume one friction for both sides of the car, in ascending order.
+      They exchange probability with their neighbours (`change.drift`). The exchange does not change
+      probabilities that equal the prior.
+    - The other nodes assume a split road (different friction left and right), so they have no order
+      and no neighbours. They lose the additional share `change.leaving`, which also goes to all
+      nodes.
     """
     hazard, leaving, drift = change
     count = w.shape[0]

@@ -74,11 +74,14 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """Return the friction under both sides and the prior probability of all nodes (friction
-    hypotheses). The split nodes together have the prior probability `split_prior`.
+    """Return the table of all nodes (friction hypotheses): friction under both sides of the car,
+    and prior probability. The K nodes with one friction for both sides come first, then SPLIT_NODES
+    split nodes.
 
-    `mu` and `prior` (K,) are friction and prior probability of the nodes with one friction for both
-    sides.
+    A split node assumes a low friction under the wheels of one side and a high friction under those
+    of the other side. `mu` and `prior` (K,) are friction and prior probability of the K nodes. In
+    the result, the split nodes together have the prior probability `split_prior`, and the K nodes
+    the rest.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs = []

@@ -4,8 +4,9 @@ difference in shape between tyres.
 Legend
     theta    normalised slip, see edge_agent.dynamics.tyres           [1]
     f        force over mu*F_z, peak 1                                  [1]
-    shape    half the difference between a sharp and a round tyre: one standard deviation of shape;
-             it changes sign at the peak, because a steep rise is followed by a steep fall [1]
+    shape    change of f if the tyre is sharper by one standard deviation of shape. The deviation is
+             half of the difference between a sharp and a round tyre. Up to the peak of f the change
+             is positive; far beyond the peak it is negative, because a sharp curve falls faster [1]
     u        theta/(1 + theta); the tables over theta are equidistant in u [1]
     t        sqrt(1 - f); the inverse curve is smooth in t up to the peak  [1]
 """
