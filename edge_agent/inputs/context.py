@@ -32,8 +32,8 @@ AIR_C: Final = (
 
 
 def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:
-    """Return the readings of a context signal, converted to the unit of the signal log, in the same
-    shape.
+    """Return the readings of a context signal in the form that the signal log stores: same shape
+    and unit, but flags as 0 or 1, and impossible values limited or removed.
 
     Args:
         name: name of the signal, one of CONTEXT.

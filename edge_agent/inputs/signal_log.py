@@ -71,9 +71,11 @@ def read_log(path: Path) -> SignalLog:
     """Read and check a signal log.
 
     Raises:
-        InputError: the file is not a readable Parquet file, has no row, lacks a required column, or
-            has a required column without a reading, a column that is not numeric, or time that is
-            missing or goes backwards. The error names the column (and row) and the fix.
+        InputError: the log is not valid. The error names the column (and row) and the fix. Reasons:
+            - The file is not a readable Parquet file, or has no rows.
+            - A required column is missing, or has no reading.
+            - A column is not numeric.
+            - A time is missing, or time goes backwards.
     """
     table = _read_table(path)
     if not table.num_rows:

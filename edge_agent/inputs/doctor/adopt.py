@@ -1,12 +1,16 @@
 """Correction of a recorded drive by the measurements of the signal doctor (automatic check of the
-signals): delayed devices and locked axles.
+signals). Three faults are corrected before the estimator reads the log:
 
-The doctor reports a delay between devices that is too large for the filter. If the drive shows the
-size of the delay, the log is corrected before the estimator reads it. A delay of unknown size
-remains a finding (reported fault), and the records of the log are not published.
+- Delayed device: the doctor reports a delay between devices that is too large for the filter. If
+  the drive shows the size of the delay, the device's readings are moved in time. A delay of unknown
+  size remains a finding (reported fault), and the records of the log are not published.
+- Locked rear axle: both rear wheels turn at the same speed. The slip that this causes in turns is
+  removed from the wheel speeds.
+- Car on a lift or rollers: the wheels are treated as standing.
 
 Smaller delays are not corrected here, because the filter itself estimates them. Therefore a log
-without faults is processed as in a car, where no estimate depends on later samples.
+without these faults is replayed unchanged. The estimates are then those that a car would compute
+during the drive, without knowledge of later samples.
 """
 
 from __future__ import annotations

@@ -80,14 +80,21 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Terms of an identity (two sides that are equal by physics): left = gain · right + offset + Σ
-    k · term. Each side and each further term is an array (n,).
+    """The two sides of an identity (equation that holds by physics) and further terms, each an
+    array (n,). The relation that is fitted is left = gain · right + offset + Σ k · term, with an
+    unknown gain k for each further term.
 
-    `per` (n,), if given, is the factor of the offset. `bend` (n,), if given, adds the term gain ·
-    share · right · bend (understeer). The share is unknown; it has a prior distribution, because at
-    a single speed understeer cannot be separated from a gain of the steering. `loose` are prior
-    standard deviations of the gains k of the last terms, which are also hard to separate from the
-    main gain.
+    Attributes:
+        left: left side.
+        right: right side.
+        per: factor (n,) by which the offset is multiplied; None means 1.
+        bend: squared speed over the square of a high speed of the drive (n,), for the understeer of
+            the car. The right side is then right · (1 + s · bend). The share s is unknown and has a
+            prior, because at a single speed understeer cannot be separated from a steering gain.
+            None means no understeer.
+        loose: prior standard deviations of the gains k of the last further terms. These gains need
+            a prior, because they are hard to separate from the main gain.
+        length: wheelbase [m] if the right side contains it, else 1.
     """
 
     left: FloatArray
@@ -257,12 +264,16 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
 def _bend_of(
     x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
 ) -> tuple[float, float]:
-    """Fit the understeer share s in y = gain · x · (1 + s · bend) + offset, where x and y are the
-    right and left side of an identity, (n,) each. Return s, and the standard deviation of ln gain
-    that follows from the uncertainty of s. `constant` (n,) is the term of the offset.
+    """Estimate the understeer share s in y = gain · x · (1 + s · bend) + offset · constant. Return
+    s, and the standard deviation of ln gain that follows from the uncertainty of s.
 
-    s is the posterior mean over the candidate values BENDS. The prior is the share on usual cars,
-    and the likelihood follows from the residual over `count` independent moments.
+    x and y (n,) are the right and left side of the steering identity (steering angle against yaw
+    rate). `bend` (n,) is the squared speed, relative to a high speed of the drive. At that high
+    speed, understeer needs the share s of the steering angle that a car without understeer needs.
+
+    s is the posterior mean over the candidate values BENDS. The prior is the distribution over
+    usual cars. The likelihood follows from the size of the residuals, which count as `count`
+    independent samples.
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))

@@ -55,8 +55,11 @@ class Mistake(NamedTuple):
 
 
 class Member(NamedTuple):
-    """A quantity in an identity (two sides that are equal by physics), and the power, 1 or -1, with
-    which the factor of its fault enters the gain (slope of the left side over the right side).
+    """A measured quantity in an identity (two sides that are equal by physics), and its exponent in
+    the gain. The gain is the slope of the left side over the right side.
+
+    A fault that multiplies the quantity by a factor f multiplies the gain by f^power. `power` is 1
+    for a quantity on the left side and -1 for a quantity on the right side.
     """
 
     quantity: str

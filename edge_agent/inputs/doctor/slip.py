@@ -171,9 +171,11 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
 
 
 def spread_of_parts(beside: FloatArray) -> float:
-    """Return how much a quantity, given by its readings (n,), differs between the parts of a drive:
-    the standard deviation of its medians in the parts. If it is small, the quantity is a constant
-    sensor error such as a tilt, because a slide does not last over all parts.
+    """Return the variation of a quantity, given by its readings (n,), over a drive: the standard
+    deviation of its medians in RADIUS_PARTS equal parts of the drive.
+
+    A sensor error, such as a tilted mount, is about the same in all parts, so the result is small.
+    A slide affects only some parts, so the result is large.
     """
     parts = [
         float(np.nanmedian(part))
