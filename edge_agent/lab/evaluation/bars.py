@@ -34,8 +34,9 @@ class EstimatorBar(NamedTuple):
 
 
 def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns one measure of one estimator
-    in one scenario: the mean over all seeds, with ordinary sensors.
+    """Return a function that takes the campaign's results and returns the mean of one measure over
+    all drives of a scenario with ordinary sensors. `measure` is for example "rmse_vx", a root mean
+    square error.
     """
 
     def read_mean(results: Results) -> float:
@@ -45,9 +46,12 @@ def mean_of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[
 
 
 def noise_mean(experiment: str, measure: str) -> Callable[[Results], float]:
-    """Return a function that takes the campaign's results and returns one measure of the paper's
-    tuned filter in an experiment of paper 004, under the paper's conditions: the mean over all
-    seeds.
+    """Return a function that takes the campaign's results and returns the mean of one measure over
+    all drives of a noise experiment of paper 004.
+
+    The estimator is the filter of the paper, with fuzzy sets tuned by the ant colony. `measure` is
+    for example "mae_vx", a mean absolute error. `experiment` is "constant" or "variable", which
+    describes the variance of the sensor noise over time.
     """
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
@@ -218,9 +222,11 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures (named numbers) of the evaluation. Figures with a target come first; with
-    `quick`, only those of them that were measured. Most other figures are named
-    `KIND.SCENARIO.ESTIMATOR.MEASURE` and have a standard deviation.
+    """Return all figures (named numbers) of the evaluation. Figures with a target come first. With
+    `quick`, figures with a target are left out if they were not measured.
+
+    Most other figures are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and are means over several
+    drives. A figure with the suffix `.sd` is the standard deviation over these drives.
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]

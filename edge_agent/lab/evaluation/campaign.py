@@ -147,9 +147,11 @@ def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, 
 
 
 def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
-    """Return, by kind of tyre, how often the default estimator's friction interval contains the
-    true value: one share per simulated drive of all scenarios. The tyres differ from the filter's
-    tyre model.
+    """Return the coverage of the default estimator's friction interval on tyres that differ from
+    its tyre model. Coverage is the share of the samples whose interval contains the true friction.
+
+    The key of the result is the kind of tyre. The value is an array with one coverage per simulated
+    drive; the drives of all scenarios follow one another.
     """
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)

@@ -1,31 +1,36 @@
 """Detection evaluation: does the estimator find slippery road, how soon, and does it report ice
 where there is no ice?
 
-Towns are drawn randomly by seed; cars are inaccurate ("rough", ROUGH_FLEET) or accurate ("plain").
-"short" drives last 120 s, and "long" ones 900 s, because some faults that stop a car's reports
-appear only after a long time. Each result for one kind of cars is computed from the samples of all
-towns with such cars. A visit is the passage of one map cell, with its likelihood of friction.
+Cars drive in towns with random friction and hills, drawn by seed. There are two kinds of cars:
+"rough" cars have large sensor errors, as real cars have (ROUGH_FLEET); "plain" cars have small
+sensor errors. "short" drives last 120 s, and "long" drives 900 s, because some faults that stop a
+car's reports appear only after a long time. Each result for one kind of cars is computed from the
+samples of all towns with such cars.
+
+A visit is the passage of one car through one map cell. The agent computes the likelihood L of each
+friction from the measurements of a visit. The grip of a wheel is its largest possible tyre force.
 
 Legend
     slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least
                 SLIDE_S
-    value       a visit has value if it is evidence against full grip: its log-likelihood at the
-                largest friction is at least VALUE_NATS below the maximum
+    on ice      a sample with friction of at most .2, or a visit whose mean friction is at most .2
+                and changes by less than MOVES
+    excited     a visit during which some wheel uses more than EXCITED_SHARE of its grip
+    value       a visit has value if it makes a high friction improbable: ln L at the largest
+                friction is at least VALUE_NATS below its maximum
     favoured    a visit favours a slippery road if max ln L(μ < .4) - max ln L(μ >= .4) >=
                 FAVOURED_NATS
-    on ice      a visit whose mean friction is at most .2 and changes by less than MOVES; a sample
-                with friction of at most .2
-    excited     a visit during which some wheel uses more than EXCITED_SHARE of its grip
-    pass        a stretch of PASS_S or longer of one car on ice, or on snow; a pass is found if
-                P(mu < .4) > CALLED_SHARE at some time during it
-    settled     at least SETTLED_S after snow and ice
-    false event a settled stretch with P(mu < .4) > CALLED_SHARE on wet or dry road; gaps up to
-                EVENT_GAP_S do not end it. The road is judged by the mean friction of the wheels, so
-                one axle may be on ice; `.off_ice` counts only samples without a wheel on snow or
-                ice
-    false grip  mu_lower more than FALSE_GRIP above the true friction
-    stood       ice or snow appeared under the standing car; these cases are evaluated separately
-                and in no other figure
+    pass        a stretch of PASS_S or longer of one car on ice, or on snow. A pass is found if the
+                estimator reports P(mu < .4) > CALLED_SHARE at some time during the pass
+    settled     a sample on wet or dry road, at least SETTLED_S after the car left snow or ice
+    false event a settled stretch with P(mu < .4) > CALLED_SHARE. Stretches with a gap of at most
+                EVENT_GAP_S between them are one event. The road is judged by the mean friction of
+                the wheels, so one axle may be on ice. `.off_ice` counts only samples without a
+                wheel on snow or ice
+    false grip  the lower end of the friction interval is more than FALSE_GRIP above the true
+                friction
+    stood       ice or snow appeared under the car while it stood. Such cases are counted in
+                separate figures and in no other figure
 """
 
 from __future__ import annotations
@@ -293,9 +298,11 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 def _judge_contradictions(
     tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches
 ) -> None:
-    """Count how often the health flag CONTRADICTION (no friction explains the measurements) begins,
-    separately for slides on slippery road and for times without a slide. For both, also sum the
-    time [s] without the flag, in which it could begin. Add all sums to the tally.
+    """Count how often the health flag CONTRADICTION (no friction explains the measurements) is set
+    during slides on slippery road. Separately, count how often it is set without a slide.
+
+    For each count, also sum the time [s] in which the flag could have been set. Time with the flag
+    already set is left out. Add all sums to the tally.
     """
     sliding = np.zeros(len(drive.mu), np.bool_)
     extended = np.zeros(len(drive.mu), np.bool_)
@@ -393,8 +400,8 @@ class TownTally(NamedTuple):
 @dataclass
 class DetectionResults:
     """Results of the detection evaluation for each simulated town (`DetectionTally`), by the length
-    of its drives ("short" or "long") and the kind of its cars ("rough": inaccurate, "plain":
-    accurate).
+    of its drives ("short" or "long") and the kind of its cars. "rough" cars have large sensor
+    errors, as real cars have; "plain" cars have small sensor errors.
     """
 
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)

@@ -1,6 +1,8 @@
 """Figures (named numbers) of the detection evaluation: how each figure is computed from a tally
-(sums and counts), its unit, and its targets ("bars") for inaccurate ("rough") and accurate
-("plain") cars.
+(sums and counts), its unit, and its targets ("bars").
+
+There are two kinds of cars, and two targets per figure: "rough" cars have large sensor errors, as
+real cars have; "plain" cars have small sensor errors.
 """
 
 from __future__ import annotations
@@ -28,10 +30,10 @@ SHARE: Final = "1"
 
 class DetectionBar(NamedTuple):
     """Definition of one figure (named number) of the detection evaluation: the drives that the
-    figure covers, the function that computes it from a tally (sums and counts), its unit, and its
-    targets for inaccurate and for accurate cars (KINDS).
+    figure covers, the function that computes it from a tally (sums and counts), and its unit.
 
-    `length` is the class of drives, "short" or "long"; "" means both together.
+    `length` is the class of drives, "short" or "long"; "" means both together. `bars` are the
+    targets for "rough" cars (large sensor errors, as in real cars) and "plain" cars (small errors).
     """
 
     name: str
@@ -217,12 +219,13 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """Return the figures (named numbers) of the detection evaluation with their standard errors
-    over towns: `NAME.KIND` for every entry of DETECTION and both kinds of cars (rough: inaccurate,
-    plain: accurate). The list begins with the figures that have a target.
+    """Return the figures (named numbers) of the detection evaluation, for every entry of the list
+    DETECTION. Figures with a target come first, each with its standard error over towns.
 
-    `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the winter towns and the other
-    towns, if there are both.
+    A figure is called `NAME.KIND`, and its standard error `NAME.KIND.se`. NAME is the name in
+    DETECTION. KIND is the kind of cars: "rough" (large sensor errors, as in real cars) or "plain"
+    (small sensor errors). `NAME.KIND.winter` and `NAME.KIND.other` are the same figure for the
+    winter towns and the other towns, if there are both.
     """
     listed = []
     for bar in sorted(DETECTION, key=lambda bar: bar.bars is None):

@@ -1,12 +1,14 @@
-"""Detection campaign: evaluate the detection of slippery road in towns with rough (inaccurate) and
-plain (accurate) cars, on short and on long drives.
+"""Detection campaign: evaluate the detection of slippery road in simulated towns, on short and on
+long drives. "rough" cars have large sensor errors, as real cars have; "plain" cars have small
+errors.
 
 Half of the towns are winter towns, in which all cars have winter equipment. To evaluate chosen
 towns and print a table:
 
     python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900
 
-Each town is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
+Each town is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter. KIND is the kind of
+cars, rough or plain.
 """
 
 from __future__ import annotations
@@ -47,8 +49,11 @@ DEFAULT: Final = "aco-fckf"
 
 
 class DetectionTown(NamedTuple):
-    """A town to evaluate: its seed, its kind of cars ("rough": inaccurate, or "plain": accurate),
-    duration of the drives [s], number of cars, and a flag that is True for a winter town.
+    """A simulated town to evaluate. The seed determines its random friction and hills. The other
+    fields are the kind of cars, the duration of the drives [s], the number of cars, and `winter`.
+
+    The kind of cars is "rough" (large sensor errors, as in real cars) or "plain" (small sensor
+    errors). `winter` is True for a winter town.
     """
 
     seed: int
@@ -64,10 +69,12 @@ class DetectionTown(NamedTuple):
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign. Towns with short drives have other seeds than towns with
-    long drives. Accurate and inaccurate cars drive in towns with the same seeds.
+    """Return the simulated towns of the campaign, whose friction and hills are drawn by seed. Towns
+    with an odd seed are winter towns.
 
-    Towns with an odd seed are winter towns.
+    Each seed is used once with "rough" cars (large sensor errors, as in real cars) and once with
+    "plain" cars (small sensor errors). Short and long drives use different seeds if there are
+    enough. With `quick`, return only one small town per kind of cars.
     """
     if quick:
         return [

@@ -131,8 +131,8 @@ def _true() -> dict[str, Any]:
 
 
 def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
-    """Plot the drive of one inaccurate car in a hilly town over time: speed and wheel speed, slope,
-    friction with the default estimator's interval, health flags.
+    """Plot the drive of one car with large sensor errors ("rough" car) in a hilly town over time:
+    speed and wheel speed, slope, friction with the default estimator's interval, health flags.
     """
     from matplotlib import pyplot as plt
 
@@ -177,8 +177,8 @@ def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
 
 
 def _draw_surfaces(figures: Sequence[Figure], path: Path) -> Path:
-    """Plot the coverage of the 90 % interval by surface (ice, snow, wet, dry), for every estimator
-    in the towns with inaccurate cars.
+    """Plot the coverage of the 90 % interval by surface (ice, snow, wet, dry) for every estimator.
+    The data come from the towns whose cars have large sensor errors, as real cars have.
     """
     from matplotlib import pyplot as plt
 

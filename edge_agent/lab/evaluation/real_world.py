@@ -1,5 +1,5 @@
-"""Evaluation under realistic conditions: inaccurate cars in hilly towns, and cars that stand on a
-slope, for every estimator.
+"""Evaluation under realistic conditions: hilly towns whose cars have large sensor errors, as real
+cars have, and cars that stand on a slope. Every estimator is evaluated.
 
 Towns (friction, hills), cars, sensors and clocks are drawn randomly by the seed; half of the cars
 have no torque signal. Results for towns are means over the samples of all towns together.
@@ -114,8 +114,9 @@ def in_winter(seed: int) -> bool:
 
 
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
-    """Simulate inaccurate cars in a town drawn by the seed; return their drives, and an array (T,
-    N) with the share of its grip that the most heavily used wheel of each car uses.
+    """Simulate cars with large sensor errors (as in real cars) in a town drawn by the seed. Return
+    their drives, and an array (T, N) with the share of its grip that the most heavily used wheel of
+    each car uses.
 
     In winter towns all cars have winter equipment.
     """
@@ -229,8 +230,8 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
 
 
 def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
-    """Simulate cars of all vehicle presets that stand on a slope of `slope` [1], some with ordinary
-    sensors, some with inaccurate sensors and without torque.
+    """Simulate cars of all vehicle presets that stand on a slope of `slope` [1]. Some have ordinary
+    sensors, and some have large sensor errors (as real cars have) and no torque signal.
     """
     batches = []
     for sensors in (USUAL, "rough"):
@@ -262,8 +263,8 @@ class RealWorldResults:
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
-    """Run towns with inaccurate cars, and cars that stand on slopes, for every estimator. The first
-    town is stored for plots.
+    """Run towns whose cars have large sensor errors (as in real cars), and cars that stand on
+    slopes, for every estimator. The first town is stored for plots.
     """
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies = {name: Tally() for name in (*estimators, "baseline")}

@@ -195,8 +195,8 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 
 def world(values: dict[str, float]) -> str:
-    """Return a Markdown table of the results in towns with inaccurate cars, one row per
-    estimator.
+    """Return a Markdown table of the results in towns whose cars have large sensor errors, as real
+    cars have; one row per estimator.
     """
     shown = {
         "coverage90": "coverage",
@@ -349,8 +349,11 @@ def detection_report(figures: Sequence[Figure]) -> str:
 
 
 def detection_table(figures: Sequence[Figure]) -> str:
-    """Return a Markdown table of the detection evaluation with one row per result: its value for
-    rough (inaccurate) and plain (accurate) cars with standard errors, and the targets.
+    """Return a Markdown table of the detection evaluation with one row per result: its values with
+    standard errors, and the targets.
+
+    Separate columns are for "rough" cars (large sensor errors, as in real cars) and "plain" cars
+    (small sensor errors).
     """
     by_name = {figure.name: figure for figure in figures}
     names = dict.fromkeys(

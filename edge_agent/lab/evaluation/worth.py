@@ -1,5 +1,5 @@
-"""Benefit of the fuzzy sets and of the ant colony: interval scores on drives with inaccurate cars
-that were not used for tuning.
+"""Benefit of the fuzzy sets and of the ant colony: interval scores on drives of cars with
+large sensor errors, as real cars have. The drives were not used for tuning.
 
 Three mechanisms of the default estimator are switched on or off. Fuzzy rules decide how much of the
 evidence on friction is used, and adapt the measurement noise R to the innovations (measurement
@@ -18,10 +18,10 @@ Legend of the filter variants (for all scores, less is better)
     colony       all rules with the vertices found by the ant colony, mean over the searches; same
                  budget as the random search
 
-Each seed gives a town with inaccurate cars and a set of manoeuvres on hills, with its own friction
-and vehicles. A ratio compares two variants: the mean score of one over all seeds, divided by that
-of the other. The figure `.difference` of a ratio is the mean over seeds of the difference of both
-scores, and `.difference.se` the standard error of that mean.
+Each seed gives a town and a set of manoeuvres on hills, with its own friction and vehicles. A ratio
+compares two variants: the mean score of one over all seeds, divided by that of the other. The
+figure `.difference` of a ratio is the mean over seeds of the difference of both scores, and
+`.difference.se` the standard error of that mean.
 """
 
 from __future__ import annotations

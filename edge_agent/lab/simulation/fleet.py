@@ -300,8 +300,9 @@ class SimulatedFleet:
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:
-    """Return an array (N,) that is True for rough (inaccurate) vehicles: the share `share` of all,
-    evenly distributed over the indices. The value for vehicle k does not depend on N.
+    """Return an array (N,) that is True for "rough" vehicles, which have large sensor errors, as
+    real cars have. They are the share `share` of all, evenly distributed over the indices. The
+    value for vehicle k does not depend on N.
     """
     number = np.arange(vehicles)
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
@@ -311,7 +312,7 @@ def winter_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for vehicles with winter equipment.
 
     Vehicles 0 and 1 have the same equipment, and so on in pairs. Therefore, if every second vehicle
-    is rough (inaccurate), so is every second one with winter equipment.
+    is "rough" (large sensor errors), so is every second one with winter equipment.
     """
     return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
 

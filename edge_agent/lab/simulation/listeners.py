@@ -26,7 +26,7 @@ EVERY: Final = 10  # blocks between two updates of the route
 
 def warned_ones(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for drivers who receive warnings. They are evenly
-    distributed over accurate and rough (inaccurate) vehicles.
+    distributed over vehicles with small and with large sensor errors.
 
     Raises:
         InputError: the share is not between 0 and 1.

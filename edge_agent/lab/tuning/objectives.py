@@ -19,7 +19,7 @@ noise, and friction intervals become too narrow. The objective `predictive` corr
 minus a cost for the deviation of NIS from 1. README.md, section "Choices", explains the default
 objective.
 
-The simulated cars are inaccurate: their sensors are misaligned and their clocks are delayed. They
+The simulated cars have sensor errors like real cars: misaligned sensors and delayed clocks. They
 drive on slopes. In towns, half of the cars have no torque signal. The drives of a search and the
 held-out drives share no seed, no vehicle file and no pair of manoeuvre and vehicle.
 """
@@ -215,8 +215,8 @@ def record_all(name: str, duration_s: float) -> TuningSet:
 
 def record_town(seed: int, cars: int, duration_s: float) -> TuningSet:
     """Simulate cars in a town that is drawn randomly by the seed, and return their drives. The
-    first WARM_S seconds of each drive are left out. The share ROUGH_SHARE of the cars is
-    inaccurate.
+    first WARM_S seconds of each drive are left out. The share ROUGH_SHARE of the cars has large
+    sensor errors, as real cars have.
     """
     fleet = SimulatedFleet(drawn_town(seed), cars, seed, RATE_HZ, rough=ROUGH_SHARE)
     fleet.step(round(WARM_S * RATE_HZ))

@@ -3,8 +3,8 @@ changes.
 
 Each number of `Constants` and of the shipped memberships (fuzzy sets) is multiplied by .7 and by
 1.4, one at a time. The filter then runs on simulated towns, half of them in winter, and on
-manoeuvres, all with inaccurate cars. Their seeds belong to tuning and are not used for published
-results.
+manoeuvres, with cars that have large sensor errors, as real cars have. Their seeds belong to tuning
+and are not used for published results.
 
 Legend of the columns; each states the change compared with the unchanged filter
     score      mean interval score of friction over the drives [%]; less is better
