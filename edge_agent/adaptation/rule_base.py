@@ -6,17 +6,18 @@ share of the evidence on friction that is used, and the rate at which sensor off
 | mismatch of wheels or axles is in one of five sets | ln R changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
-| slide, demand, new forces and strain each have a set | ln of the evidence share | Takagi–Sugeno |
+| slide, demand, new forces, strain are in certain sets | evidence share changes | Takagi–Sugeno |
 
 Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1).
-Takagi–Sugeno: each combination of the four inputs' sets has a value, and the result is their mean,
-weighted by membership. The first row is implemented in `fuzzy.py`. The other sets are ramps from a
-foot (membership 0) to a peak (membership 1); `Memberships` contains feet, peaks and consequents.
+Takagi–Sugeno: each combination of the four inputs' sets has a value of ln(evidence share). The
+result is the mean of these values, weighted by membership. The first row is implemented in
+`fuzzy.py`. The other sets are ramps from a foot (membership 0) to a peak (membership 1);
+`Memberships` contains feet, peaks and consequents.
 
 Mismatch is actual over theoretical innovation variance, minus 1. Demand is the force over load of
 an axle. Forces are new if they differ from their recent averages. Strain is the deviation of the
-estimated states of car and sensors from their prior. Inputs come from the block (0.05 s of samples)
-that has just ended, so no rule has its own effect as input.
+estimated states of car and sensors from their prior. The rules are evaluated once per block (0.05 s
+of samples), after the block has ended. Therefore no rule changes its own input within a block.
 
 `plain_rules` is the baseline without fuzzy sets. It replaces the last row by the formula of
 `plain_share`, and switches off the second and third row. The evaluation divides the score with
@@ -82,9 +83,11 @@ def rule_base(memberships: Memberships) -> RuleBase:
 
 
 def plain_rules(half: float, power: float, steady: float) -> RuleBase:
-    """Return a rule base without fuzzy sets. The filter then uses the share `plain_share` of the
-    evidence on friction. Wide steering does not increase R, and no mismatch accelerates the
-    forgetting.
+    """Return a rule base without fuzzy sets, as a baseline. The formula of `plain_share` then gives
+    the share of the evidence on friction that the filter uses.
+
+    Wide steering angles do not increase the measurement noise R. Sensor offsets, slope and bank
+    return to their prior at the usual rate, even if innovations are larger than expected.
 
     Args:
         half: demand (force over load of an axle) at which half of the evidence is used [1].

@@ -164,11 +164,11 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
 
 
 def braking_from(horizon: Horizon) -> FloatArray:
-    """Return v^2/2 (M,) [m^2/s^2] for each metre ahead, where v is the highest speed from which the
-    car can stop there.
+    """Return v^2/2 (M,) [m^2/s^2] for each metre ahead, where v is the highest current speed from
+    which the car can stop within that distance.
 
-    The braking uses the lower end of the friction interval, or UNKNOWN_LOWER on an unknown road.
-    The deceleration is limited to a comfortable one.
+    The assumed deceleration is gravity times the lower end of the friction interval, at most a
+    comfortable deceleration. On an unknown road, the assumed friction is UNKNOWN_LOWER.
     """
     lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
     return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

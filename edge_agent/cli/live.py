@@ -70,8 +70,9 @@ class LookoutPart:
 
 
 class VssPart:
-    """Component of the agent that reports the friction at the vehicles as VSS signals (vehicle
-    signal specification). It does so only while records of the vehicles may be published.
+    """Component of the agent that publishes the friction at the vehicles as signals in the format
+    of the Vehicle Signal Specification (VSS). It does so only while records of the vehicles may be
+    published.
     """
 
     def __init__(self, output: RoadFrictionOutput) -> None:
@@ -82,25 +83,28 @@ class VssPart:
         self._output.attach(name, session)
 
     def start_part(self) -> None:
-        """Do nothing: the output of VSS signals starts with the first report of friction."""
+        """Do nothing, because the output needs no start: the first VSS signals are published with
+        the first report of friction.
+        """
 
     def update_part(self, pipeline: Pipeline, *, admitted: bool) -> None:
-        """Report the friction after a block of samples, if the records of the block may be
-        published."""
+        """Publish the friction at the vehicles after a block of samples, if `admitted` is True (the
+        records of the block may be published).
+        """
         if admitted:
             self._output.report_grip(pipeline.grip)
 
     def close_part(self) -> Mapping[str, float]:
-        """Close the output of friction signals. Return an empty dictionary, because this
-        component counts nothing.
+        """Close the output of friction signals. Return an empty dictionary, because this component
+        has no counters.
         """
         self._output.close()
         return {}
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
-    """Return a function that prints warnings on stdout, as text or as JSON, depending on the log
-    format.
+    """Return a function that prints a warning of slippery road ahead as one line on stdout. Its
+    arguments are the vehicle's name and the warning. The log format selects text or JSON.
 
     A warning contains the time [s] until the car reaches the slippery stretch of road. In JSON, an
     infinite time is written as null.

@@ -74,7 +74,8 @@ def advance_velocity(
     """Return (v_x, v_y) [m/s] after `step` [s] in which accelerations a_x, a_y and yaw rate r are
     constant.
 
-    The solution is exact. With Euler's rule the error of v_y would be four times larger.
+    The solution is exact. In a filter that uses Euler's rule instead, the error of v_y is four
+    times as large.
     """
     angle = yaw_rate * step
     cos = math.cos(angle)

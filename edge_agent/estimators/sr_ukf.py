@@ -1,15 +1,16 @@
 """Estimator `sr-ukf`: the square-root unscented filter of paper 003 for the friction of four
 wheels.
 
-"Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for
-distributed drive vehicles (paper 003; the equations are lost in the text copy, so its sections are
-cited). Seven degrees of freedom with Dugoff tyres (section 2), unscented points, time and
-measurement update (3.1), posterior factor by downdates (3.2).
+Paper 003 is "Road adhesion coefficient estimation method for distributed drive electric vehicles
+based on SR-UKF". The equations are lost in the text copy, so the paper's sections are cited. Its
+vehicle model has seven degrees of freedom and Dugoff tyres (section 2). Section 3.1 defines the
+unscented points, and the time and measurement updates. Section 3.2 computes the factor of the
+posterior covariance by downdates.
 
-State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four rotational degrees of freedom of the
-wheels are torque balances, used as measurements: F_x = (T - J*omega')/R. With these measurements
-the friction of each driven wheel is observable. With the paper's a_x, a_y, r alone, at most two of
-the four frictions are observable (errata).
+The state is [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four rotational degrees of freedom of
+the wheels are torque balances, used as measurements: F_x = (T - J*omega')/R. With these
+measurements the friction of each driven wheel is observable. With the paper's a_x, a_y, r alone, at
+most two of the four frictions are observable.
 
 `literal.wheel_friction_ukf` is the filter as printed, with four states and given motion. The filter
 in this module is for a car, in which v_x and v_y are unknown. Therefore they are states, a_x and

@@ -383,7 +383,9 @@ def _build_rows(
 
 def _row_rate(dense: Mapping[str, Series]) -> float:
     """Return the number of rows (samples) per second [Hz] for the merged log: the rate of the
-    fastest channel in `dense`, rounded up to a usual rate.
+    fastest channel in `dense`, rounded up to a value in RATES.
+
+    `dense` contains all channels except those with few readings, such as positions (SPARSE).
     """
     fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])

@@ -349,9 +349,10 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update the grip that the accelerometers show in a visit (passage of a map cell), `dt` [s]
-    after the previous sample. Without accelerometer readings this grip stays infinite in a new
-    visit, so that it does not limit the grip used.
+    """Update `visit.felt`, the upper limit of the grip used in a visit (passage of a map cell)
+    according to the accelerometers. `dt` [s] is the time since the previous sample.
+
+    The limit is infinite (no limit) in a new visit until the first accelerometer reading.
     """
     if np.isfinite(sample.ax + sample.ay):
         share = 1.0 - np.exp(-dt / FELT_S)

@@ -110,9 +110,11 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def expire_batches(self, now: float) -> Iterator[int]:
-        """Queue the batches that were not answered before `now` [s], so that they are sent again. A
-        batch that the service seems to ignore (`HeldBatches.is_passed_over`) is not queued. Its key
-        is yielded, and the caller must remove it before it continues.
+        """Queue the batches that were not answered before `now` [s], so that they are sent again.
+
+        A batch that the service seems to ignore (`HeldBatches.is_passed_over`) is not queued. Its
+        key is yielded, and the caller must remove this batch from the outbox before requesting the
+        next key.
         """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)

@@ -87,12 +87,13 @@ class Settlement:
         return self._log.hangs_s
 
     def until_early_s(self, now_s: float) -> float:
-        """Return the time [s] until the waiting rows may be written to disk before the regular
-        period (setting `segment_s`) ends. The earlier they are durable, the earlier their senders
-        receive an acknowledgement. At most WRITE_SHARE of the time is spent on writing.
+        """Return the time [s] until the waiting rows may be written to disk early, that is, before
+        the regular period (setting `segment_s`) ends. Early writing shortens the time until the
+        senders receive an acknowledgement.
 
-        The result is infinite if no rows wait, if a write is running, or if the last write failed.
-        `now_s` is the monotonic time [s].
+        At most the share WRITE_SHARE of the time is spent on writing, so a slow write delays the
+        next early write. The result is infinite if no rows wait, if a write is running, or if the
+        last write failed. `now_s` is the monotonic time [s].
         """
         if self.failing or not self._log.can_begin:
             return math.inf

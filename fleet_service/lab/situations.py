@@ -1,7 +1,8 @@
-"""Evaluation of short situations in which the map could become wrong: many reports that are only
-lower bounds of friction, an outage of the network, careful drivers on ice, and a wet curve.
+"""Evaluation of the map in short simulated situations in which it could become wrong. The
+situations are reports that are only lower bounds of friction, an outage of the network, careful
+drivers on ice, and a wet curve.
 
-The true friction is known by construction. Pure (no I/O).
+The true friction is known, because it is simulated. The module does no I/O.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ VALUED: Final = 0.3
 
 def bound_excess(used: float, path: str) -> float:
     """Return by how much the map overestimates the certain grip of a cell after BOUNDED vehicles
-    drove through it. Each vehicle used the grip `used` and did not measure the friction. The result
-    is the lower end of the map's interval of friction, minus the larger of `used` and the lower end
-    of the prior's interval.
+    drove through it. Each vehicle used the grip `used` and did not measure the friction.
+
+    The true certain grip is the larger of `used` and the lower end of the prior's friction
+    interval. The map's certain grip is the lower end of its friction interval.
 
     `path` consists of the encoding ("protobuf" or "json") and the content of the reports.
     "posterior" means a median with an interval; "likelihood" means log-likelihoods on the friction

@@ -23,9 +23,11 @@ STIFFNESSES: Final = {"similarity": 0.0, "proportional-to-friction": 1.0}
 
 
 class TyreOption(NamedTuple):
-    """Tyre model that a paper's filter assumes: how slip stiffness depends on friction
-    (`stiffness`), its decrease with the load (`quadratic`), and a factor for the rear axle
-    (`rear_slope`).
+    """Tyre model that a paper's filter assumes.
+
+    `stiffness` selects if slip stiffness depends on friction. `quadratic` is the decrease of
+    stiffness per load with the wheel load. `rear_slope` is the ratio of rear to front cornering
+    stiffness per load.
     """
 
     stiffness: str = "similarity"  # a key of STIFFNESSES

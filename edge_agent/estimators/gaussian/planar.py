@@ -1,10 +1,17 @@
-"""Process model with three degrees of freedom (v_x, v_y, yaw rate) that the papers share,
-integrated by Heun's rule.
+"""Process model of the papers' planar motion filters, with three degrees of freedom (v_x, v_y, yaw
+rate r). The model is integrated by Heun's rule.
 
-State [v_x, v_y, a_x, a_y, r, z]. Papers 000 (1) to (14), 001, 004 (1) to (12): v_x' = a_x + r*v_y,
-v_y' = a_y - r*v_x (004 prints the wrong sign), I_z*r' = moment of the tyres' forces; a_x and a_y
-follow from the forces. z is friction (004) or the yaw acceleration (000, 001). The papers use the
-yaw moment as state. Here it is divided by I_z, so that all states are of similar magnitude.
+It is the model of paper 000 (equations 1 to 14), of paper 001, and of paper 004 (equations 1 to
+12). The state is [v_x, v_y, a_x, a_y, r, z]. The accelerations a_x and a_y follow from the tyre
+forces.
+
+    v_x'    = a_x + r*v_y
+    v_y'    = a_y - r*v_x    (paper 004 prints the wrong sign)
+    I_z*r'  = yaw moment of the tyre forces
+
+The last state z is the friction in paper 004, and the yaw acceleration in papers 000 and 001. These
+two papers use the yaw moment as state. Here the moment is divided by I_z, so that all states are of
+similar magnitude.
 """
 
 from __future__ import annotations
@@ -181,16 +188,17 @@ def _apply_heun_step(
 
 @inlined
 def _with_friction(wheels: WheelInputs, mu: Four) -> WheelInputs:
-    """Return the inputs of the wheels (steering, speed, force) with their friction replaced by
-    `mu`.
+    """Return a copy of the wheel inputs `wheels` (steering, speed, force, friction) in which `mu`
+    replaces the friction.
     """
     return WheelInputs(wheels.cos, wheels.sin, wheels.omega, wheels.force_x, mu)
 
 
 @inlined
 def _interpolate_inputs(track: InputTrack, share: float, force_x: Four, mu: Four) -> WheelInputs:
-    """Return the inputs of the wheels (steering, speed, force, friction) interpolated between the
-    previous sample (`share` 0) and the current sample (`share` 1).
+    """Return the wheel inputs at a time between the previous sample (`share` 0) and the current
+    sample (`share` 1). Steering angles and wheel speeds are interpolated. The longitudinal forces
+    `force_x` and the friction `mu` are copied.
     """
     before = track.inputs_before
     use = track.inputs

@@ -8,9 +8,12 @@ Legend
     P_f, Q      covariance and process noise of the master
     beta_i      information share of sub-filter i; its P_i = P_f/beta_i, Q_i = Q/beta_i (15) to (20)
 
-The information shares follow from (54), which gives more information to the worse sub-filter. Both
-shares start at one half, because the printed start at zero divides by zero. Equation (52) uses P_f,
-not its inverse. The cubature points use singular values (40), (41).
+The information shares follow from (54), which gives more information to the worse sub-filter. The
+cubature points use singular values (40), (41).
+
+The code differs from the paper in two points. Both information shares start at one half, because
+the printed start value of zero would cause a division by zero. In (52), the code uses P_f where the
+paper prints the inverse of P_f.
 """
 
 from __future__ import annotations

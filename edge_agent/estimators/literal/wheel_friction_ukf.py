@@ -1,23 +1,27 @@
-"""The friction filter of paper 003 as printed, and the filter (UKF) with which the paper compares
-it.
+"""The friction filter of paper 003 as printed, and the unscented Kalman filter (UKF) with which the
+paper compares it.
 
-The filter has four states, given motion and unscented points. State mu_fl, mu_fr, mu_rl, mu_rr, a
-random walk. Measurement [a_x, a_y, r] (section 3.1). The code uses the change of the yaw rate r
-over one sample. Therefore the third measurement is the yaw acceleration r' [rad/s^2]. With
-`torque_rows`, the measurement also has the longitudinal force F_x of each wheel from its torque
-balance. Without these rows, only two of the four frictions are observable on a straight road.
+The four states are the frictions mu_fl, mu_fr, mu_rl, mu_rr of the wheels, a random walk. The
+vehicle's motion is given. Both filters represent the state by unscented points. The measurement is
+[a_x, a_y, r] (section 3.1). The code uses the change of the yaw rate r over one sample. Therefore
+the third measurement is the yaw acceleration r' [rad/s^2]. With `torque_rows`, the measurement also
+has the longitudinal force F_x of each wheel from its torque balance. Without these rows, only two
+of the four frictions are observable on a straight road.
 
 Legend: X_i, Z_i points of state and measurement, side weight w = 1/(2*alpha^2*n), e_i = Z_i - Z_0,
 d = sum of w*e_i.
 
-Square-root form (section 3.2): roots by singular values. With the printed alpha = .001 the central
-point has a weight of -10^6, which has no real root. However, sum(W_i*(Z_i - z)*(Z_i - z)') =
-sum(w*e_i*e_i') + (beta - alpha^2)*d*d' exactly, and in the right-hand form all weights are
-positive. That form is used here, in both precisions.
+Square-root form (section 3.2): The square roots of covariances are computed by singular values.
+With the printed alpha = .001 the central point has a weight of -10^6, which has no real root.
+However, the following equation is exact, and all weights on its right side are positive:
 
-Covariance form (section 3.1, "UKF", for comparison): the textbook sums with weights of 10^6, in
-which digits cancel. In single precision the covariance then has no Cholesky factor at some steps,
-and the last valid factor is used instead.
+    sum(W_i*(Z_i - z)*(Z_i - z)') = sum(w*e_i*e_i') + (beta - alpha^2)*d*d'
+
+The code uses the right side, in single and in double precision.
+
+Covariance form (section 3.1; "UKF" in the paper's comparison): The filter computes the sums as in
+textbooks. Digits cancel in these sums, because the weights are about 10^6. In single precision the
+covariance then has no Cholesky factor at some steps. The filter then uses the last valid factor.
 """
 
 from __future__ import annotations

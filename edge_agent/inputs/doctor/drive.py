@@ -200,13 +200,17 @@ def prepare_drive(
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
     """Return a mask (n,) that is True where a wheel spins or locks. The function compares the wheel
-    speeds (n, 4) with each other, so their unit does not matter. `fast` is a high speed of the car
-    in this drive, in the same unit.
+    speeds with each other, so their unit does not matter.
 
     The front and rear wheel of a side roll nearly alike, in turns too. A constant difference
     between them is attributed to different tyres. A wheel that differs all the time is not
     compared, because the complete drive would then count as slip. Such a wheel is reported as a
     separate fault.
+
+    Args:
+        wheels: wheel speeds (n, 4), in any unit.
+        fast: 95 % quantile of the car's speed in this drive, in the same unit. A car slower than
+            the share CREEP of this speed counts as standing.
     """
     speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
@@ -229,9 +233,13 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
 
 def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
     """Return a mask (n,) that is True where all wheels spin or lock together. There the ratio of
-    the wheels' speed `v` (n,) to the speed over ground `v_ground` (n,) differs from its usual value
-    in this drive. Only this difference counts, so the unit of `v` does not matter. `fast` is a high
-    speed of the car in this drive, in the unit of `v`.
+    the speed over ground to the wheels' speed differs from its usual value in this drive.
+
+    Args:
+        v: speed of the wheels (n,), in any unit, because only changes of the ratio count.
+        v_ground: speed over ground (n,).
+        fast: 95 % quantile of the car's speed in this drive, in the unit of `v`. Samples below 0.3
+            times this speed are not compared.
     """
     known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
     if known.sum() < 5 * RATE_HZ:

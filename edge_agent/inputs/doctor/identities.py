@@ -88,10 +88,10 @@ class Relation(NamedTuple):
         left: left side.
         right: right side.
         per: factor (n,) by which the offset is multiplied; None means 1.
-        bend: squared speed over the square of a high speed of the drive (n,), for the understeer of
-            the car. The right side is then right · (1 + s · bend). The share s is unknown and has a
-            prior, because at a single speed understeer cannot be separated from a steering gain.
-            None means no understeer.
+        bend: squared speed, divided by the square of the 95 % quantile of the drive's speed (n,),
+            for the understeer of the car. The right side is then right · (1 + s · bend). The share
+            s is unknown and has a prior, because at a single speed understeer cannot be separated
+            from a steering gain. None means no understeer.
         loose: prior standard deviations of the gains k of the last further terms. These gains need
             a prior, because they are hard to separate from the main gain.
         length: wheelbase [m] if the right side contains it, else 1.
@@ -268,8 +268,9 @@ def _bend_of(
     s, and the standard deviation of ln gain that follows from the uncertainty of s.
 
     x and y (n,) are the right and left side of the steering identity (steering angle against yaw
-    rate). `bend` (n,) is the squared speed, relative to a high speed of the drive. At that high
-    speed, understeer needs the share s of the steering angle that a car without understeer needs.
+    rate). `bend` (n,) is the squared speed, divided by the square of the 95 % quantile of the
+    drive's speed. At that quantile, a car with understeer needs 1 + s times the steering angle of a
+    car without understeer.
 
     s is the posterior mean over the candidate values BENDS. The prior is the distribution over
     usual cars. The likelihood follows from the size of the residuals, which count as `count`

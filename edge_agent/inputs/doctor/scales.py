@@ -185,8 +185,11 @@ class Verdict:
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
-    """Return the cheapest set of faults (wrong units and signs) that explains the gains of the
-    fitted identities `found` (pairs of expressions that are equal by physics).
+    """Return the most plausible set of faults (wrong units and signs) that explains the fitted
+    identities `found` (pairs of expressions that are equal by physics).
+
+    This set has the lowest cost. Each fault adds a fixed cost, because faults are rare. Each
+    identity adds the squared normalised error that remains in its gain (ratio of its two sides).
     """
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}

@@ -61,12 +61,15 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
 
 def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
     """Return True if a wheel disagrees with the other three wheels most of the time while those
-    agree with each other. `rest` (n, 3) are the speeds of the other wheels, `others` (n,) their
-    common speed, and `off` (n,) is True where the wheel differs from it. `fast` is a high speed of
-    the car in this drive.
+    agree with each other. No wheel spins for that long, so the caller reports that the signal is
+    not the speed of this wheel.
 
-    No wheel spins for that long, so the caller reports that the signal is not the speed of this
-    wheel.
+    Args:
+        rest: speeds of the other wheels (n, 3), in any unit.
+        others: common speed of the other wheels (n,), in the same unit.
+        off: True where the wheel differs from `others` (n,).
+        fast: 95 % quantile of the car's speed in this drive, in the same unit. Samples below 0.3
+            times this speed are not used.
     """
     agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
     moves = np.abs(others) > 0.3 * fast

@@ -44,7 +44,7 @@ class Decoder:
         }
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals that received CAN frames contain, by name. Each element of `heard` is
+        """Return the signals decoded from received CAN frames, by name. Each element of `heard` is
         a frame (time, (identifier, extended, data)).
         """
         log: Log = {}

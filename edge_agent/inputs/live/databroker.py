@@ -88,7 +88,7 @@ class DatabrokerFeed(Feed):
         super().close()
 
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the values that received updates of the databroker contain, by signal path."""
+        """Return the values from the databroker's updates `heard`, by signal path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
         for time, (path, value) in heard:

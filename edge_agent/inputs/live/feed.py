@@ -120,9 +120,7 @@ class Feed(ABC):
 
     @abstractmethod
     def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals (times and values), by name, that the received messages `heard`
-        contain.
-        """
+        """Return the signals (times and values) from the received messages `heard`, by name."""
 
     def start(self) -> None:
         """Start the thread that listens to the live source."""
@@ -157,7 +155,9 @@ class Feed(ABC):
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
-        """Count a message of the live source that cannot be read, and log a new reason."""
+        """Count a message of the live source that cannot be read. Log `reason` (a description of
+        the error), unless the same reason was logged before.
+        """
         self.broken += 1
         self.say(reason)
 

@@ -324,9 +324,12 @@ def _judge_contradictions(
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
     """Count false reports of slippery road by car n, at least SETTLED_S [s] after snow and ice, and
-    add the counts to the tally (sums of the evaluation). Count the reports of the estimator and of
-    the slip flag (ordinary ABS logic) separately, and both also for each threshold of the ROC
-    curve.
+    add the counts to the tally (sums of the evaluation).
+
+    The reports of the estimator and of the slip flag (ordinary ABS logic) are counted separately.
+    For the ROC curve, they are counted again with other limits. For the estimator, these are limits
+    of its evidence for a slippery road (ROC_NATS). For the flag, they are limits of the reported
+    friction (ROC_FLAG_MU).
     """
     grips = drive.mu[:, n] > SNOW_MU
     settled = grips & ~recent_maximum(~grips[:, None], SETTLED_S)[:, 0].astype(bool)

@@ -45,22 +45,26 @@ class DetectionBar(NamedTuple):
 
 
 def mean_of(name: str) -> Callable[[DetectionTally], float]:
-    """Return a function that takes a tally (sums and counts of the evaluation) and returns the mean
-    of the values stored under `name`.
+    """Return a function that computes a mean from a tally (sums and counts of the evaluation): the
+    mean of the values stored under `name`.
     """
     return lambda tally: tally.mean(name)
 
 
 def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
-    """Return a function that takes a tally (sums and counts of the evaluation) and returns the
-    quantile `share` of the detection times [s] stored under `name`.
+    """Return a function that computes a quantile of detection times [s] from a tally (sums, counts
+    and detection times of the evaluation). `name` selects the times, and `share` (0 to 1) the
+    quantile.
     """
     return lambda tally: tally.quantile(name, share)
 
 
 def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
-    """Return a function that takes a tally (sums of the evaluation by name) and returns 1000 *
-    `over` / `under`, each the sum of the measure with that name.
+    """Return a function that computes a rate from a tally (sums of the evaluation by name): 1000
+    times the sum named `over`, divided by the sum named `under`.
+
+    If `under` is a distance [km] or a time [s], the unit of the rate is "per 1000 km" or "per 1000
+    s".
     """
     return lambda tally: 1e3 * tally.rate(over, under)
 

@@ -1,5 +1,8 @@
-"""Plots of the evaluation, as in the papers, of the drive with the first seed: estimated and true
-motion, friction with its interval, adaptation, fuzzy sets.
+"""Plots of the evaluation, similar to those in the papers.
+
+Each scenario has a plot of the drive with the first seed: estimated and true motion, friction with
+its 90 % interval, and the adapted factor on the measurement noise R. Further plots show results
+over all drives, and the fuzzy sets.
 """
 
 from __future__ import annotations

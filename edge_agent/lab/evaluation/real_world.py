@@ -115,8 +115,8 @@ def in_winter(seed: int) -> bool:
 
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
     """Simulate cars with large sensor errors (as in real cars) in a town drawn by the seed. Return
-    their drives, and an array (T, N) with the share of its grip that the most heavily used wheel of
-    each car uses.
+    their drives, and the utilisation of each car's most heavily used wheel, (T, N). Utilisation is
+    the tyre force divided by the largest possible tyre force.
 
     In winter towns all cars have winter equipment.
     """

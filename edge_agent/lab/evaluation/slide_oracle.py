@@ -1,8 +1,10 @@
-"""Oracle for visits (passages of a map cell): the evidence of an ideal observer that knows the
-motion and the force of every tyre, except for noise.
+"""Oracle for visits (passages of a map cell): an ideal observer that measures the slip and the
+force of every tyre. From these measurements the oracle computes the likelihood L of each
+friction μ.
 
-The oracle does not know the stiffness of the tyre and the shape of its force curve. Because it
-knows more than any estimator, its evidence is an upper limit of the information in a visit.
+The measurements contain noise, and the oracle does not know the stiffness of the tyre and the shape
+of its force curve. However, the oracle knows more than any estimator. Therefore its likelihood is
+an upper limit of the information on friction in a visit.
 
     f = μ F(k q / μ; c, e)     force curve of a tyre: Magic Formula F with shape c and curvature e
     f        force over load |F| / F_z of a wheel, known with noise of standard deviation FORCE_STD
@@ -16,10 +18,10 @@ knows more than any estimator, its evidence is an upper limit of the information
     L(μ) = mean over random tyres of Π over wheels and samples
            N(f; μ F(k q/μ), FORCE_STD² + (slope · σ_q)²) · p(q)
 
-For p(q), every force that a driver may demand is assumed equally likely. A uniform density of f
-means that the density of q is proportional to df/dq. Therefore p(q) is the slope of the force
-curve, at least LEAST_SLOPE. Only every EACH-th sample is used, because the errors of successive
-samples are correlated.
+The oracle assumes that all tyre forces are equally likely. A uniform density of f means that the
+density of q is proportional to df/dq. Therefore p(q) is the slope of the force curve, at least
+LEAST_SLOPE. Only every EACH-th sample is used, because the errors of successive samples are
+correlated.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ FLAGGED_MU: Final = 0.35  # a lower flagged friction reports the road as slipper
 
 
 def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:
-    """Return the friction that ABS-like logic reports from slip and yaw rate (slip flag), (T, N);
-    infinite where no flag is set.
+    """Return the friction (T, N) that ordinary ABS and ESC logic would report from wheel slip and
+    yaw rate; infinite where no flag is set.
 
     Args:
         t: (T, N) [s].
@@ -79,8 +79,12 @@ def _median(values: FloatArray, count: int) -> float:
 
 @compiled
 def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
-    """Return the friction (T,) that the slip flag and the yaw flag of one car report; infinite
-    where no flag is set.
+    """Return the friction (T,) that ordinary ABS and ESC logic would report for one car; infinite
+    where neither the slip flag nor the yaw flag is set.
+
+    The slip flag is set while a wheel's speed differs much from the car's speed. The yaw flag is
+    set while the yaw rate differs much from that expected from steering. While a flag is set, the
+    friction is the car's measured acceleration divided by gravity.
 
     Args:
         signals: sensor readings (T, channels).

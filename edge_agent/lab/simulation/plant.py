@@ -23,6 +23,8 @@ accelerations with a lag, the body rolls, and there are air drag and rolling res
     θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s    slip (longitudinal, lateral), K its stiffness
     K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0  static load, ε degression of the stiffness
                                                  κ    stiffness over load at the static load [1]
+                                                 θ    slip normalised by stiffness and grip
+                                                 f    tyre curve: used share of the grip μ F_z
 
     g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to
                                                            the left
@@ -37,7 +39,8 @@ option of the vehicle, K grows with μ.
 
 A vehicle may have tyres with a relaxation length (RELAXATION: four fifths of the slip build up over
 that length), and controllers that work in cycles and report their activity (ABS_HZ:
-`controllers.py`). Without controllers, slip is limited smoothly.
+`controllers.py`). Without controllers, the drive or brake torque of a wheel decreases smoothly
+where its slip exceeds a limit.
 
 Integration: explicit Euler for the body, and linearly implicit Euler for the wheels, because their
 slip is stiff. The denominator of a wheel's step contains the secant slope of the tyre, so the step

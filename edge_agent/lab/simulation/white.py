@@ -18,7 +18,9 @@ SCHEDULE_S: Final = 2.0  # [s] duration of each variance; the period is six seco
 
 
 def scheduled_variance(t: FloatArray) -> FloatArray:
-    """Return the noise variance at the times t (T,) [s] according to the paper's table 2."""
+    """Return the variance of the measurement noise at the times t (T,) [s], according to table 2 of
+    paper 004. Its unit is the square of the signal's SI unit.
+    """
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
 

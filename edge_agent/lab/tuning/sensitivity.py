@@ -59,9 +59,13 @@ class JudgedDrives(NamedTuple):
 
 
 class FilterMeasures(NamedTuple):
-    """Measures of one filter on all drives: mean interval score of friction (`score`), share of the
-    samples with high friction that the filter calls slippery (`false_ice`), and share of the
-    samples on slippery road that it calls slippery (`found`).
+    """Measures of one filter on all drives.
+
+    Attributes:
+        score: mean interval score of friction.
+        false_ice: share of the samples with high friction that the filter calls slippery.
+        found: share of the samples on slippery road, with a wheel that uses much of its grip, that
+            the filter calls slippery.
     """
 
     score: float
@@ -108,8 +112,9 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
     """Run the default filter with the parameter tables `design` on all drives, and return its
     measures.
 
-    Only towns count for the measure `found`, because the simulated manoeuvres do not record the
-    grip in use.
+    The measure `found` only counts samples on slippery road in which a wheel uses much of its grip.
+    Only drives in the simulated towns record the grip in use. Therefore the simulated manoeuvres do
+    not count for `found`.
     """
     scores = []
     cried = grippy = warned = slippery = 0

@@ -55,9 +55,13 @@ BANDS: Final = (
 
 
 def expression(t: Table) -> Table:
-    """Return counts of value pairs by class, day and bin of elapsed time: number of `pairs`, number
-    of `unlike` pairs (one value slippery, the other not), number of `slippery` values in them, and
-    sum of elapsed `seconds`.
+    """Return counts of value pairs by temperature band, part of the day (`hours`), day, and bin of
+    elapsed time (`octave`). A pair consists of two successive friction values of one map cell and
+    heading sector, from different vehicles.
+
+    The counts are the number of `pairs`, the number of `unlike` pairs (one value slippery, the
+    other not), and the number of `slippery` values in all pairs. `seconds` is the sum of the times
+    between the two values.
 
     Args:
         t: observations with `temperature` of the air [°C], null if unknown.

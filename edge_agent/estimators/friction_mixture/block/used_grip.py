@@ -1,12 +1,13 @@
 """Reported grip in use: the larger force over load of the two axles, smoothed over SMOOTH_S.
 
 The reported value is the largest one of the last second. The force is smoothed first, because the
-largest of twenty noisy values would show the sensor noise more than the tyre forces. The value that
-weights the evidence on friction is not smoothed.
+largest of twenty noisy values would show the sensor noise more than the tyre forces. The filter
+also weights its evidence on friction by the force over load; for this purpose the force is not
+smoothed.
 
-Where torque is missing, the brakes are assumed to load both axles in proportion to their load. This
-is how ABS and brake-force distribution act near the limit. With a fixed share instead, the force of
-an unloaded rear axle would exceed the grip of any tyre.
+Where torque is missing while the car brakes, both axles are assumed to have the same brake force
+per load. ABS and brake-force distribution have this effect near the limit. With a fixed share
+instead, the force of an unloaded rear axle would exceed the grip of any tyre.
 """
 
 from __future__ import annotations

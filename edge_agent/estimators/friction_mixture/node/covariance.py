@@ -37,8 +37,12 @@ def symmetric_at(covariance: FloatArray, i: int, j: int) -> float:
 
 @compiled
 def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
-    """Compute the first columns of the lower-triangular factors of the covariances, and write them
-    to `root` (n, CURVED, LANES). A pivot (squared diagonal element) is at least LEAST_VARIANCE.
+    """Compute the first CURVED columns of the lower-triangular (Cholesky) factors of the state
+    covariances, one factor per node (friction hypothesis). Write them to `root` (n, CURVED, LANES),
+    with n states and LANES nodes.
+
+    The measurements are nonlinear only in the first CURVED states. A pivot (squared diagonal
+    element) is at least LEAST_VARIANCE.
     """
     for j in range(CURVED):
         total = lanes_at(covariance, (j, j))

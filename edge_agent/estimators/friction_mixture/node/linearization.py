@@ -216,12 +216,12 @@ def weigh_slopes(
 
 @inlined
 def slope_along(slope: float, ratio: float, square: float, whole: float) -> float:
-    """Return the slope [1] of the tyre curve in one direction (longitudinal or lateral): derivative
-    of the force over load in this direction by the slip in the same direction.
+    """Return the slope [1] of the tyre curve in one direction (longitudinal or lateral): the
+    derivative of force over load by slip, both in this direction.
 
-    Slip is multiplied by the stiffness at small slip, so that slip and force of a linear tyre
-    (constant stiffness) are equal. Therefore the slope is 1 at small slip. It decreases towards the
-    flat part of the curve, and is limited to at least FLATTEST.
+    Slip is stated as the force over load that a linear tyre (constant stiffness) would have.
+    Therefore the slope is 1 at small slip and decreases towards the flat part of the curve. The
+    result is at least FLATTEST.
 
     Args:
         slope: slope of the tyre curve at the total slip [1].
@@ -235,14 +235,14 @@ def slope_along(slope: float, ratio: float, square: float, whole: float) -> floa
 
 @inlined
 def slip_noise_correction(slope: float) -> float:
-    """Return the amount by which the noise variance of a residual must be reduced where the tyre
-    curve has the slope `slope`. It is given as a share of the slip noise variance.
+    """Return the share of the slip noise variance that the caller must subtract from the noise
+    variance of a residual. `slope` is the slope k of the tyre curve.
 
-    A residual is the distance normal to the curve. At slope k, the share k^2/(1 + k^2) of the slip
-    noise enters it (errors in variables). features.noise_std contains one half, the share at slope
-    1, so the result is one half minus the actual share.
+    A residual is the distance of a measurement from the tyre curve, normal to the curve. Therefore
+    the share k^2/(1 + k^2) of the slip noise variance enters the residual (errors in variables).
+    `features.noise_std` assumes k = 1, where the share is 1/2. The result is 1/2 - k^2/(1 + k^2).
 
-    Without the correction, the noise would be too large on the flat part of the curve. This would
-    favour nodes (friction hypotheses) by which the wheels slide.
+    Without the correction, the noise would be too large on the flat part of the curve. The filter
+    would then prefer nodes (friction hypotheses) in which the wheels slide.
     """
     return 0.5 - slope * slope * inverse_of(1.0 + slope * slope)

@@ -381,10 +381,12 @@ def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
 
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
-    """Limit the vehicle and sensor states in `mean` (n, LANES) to their possible range.
+    """Limit the vehicle and sensor states in `mean` (n, LANES) to a range around their prior. The
+    range is `constants.farthest` standard deviations on each side.
 
-    Only the ratios of the wheel radii are observable. A common error of all radii scales the speed,
-    and no sensor here measures that scale. Therefore the mean of the radius errors is set to zero.
+    The function also subtracts the mean of the four wheels' radius errors from each of them. Only
+    the ratios of the radii are observable: a common error scales the speed, and no sensor here
+    measures that scale.
     """
     far = constants.farthest
     common = 0.0

@@ -118,11 +118,12 @@ def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
 
 @compiled
 def find_readings(features: BlockFeatures, node: NodeWorkspace) -> None:
-    """Compute the wheel speeds (node.rolling) and the offset of the steering angle (node.steering).
-    They are corrected by the filter states in node.point, such as wheel radii and time lags.
+    """Compute the corrected wheel speeds (node.rolling) and the correction of the steering angle
+    (node.steering). The corrections follow from the filter states in node.point, such as errors of
+    the wheel radii and delays of the sensors.
 
-    The offset of the steering includes the compliance of the front axle: steering column and
-    bushings of production cars yield up to 35 mrad per g of lateral acceleration.
+    The steering correction includes the compliance of the front axle. Steering column and bushings
+    of production cars yield up to 35 mrad per g of lateral acceleration.
     """
     x = node.point
     late = lanes_at(x, NodeState.LAG_WHEEL) * features.change

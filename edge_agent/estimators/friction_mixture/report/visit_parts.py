@@ -52,8 +52,10 @@ def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray)
     part.
 
     If friction has jumped, write the log-likelihood of the part that ends to `evidence` (32,), at
-    the friction values CENTRES. If not, keep the current node probabilities if they contain more
-    information on friction than those kept before.
+    the friction values CENTRES. This log-likelihood comes from the belief (probabilities of the
+    friction hypotheses) in `memory.surest`. Without a jump, the current belief replaces the belief
+    in `memory.surest` if both are compatible and the current belief contains more information on
+    friction.
     """
     if memory.split:
         return

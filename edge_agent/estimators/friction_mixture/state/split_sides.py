@@ -123,10 +123,11 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 
 @compiled
 def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """Compute `out` (K,), the probabilities of K friction values, from the probabilities `w` of all
-    nodes (friction hypotheses). The result is the probability of each node with one friction, plus
-    a part of those of the split nodes (different friction left and right).
+    """Compute `out` (K,), the probabilities of K friction values of the road, from the
+    probabilities `w` of all nodes (friction hypotheses).
 
+    The first K nodes assume one friction for the whole car, and `out` starts with their
+    probabilities. The other nodes are split nodes, which assume different friction left and right.
     `share` (SPLIT_NODES, K) distributes the probability of each split node over the K values.
     """
     chain = out.shape[0]

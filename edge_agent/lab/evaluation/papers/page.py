@@ -42,9 +42,12 @@ def cells(row: PaperRow) -> list[str]:
     """Return the cells of a table row of the report as text: the number that the paper prints, and
     four results of this project for comparison.
 
-    These are the result of the paper's filter on a simulated car that equals the filter's model,
-    and on the simulator's standard car. Two results with ordinary sensors and vehicle parameters
-    known to a few per cent follow: the paper's estimator, and the project's default estimator.
+    The four results are, in this order:
+
+    - the paper's filter on a simulated car that equals the filter's model
+    - the paper's filter on the simulator's standard car
+    - the paper's estimator with ordinary sensors and vehicle parameters known to a few per cent
+    - the project's default estimator on the same drives as the third result
     """
     shown = row.shown or number(row.printed)
     return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
