@@ -255,14 +255,20 @@ def kind_of(evidence: ByteArray) -> int:
 
 @refcount_free_inlined
 def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
-    """Fill `out` (32) with the likelihood L̃ of a visit (passage of a cell), scaled to mean 1,
-    after averaging over the vehicle's unknown bias. `evidence` (32) is the reported log-likelihood
-    in steps.
+    """Fill `out` (32) with the likelihood L̃ of the road's friction μ from one visit (passage of a
+    cell), scaled to mean 1. L̃ allows for the unknown bias of the vehicle's readings.
 
-    The average is taken only for the kind VALUE (a measurement of μ). A BOUND (only a lower bound
-    of μ) is made flat above its maximum, because a fall there is noise. It is not smoothed:
-    otherwise many bounds together could exceed the grip that any vehicle used. `padded` (PADDED) is
-    scratch memory; its first and last REACH numbers must be zero.
+    Args:
+        evidence: the reported log-likelihood (32,), as the distance below its maximum in steps of
+            1/16 nat.
+        kind: VALUE (a measurement of μ): the likelihood is averaged over the bias, which smooths
+            it. BOUND (only a lower bound of μ): the likelihood is not smoothed, but made flat above
+            its maximum.
+        padded: scratch memory (PADDED); its first and last REACH numbers must be zero.
+        out: array for the result.
+
+    A fall of a BOUND above its maximum is noise, so it is removed. Smoothed bounds would be wrong,
+    because many of them together could exceed the grip that any vehicle used.
     """
     if kind == VALUE:
         for j in range(_BINS):

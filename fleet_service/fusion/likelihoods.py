@@ -33,8 +33,12 @@ _USED_STEP: Final = 0.005
 
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
-    """Return the log-likelihood of each visit, (n, 32), in steps of 1/16 nat below its maximum, and
-    a description of the reported values.
+    """Return the likelihood of friction from each of n visits, and the friction values for the
+    comparison of vehicles.
+
+    The result has two arrays. `steps` (n, 32) is the log-likelihood, in steps of 1/16 nat below its
+    maximum. `reported` (n, 3) contains mean, standard deviation and P(slippery) of each reported
+    friction value; NaN if the visit gives only a lower bound.
 
     Args:
         columns: `log_likelihood` (n, 32); the sender's posterior as median `mu` and interval from

@@ -97,9 +97,14 @@ def next_cell(cell: int, heading: int) -> int:
 
 @refcount_free_inlined
 def _write_message(message: FloatArray, weight: float, road: FloatArray, prior: FloatArray) -> None:
-    """Write to `message` (32,) the factors m by which a slippery neighbour multiplies the belief
-    about a cell. `weight` is w, `road` (32,) the neighbour's belief n, and `prior` (32,) the belief
-    p₀ about an unmeasured road.
+    """Write to `message` (32,) the message m of a slippery neighbour: the factor for the
+    probability of each friction bin of the cell that receives it.
+
+    Args:
+        message: array for the result.
+        weight: weight w of the message, from 0 (no effect, all factors are 1) to 1.
+        road: belief n about the neighbour's road (32,).
+        prior: belief p₀ about an unmeasured road (32,).
     """
     for i in range(_BINS):
         message[i] = 1.0 - weight + weight * road[i] / prior[i]
@@ -112,8 +117,9 @@ class ReadRule(NamedTuple):
         kernels: table of kernels, (kernels, 32, 32). A kernel maps a belief about measured friction
             to a belief about the road; it adds the error that all reports in a cell share (see
             `shared`).
-        silence: SILENCE if messages from neighbouring cells are weakened when few visits to a cell
-            gave a friction value (factor q of the module); 0 if such visits have no effect.
+        silence: constant SILENCE in the factor q of the module. This factor weakens messages from
+            slippery neighbours if vehicles visited the cell but reported few friction values there.
+            0 switches the factor off.
     """
 
     kernels: Float32Array
@@ -319,10 +325,12 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
 
 @refcount_free_inlined
 def _silence_factor(cells: RecordArray, row: int, neighbour: int, silence: float) -> float:
-    """Return the factor q in (0, 1] by which the message (factors on a belief) of a slippery
-    neighbour is weakened. From the neighbour's recent friction values and both numbers of visits, a
-    number of values is expected for the cell in `row`. The factor is below 1 if the cell has fewer
-    values.
+    """Return the factor q in (0, 1] that weakens the message of a slippery neighbour if vehicles
+    visited the cell in `row` but reported fewer friction values than expected.
+
+    The expected number is the neighbour's number of recent values. If the cell has fewer visits
+    than the neighbour, the expected number is lower in the same ratio. The factor is 1 if the cell
+    has at least the expected number.
     """
     visits = float(cells[row].visits) / max(float(cells[neighbour].visits), 1.0)
     lacking = _recent_values(cells, neighbour) * min(visits, 1.0) - _recent_values(cells, row)

@@ -228,8 +228,12 @@ def kernel_of(cells: RecordArray, row: int) -> int:
 def read_road(
     kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray
 ) -> None:
-    """Compute the belief about the road, `road` (32), from the stored belief `p` (32), which is
-    about the friction that all vehicles of the fleet read there. The result sums to one.
+    """Compute the belief about a road's friction, `road` (32), from the stored belief `p` (32) of
+    the cell in row `row`.
+
+    The stored belief is about the friction that the vehicles measure, which contains the error that
+    they have in common. The belief about the road is wider, because it allows for this error. It
+    sums to one.
     """
     kernel = kernels[kernel_of(cells, row)]
     for i in range(mugrid.BINS):

@@ -160,9 +160,11 @@ def judge_flag(
 def _note_shape(
     peers: RecordArray, vehicle: int, used: float, difference: float, variance: float
 ) -> None:
-    """Record how the friction values of one vehicle in one cell depend on the grip that the vehicle
-    used. The function compares two visits. A constant relative error of the vehicle cancels in the
-    difference.
+    """Add one comparison of two visits to the sums from which `shape_of` estimates the slope. The
+    slope is the amount by which a friction value is too low per unit of unused grip.
+
+    Both visits are of one vehicle to one cell, so that a constant relative error of the vehicle
+    cancels in the difference of the two friction values.
 
     Args:
         peers: comparison records (`PeersRecord`), one row per vehicle.

@@ -341,8 +341,8 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
 @refcount_free_inlined
 def ice_evidence(entries: RecordArray, entry: int) -> float:
     """Return the evidence [nat] that one observation (row `entry`) gives for ice (μ < SLIPPERY)
-    against grip (μ ≥ SLIPPERY): the logarithm of the ratio of their largest likelihoods, at least
-    0.
+    against grip (μ ≥ SLIPPERY). It is the logarithm of the ratio of their largest likelihoods, at
+    least 0.
 
     The ratio allows for the tyre-curve error. A vehicle that uses less than the share SHARED_SHARE
     of the grip may report too low a value. If the vehicle used the grip u on a road of friction μ,
@@ -350,11 +350,13 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
     is the error per unit of unused grip that alerts assume for a fleet about which nothing has been
     learned (`shared.Shape.alarm`). SHARED_MOST is the largest relative standard deviation.
 
-    Let L(r) be the reported likelihood of a reading r, scaled to maximum 1. The likelihood of ice
-    is taken as 1. This is exact if the maximum of L is at ice; if it is at grip, the likelihood of
-    grip is also 1 and the result is 0. The likelihood of grip is the maximum of L(r)·exp(-½·((μ -
-    r)/d(μ))²) over all μ ≥ SLIPPERY and r ≤ μ. The result is minus the logarithm of the likelihood
-    of grip.
+    The function computes the largest likelihood of grip: the maximum of L(r)·exp(-½·((μ -
+    r)/d(μ))²) over all μ ≥ SLIPPERY and r ≤ μ. L(r) is the reported likelihood of a reading r,
+    scaled to maximum 1. The result is minus the logarithm of this number.
+
+    The likelihood of ice needs no computation. If the maximum of L is at ice, the likelihood of ice
+    is 1, so the result is exact. If the maximum is at grip, the likelihood of grip is 1 and the
+    result is 0.
     """
     evidence = entries[entry].evidence
     used = entries[entry].used / USED

@@ -127,8 +127,11 @@ def report_priors(reports: Reports) -> Float32Array:
 
 
 def weather_of(reports: Reports) -> Weather:
-    """Return the road time (time scaled by weather) of all regions in `reports`. If several reports
-    have the same region and time, the last one counts.
+    """Return the `Weather` of all regions in `reports`: for each report, the rates at which roads
+    age from its time on, and the prior belief about an unmeasured road.
+
+    After VALID_NS without a new report, the rates are 1 and the prior is uniform. If several
+    reports have the same region and time, the last one counts.
     """
     last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
     keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(
@@ -183,8 +186,12 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # bits from a slot'
 
 @refcount_free
 def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
-    """Return the road time (weather-scaled age) [s] of drift and of change that passes between two
-    times [ns], and the row whose prior applies at the end; row 0 if no report applies.
+    """Return three values for the slot `key` and the interval from `begin` to `end` [ns].
+
+    The first two are road times [s]: the length of the interval multiplied by a rate that depends
+    on the weather. The first uses the rate at which friction drifts, and the second uses the rate
+    at which roads change suddenly. The third value is the row of `weather.prior` that applies at
+    the end; it is 0 if no weather report applies.
     """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:

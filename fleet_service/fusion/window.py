@@ -102,9 +102,11 @@ def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Vote
     """Add the votes of a batch (effects of its observations on cells) to the lateness windows
     (recent observations, sorted by time) of their cells, and update the beliefs.
 
-    Every memory pool must have space for k votes. Return a mask of observations (n,) that were left
-    out, because `most` observations of their vehicle already wait in the same cell. If an
-    observation affects several cells, only the number that waits in its own cell counts.
+    Every memory pool must have as many free rows as the batch has votes.
+
+    Return a mask (n,) of the observations that were left out. An observation is left out if
+    `votes.most` observations of its vehicle already wait in the cell in which it was made. Its
+    votes for neighbouring cells are not limited.
     """
     n = len(arrivals.time)
     k = len(votes.row)

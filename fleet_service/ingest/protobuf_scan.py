@@ -1,11 +1,11 @@
 """Scanner that finds the fields in the bytes of many protobuf batches. It is compiled and creates
 no object per message.
 
-The protobuf library remains the reference. The scanner accepts only messages as our own encoder, or
-any plain encoder of the .proto file, writes them: each field once, columns packed, numbers in
-range, plain ASCII names, columns of equal length. It marks all other messages as not understood,
-and `batch_decoder` lets the library decode and encode them. Source: protobuf's encoding reference
-(tags, varints, packed fields).
+The protobuf library remains the reference. The scanner understands only messages in the usual form,
+which GripMap's encoder and ordinary protobuf encoders produce. In this form, each field occurs
+once, columns are packed and of equal length, numbers are in range, and names are plain ASCII. The
+scanner marks all other messages as not understood, and `batch_decoder` lets the library decode and
+encode them. Source: protobuf's encoding reference (tags, varints, packed fields).
 """
 
 from __future__ import annotations

@@ -64,12 +64,13 @@ RANGES: Final = {
 
 class Clock(NamedTuple):
     """Time of the service, and limits for the time of a record, all in ns. A record is accepted if
-    its time is at most `now` + `ahead` and at least `horizon`.
+    its time lies between `horizon` and `now` + `ahead`. The property `horizon` is `now` - `oldest`,
+    or earlier if the clock may be wrong.
 
     Attributes:
         now: time of the service.
         ahead: how much later than `now` the time of an accepted record may be.
-        oldest: largest age of an accepted record. Ages are counted from `now`, or from `least` if
+        oldest: largest age of an accepted record. Its age is counted from `now`, or from `least` if
             that is earlier.
         doubt: records that are later than `now` + `ahead`, by at most this much, are neither
             accepted nor refused; their senders repeat them.

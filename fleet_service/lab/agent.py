@@ -63,7 +63,8 @@ class ErrorModel(NamedTuple):
         stated: ratio of the standard deviation that a vehicle states to its true one.
         share: smallest and largest share of the grip that an excited visit uses (one that measures
             the friction).
-        low: how much too low a value of μ is, per share of the grip that was left unused.
+        low: relative error of values of μ that are too low because little grip was used. If the
+            share s of the grip is used, the value is too low by `low`·(1 - s)·μ.
         tyres: relative error common to all tyres of the fleet.
         half: relative error that every second vehicle has in addition.
         alike: share of the passes at a place in which the vehicle does the place's most frequent

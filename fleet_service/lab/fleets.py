@@ -42,10 +42,15 @@ class Fleet(NamedTuple):
     """Simulation of a fleet for `minutes` [min], in which the share `share` of the vehicles always
     reports the friction `claim`.
 
-    The service judges vehicles by their earlier reports. Coverage and error are therefore measured
-    from minute `begin` on, when every vehicle has about 200 visits (passages of cells), as many as
-    a car makes in a day. The rates of alerts are measured as soon as each vehicle has made EARLIER
-    visits, about two minutes after the start. The figures `…_settled` are measured from `begin` on.
+    The service judges vehicles by their earlier reports, so the results depend on the time at which
+    the evaluation begins:
+
+    - Coverage and error of the map are measured from minute `begin` on. Every vehicle then has
+      about 200 visits (passages of cells), as many as a car makes in a day.
+    - The rates of false and missed ice alerts are measured as soon as each vehicle has made EARLIER
+      visits, about two minutes after the start.
+    - The same rates are measured again from minute `begin` on. The names of these figures contain
+      `_settled`.
     """
 
     name: str

@@ -1,8 +1,7 @@
-"""Evaluation of the map in short simulated situations in which it could become wrong. The
-situations are reports that are only lower bounds of friction, an outage of the network, careful
-drivers on ice, and a wet curve.
+"""Evaluation of short situations in which the map could become wrong: many reports that are only
+lower bounds of friction, an outage of the network, careful drivers on ice, and a wet curve.
 
-The true friction is known, because it is simulated. The module does no I/O.
+The true friction is known by construction. Pure (no I/O).
 """
 
 from __future__ import annotations
@@ -43,11 +42,12 @@ VALUED: Final = 0.3
 
 
 def bound_excess(used: float, path: str) -> float:
-    """Return by how much the map overestimates the certain grip of a cell after BOUNDED vehicles
-    drove through it. Each vehicle used the grip `used` and did not measure the friction.
+    """Return by how much the map's lower limit of friction in a cell exceeds the reported lower
+    bound, after BOUNDED vehicles drove through the cell.
 
-    The true certain grip is the larger of `used` and the lower end of the prior's friction
-    interval. The map's certain grip is the lower end of its friction interval.
+    Each vehicle used the grip `used` and did not measure the friction. The result is the lower end
+    of the map's interval of friction, minus the larger of `used` and the lower end of the prior's
+    interval. A positive result means that the map promises too much grip.
 
     `path` consists of the encoding ("protobuf" or "json") and the content of the reports.
     "posterior" means a median with an interval; "likelihood" means log-likelihoods on the friction
@@ -111,10 +111,11 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest amount by which the map overestimates the certain grip of a cell after
-    reports that are only lower bounds (`bound_excess`). It is the maximum over all grips used in
-    USED, over both encodings (protobuf, JSON), and over both contents of the reports (posterior,
-    likelihood).
+    """Return the largest excess of the map's lower friction limit, as computed by `bound_excess`. A
+    positive result means that the map promises more grip than the vehicles used.
+
+    The result is the maximum over all combinations of the used grip (USED), the encoding (protobuf,
+    JSON), and the content of the reports (posterior, likelihood).
     """
     paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
     return max(bound_excess(used, path) for used in USED for path in paths)
@@ -122,11 +123,13 @@ def lower_excess() -> float:
 
 def backlog_fused(rng: Generator) -> float:
     """Return the share of late observations that still affect the map after an outage of the
-    network.
+    network. An observation is late if it arrives more than LATENESS_S after a newer one of any
+    vehicle.
 
-    In this situation, vehicles drive for an hour. One vehicle is connected all the time, so that
-    its observations make older ones of others late. BACKLOG other vehicles have no connection in
-    this hour, and their observations arrive together at its end.
+    In this situation, vehicles drive for an hour. BACKLOG vehicles have no connection in this hour,
+    and their observations arrive together at its end. One other vehicle is connected all the time.
+    The service has already received its newest observation when the others arrive, so that most of
+    them are late.
     """
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)

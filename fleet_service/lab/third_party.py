@@ -329,10 +329,11 @@ def measure_cold(seed: int) -> dict[str, float]:
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
-    """Simulate all drives of the other maker's fleets, and return the figures by name. Three cases
-    are measured: honest fleets with each size of gain error, a change of the road, and a service
-    that does not know the vehicles yet. `log_line` is called with a line about the progress after
-    each fleet.
+    """Run all simulations of this module, and return their figures by name.
+
+    There are three: honest fleets, with each size of gain error in GAINS; a road whose friction
+    changes; and a new service that has no earlier reports of the vehicles. `log_line` is called
+    with a line about the progress after the honest fleets of each gain error.
     """
     out: dict[str, float] = {}
     for name, gain_std in GAINS.items():

@@ -141,10 +141,16 @@ def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
 ) -> Visits:
     """Simulate the drives of a fleet through a town: each vehicle passes a whole road every minute
-    on average, at random times.
+    on average, at random times. Return the visits (passages of cells).
 
-    If `acquainted` is not 0, only the first half of the roads is driven until this minute, and only
-    the other half afterwards. Then the service knows the vehicles, but not the roads.
+    Args:
+        rng: random generator.
+        town: the town.
+        errors: errors of the vehicles; their number is the size of the fleet.
+        minutes: length of the simulation [min].
+        acquainted: minute at which the fleet changes to other roads. Before it, vehicles drive only
+            on the first half of the roads; afterwards, only on the other half. The service then
+            knows the vehicles, but not the roads. If it is 0, all roads are used all the time.
     """
     vehicles = len(errors.slope)
     model = errors.model

@@ -16,11 +16,14 @@ from schemas.errors import InputError
 
 
 def read_overlay(path: Path | None) -> dict[str, list[Any]] | None:
-    """Return cell (as text), sector and mean mu of each cell and heading sector; None if the file
-    does not exist yet.
+    """Read an overlay, which is an additional map that the page draws over the live map. Return the
+    columns `cell` (numbers as text), `sector` and `mu`; None if `path` is None or the file does not
+    exist yet.
+
+    The file may have several rows for a cell and heading sector. `mu` is their mean.
 
     Raises:
-        InputError: the file has other columns.
+        InputError: the file lacks one of the columns cell, sector and mu.
     """
     if path is None or not path.is_file():
         return None

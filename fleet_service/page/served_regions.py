@@ -89,8 +89,9 @@ class ServedRegions:
 
 
 def _box_of_expression(region: str) -> list[float]:
-    """Return west, south, east, north [deg] of the square that the leading digits of a region
-    expression name.
+    """Return the square that contains all regions which a region expression (Zenoh key pattern that
+    selects regions) matches: west, south, east, north [deg]. The digits before the first `*` of the
+    expression determine the square.
     """
     digits = region.partition("*")[0].replace("/", "")
     return box_of(grid.from_quadkey(digits), len(digits))

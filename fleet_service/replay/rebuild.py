@@ -471,7 +471,11 @@ class _Held:
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:
-        """Yield the rows of each non-empty chunk, in order; call this only once."""
+        """Yield the rows of each chunk (rows between two successive `borders`) as a table. The
+        chunks are in order of time, and empty chunks are left out.
+
+        Call this method only once, because it frees the memory of each chunk.
+        """
         for k, packed in enumerate(self._kept):
             self._kept[k] = []
             if packed:
@@ -479,8 +483,11 @@ class _Held:
 
 
 def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Return times from `low` to `high` [ns] that divide this interval at full minutes (epoch
-    borders). If rows are evenly distributed in time, about `most` rows lie between two times.
+    """Divide the interval from `low` to `high` [ns] into parts of whole minutes. Return the borders
+    of the parts [ns], including `low` and `high`.
+
+    The number of parts is such that each part contains about `most` of the `rows` rows of the
+    interval, if the rows are evenly distributed in time. A part is at least one minute long.
     """
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))

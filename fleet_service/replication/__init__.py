@@ -21,7 +21,8 @@ take over after a shorter time, HINT · `lease_s`.
 | taking | lease created, but the former holder renewed meanwhile | joining | first wait `lease_s` |
 | joining | folder and bucket are equal, fence is written | holding | serve and acknowledge |
 | joining | a later lease exists | waiting | none |
-| joining | the bucket does not answer | joining | a standby retries, another service stops |
+| joining (service configured as standby) | the bucket does not answer | joining | retry |
+| joining (any other service) | the bucket does not answer | released | stop with an error |
 | holding | last valid renewal less than `lease_s / 2` ago | holding | serve and acknowledge |
 | holding | no valid renewal for `lease_s / 2` | silent | renew and upload, acknowledge nothing |
 | silent | a renewal is valid again | holding | serve and acknowledge |

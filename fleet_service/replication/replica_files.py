@@ -55,8 +55,9 @@ class ReplicaFiles:
         """Return name and stamp (size and time of the last write) of each file that is copied to
         the bucket.
 
-        The folders are listed in the given order. In the order of FOLDERS, a row that compaction
-        moves to another folder during the listing is always found.
+        The folders are listed in the given order. The default order ensures that a row is found
+        even if compaction moves it to another folder during the listing. In this order, each folder
+        comes before the folder to which its rows are moved.
         """
         found: dict[str, Stamp] = {}
         paths = (path for one in folders for path in sorted((self.root / one).rglob("*")))

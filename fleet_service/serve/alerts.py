@@ -125,9 +125,10 @@ class Alerts:
         """Return True if the limit for idle roads permits an alert. A road is idle if fewer than
         OTHERS_NEEDED vehicles have ever reported it. On other roads there is no limit.
 
-        On an idle road, at least LEAST_SOURCES vehicles must have reported the ice that have not
-        reached their own limit. A vehicle has reached its limit if its reports have recently led to
-        alerts on idle roads in several other areas (see `IdleRoads`).
+        On an idle road, the alert needs the support of at least LEAST_SOURCES vehicles. A vehicle
+        supports it if the vehicle reported the ice and has not reached its own limit. A vehicle has
+        reached its limit if its reports have recently led to alerts on idle roads in several other
+        areas (see `IdleRoads`).
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
@@ -146,10 +147,11 @@ class Alerts:
         slippery stretches of road are checked too. Slots with an active alert are left out. A slot
         becomes a candidate if both conditions hold:
 
-        - Enough vehicles are sources, of the slot itself or of the stretch. More are needed in a
-          slot where vehicles also reported grip.
-        - The slot has a source of its own, and its own reports make slippery road probable. Or the
-          stretch has sources both before and behind the slot.
+        1. The slot itself or its stretch has enough sources. More are needed in a slot where
+           vehicles also reported grip.
+        2. The ice is in this slot. This is assumed in two cases: either the slot has a source of
+           its own and its own reports make slippery road probable, or the stretch has sources both
+           before and behind the slot.
         """
         fusion = self._fusion
         slots = slots[self._own_sources(slots, Side.ICE)[:, 0] > 0]

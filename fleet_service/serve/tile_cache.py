@@ -43,10 +43,11 @@ class ShownTile(NamedTuple):
             `cells`. It is empty if the cells have another order and are used for one query only.
         least: smallest number of vehicles of any cell. If a query requires no more vehicles, it
             selects every cell.
-        common: box (west, south, east, north) [deg] for a quick test. A query's box that touches
-            `common` overlaps every cell in longitude, so cells must be selected only by latitude.
-            If the cells are not ordered from south to north, `common` is NOTHING, which no box
-            touches.
+        common: box (west, south, east, north) [deg] for a quick test. If a query's box overlaps
+            `common`, its range of longitudes overlaps that of every cell, so that cells must be
+            selected only by latitude. West is the largest western edge of all cells, and east is
+            the smallest eastern edge. South and north are infinite. If the cells are not ordered
+            from south to north, `common` is NOTHING, which overlaps no box.
         made: time at which this tile was made [ns].
         change: number of the newest change of the map that this tile includes.
     """

@@ -63,17 +63,20 @@ def grow_windows(state: State, most: int) -> State:
 
 
 def grow_pairs(state: State, most: int) -> State:
-    """Return the fusion's state with room for at least `most` records of active pairs. An active
-    pair is one vehicle in one slot in which the vehicle has reported recently.
+    """Return the fusion's state with room for at least `most` pairs in its hash table
+    `State.pairs`. A pair is the record of one vehicle in one slot (cell and heading sector) in
+    which the vehicle has reported recently.
     """
     return _move_pairs(state, max(int(state.used[PAIRS]), most), only_waiting=False)
 
 
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
-    """Return the fusion's state after old records have been moved to compact storage. A pair is the
-    record of one vehicle in one slot (cell and heading sector). All pairs whose observations are
-    final move from the hash table `State.pairs` to the sorted arrays `State.settled`. Reports that
-    are too old to have an effect at `now` [s] are deleted.
+    """Return the fusion's state after records that can no longer change have been moved to compact
+    storage. A pair is the record of one vehicle in one slot (cell and heading sector).
+
+    If all observations of a pair are final, its reports move from the hash table `State.pairs` to
+    the sorted arrays `State.settled`. Reports that are too old to have an effect at `now` [s] are
+    deleted.
 
     `names` (V,) are the records of the vehicles, and `size` is the number of slots in use.
     """

@@ -352,9 +352,9 @@ class State(NamedTuple):
 
     Attributes:
         live: the current slots.
-        base: final state of each slot that has a window, in the rows of `windows`. Final means
-            without the observations in the window. For reporters it contains only the vehicles that
-            reported grip or ice (`SourcesRecord`).
+        base: final state (without the observations in the window) of each slot that has a window,
+            in the rows of `windows`. The lists in `base.reporters` have the type `SourcesRecord`:
+            they name the vehicles that reported grip or ice, but not their friction values.
         windows, entries: pools (arrays with free rows) of `WindowRecord` and `EntryRecord`.
         free_windows, free_entries: stacks of the pools' free rows.
         pairs: hash table with the records of active pairs (vehicles that reported in a slot
