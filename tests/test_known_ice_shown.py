@@ -22,9 +22,12 @@ def test_no_output_draws_known_ice_as_unknown(tmp_path: Path) -> None:
 
 def test_an_older_snapshot_shows_known_ice_on_page_and_in_qgis(tmp_path: Path) -> None:
     """A stored map (snapshot) of an older version has only a lower bound and no μ for some places
-    that are known to be icy. The live page and QGIS must still show these places as ice. Query
-    answers and exported snapshots have no μ for them. Therefore `find_hidden` must report exactly
-    these places as hidden there, which shows that it detects hidden ice.
+    that are known to be icy.
+
+    The live page and QGIS must show these places as ice. Query answers and exported snapshots
+    cannot show them, because they contain no μ for these places. `find_hidden` must report exactly
+    these places as hidden in answers and exports. This proves that `find_hidden` can detect hidden
+    ice.
     """
     ice = KnownIce(tmp_path, is_older=True)
     found = find_hidden(ice)

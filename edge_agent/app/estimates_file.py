@@ -58,8 +58,8 @@ def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 an Arr
 
 
 class EstimatesFile:
-    """Writer of a file of estimates, which adds one block of samples after the other. The file gets
-    its final name only when it is complete.
+    """Writer of a file of estimates, which receives the samples block by block. The file gets its
+    final name only when it is complete.
 
     Raises:
         InputError: the path cannot be written, or its suffix is not one of ENDINGS.

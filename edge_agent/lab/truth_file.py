@@ -41,8 +41,9 @@ class _Visit:
 
 @dataclass
 class TruthRecorder:
-    """Recorder of the true friction per visit (passage of a map cell) of the named vehicles, one
-    block of samples after the other."""
+    """Recorder of the true friction per visit (passage of a map cell) of the named vehicles. It
+    receives the samples block by block.
+    """
 
     names: tuple[str, ...]
     rows: list[tuple[str, _Visit]] = field(default_factory=list)

@@ -188,10 +188,10 @@ _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # bits from a slot'
 def road_time(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
     """Return three values for the slot `key` and the interval from `begin` to `end` [ns].
 
-    The first two are road times [s]: the length of the interval multiplied by a rate that depends
-    on the weather. The first uses the rate at which friction drifts, and the second uses the rate
-    at which roads change suddenly. The third value is the row of `weather.prior` that applies at
-    the end; it is 0 if no weather report applies.
+    The first two are road times [s]: integrals over the interval of a rate that depends on the
+    weather and is 1 without a report. The first uses the rate at which friction drifts, and the
+    second uses the rate at which roads change suddenly. The third value is the row of
+    `weather.prior` that applies at the end; it is 0 if no weather report applies.
     """
     seconds = (end - begin) * 1e-9
     if len(weather.region) == 0:

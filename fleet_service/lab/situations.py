@@ -47,7 +47,7 @@ def bound_excess(used: float, path: str) -> float:
 
     Each vehicle used the grip `used` and did not measure the friction. The result is the lower end
     of the map's interval of friction, minus the larger of `used` and the lower end of the prior's
-    interval. A positive result means that the map promises too much grip.
+    interval. A positive result means that the map claims too much grip.
 
     `path` consists of the encoding ("protobuf" or "json") and the content of the reports.
     "posterior" means a median with an interval; "likelihood" means log-likelihoods on the friction
@@ -111,8 +111,8 @@ def _decode_batch(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
 
 
 def lower_excess() -> float:
-    """Return the largest excess of the map's lower friction limit, as computed by `bound_excess`. A
-    positive result means that the map promises more grip than the vehicles used.
+    """Return the largest excess of the map's lower limit of friction, as computed by
+    `bound_excess`. A positive result means that the map claims too much grip.
 
     The result is the maximum over all combinations of the used grip (USED), the encoding (protobuf,
     JSON), and the content of the reports (posterior, likelihood).
@@ -123,8 +123,8 @@ def lower_excess() -> float:
 
 def backlog_fused(rng: Generator) -> float:
     """Return the share of late observations that still affect the map after an outage of the
-    network. An observation is late if it arrives more than LATENESS_S after a newer one of any
-    vehicle.
+    network. An observation is late if the service already has an observation of any vehicle that
+    was made more than LATENESS_S later.
 
     In this situation, vehicles drive for an hour. BACKLOG vehicles have no connection in this hour,
     and their observations arrive together at its end. One other vehicle is connected all the time.

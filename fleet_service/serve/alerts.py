@@ -125,10 +125,9 @@ class Alerts:
         """Return True if the limit for idle roads permits an alert. A road is idle if fewer than
         OTHERS_NEEDED vehicles have ever reported it. On other roads there is no limit.
 
-        On an idle road, the alert needs the support of at least LEAST_SOURCES vehicles. A vehicle
-        supports it if the vehicle reported the ice and has not reached its own limit. A vehicle has
-        reached its limit if its reports have recently led to alerts on idle roads in several other
-        areas (see `IdleRoads`).
+        On an idle road, at least LEAST_SOURCES of the vehicles that reported the ice must be below
+        their own limit. A vehicle has reached its limit if its reports have recently led to alerts
+        on idle roads in several other areas (see `IdleRoads`).
         """
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:

@@ -1,8 +1,8 @@
 """Metrics and health over HTTP: OpenMetrics at `/metrics`, health at `/healthz`, on the loopback
 interface by default.
 
-All values are read from the program's state when they are requested; no counter exists only for the
-metrics.
+All values are read from the program's state at the time of the request. The module keeps no
+counters of its own.
 """
 
 from __future__ import annotations

@@ -114,7 +114,8 @@ def spread(
 
 
 def _unpack_column(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an Arrow array
-    """Unpickle each value of a column of bytes. Yield pairs: the number of a task, and this task or
-    its outcome.
+    """Unpickle each value of a column of bytes, and yield the resulting pairs. In the input of a
+    Spark job, a pair is the number of a task and the task itself. In the output, it is the number
+    of a task and its outcome.
     """
     return (pickle.loads(one) for one in column.to_pylist())

@@ -205,9 +205,14 @@ class VectorLimit(CompiledFilters):
         return out
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
-        """Run all filters over T successive readings, which are `gone` seconds apart and arranged
-        by `side_by_side`. Return the mean of each filter's state after each reading, (T, N/L, 6,
-        L).
+        """Run all filters over T successive sensor readings, and return the mean of each filter's
+        state after each reading, (T, N/L, 6, L). N is the number of vehicles, and L the number of
+        lanes of a SIMD vector.
+
+        Args:
+            readings: readings (T, N/L, 11, L). The method `side_by_side` converts an array (T, N,
+                11) to this shape.
+            gone: time between two readings [s].
         """
         samples, blocks, _, lanes = readings.shape
         out = allocate_aligned(samples, blocks, STATES, lanes)

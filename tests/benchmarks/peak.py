@@ -32,8 +32,8 @@ INVERSE = 8 + CURVE  # operations of computing the slip that gives a force
 
 
 def measure_peak() -> float:
-    """Return the double-precision peak of one core [GFLOP/s]: that of a loop of independent fused
-    multiply-adds in registers, the best of several rounds.
+    """Measure the double-precision peak of one core [GFLOP/s]. The core runs a loop of independent
+    fused multiply-adds in registers. Return the result of the fastest of ROUNDS rounds.
     """
     values = np.full((2, LANES), 0.5)
     add_products(values, 1)
@@ -80,10 +80,13 @@ def count_operations(interval: float) -> float:
     """Return the floating-point operations per sample of the default estimator at a sampling
     `interval` [s].
 
-    Counted from the source (`friction_mixture/node`) are the operations for the NODES nodes
-    (filters of one friction hypothesis each) on a car with torque signals. A division or root
-    counts as one operation. Unused SIMD lanes, mixing after a road change, the sums over a block of
-    samples and the output are not counted, so the share of the peak is a lower limit.
+    The numbers were counted in the estimator's source code (`friction_mixture/node`), for a car
+    with torque signals. They cover the NODES nodes (filters of one friction hypothesis each). A
+    division or root counts as one operation.
+
+    Four parts are not counted: unused SIMD lanes, mixing after a road change, the sums over a block
+    of samples, and the output. The share of the peak that is computed from this count is therefore
+    a lower limit.
     """
     samples = round(Constants().block_time / interval)
     return NODES * (_count_rows() + _count_covariances()) / samples

@@ -130,8 +130,8 @@ def engine(root: str) -> None:
 
 
 def _make_burst(number: int) -> list[Message]:
-    """Return a burst: 2 * BURST messages that are sent without pauses. Every second message is from
-    the western region, the others are from the eastern region.
+    """Return 2 * BURST messages that are sent without pauses. Messages from the western and from
+    the eastern region alternate; the first message is from the west.
     """
     now = time.time_ns()
     west, east = (
@@ -141,8 +141,8 @@ def _make_burst(number: int) -> list[Message]:
 
 
 def list_regions(burst: Sequence[Message]) -> list[str]:
-    """Return the western and the eastern region of a burst (see `_make_burst`), as they appear in
-    the Zenoh keys of its first two messages.
+    """Return the western and the eastern region of a burst, as they appear in Zenoh keys. A burst
+    alternates between messages from both regions, so the first two messages are enough.
     """
     return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
 

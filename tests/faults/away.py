@@ -4,9 +4,10 @@ the service returns with a limited rate.
 The cars' outboxes (stores of unacknowledged messages) and the service's engine (the service without
 its network) are real. Network and time are simulated, so that an hour takes a minute. The simulated
 service has an input queue, and drops messages that do not fit. Twice a second it writes rows to
-disk and acknowledges them. Per car, its rate (20 batches a second) and its queue (20 batches) are
-those of a service for a thousand cars. Every second each car enters a cell that no car visited
-before. At the end all these cells must be on the map.
+disk and acknowledges them. The service processes 20 batches a second for each car, and its queue
+has 20 places for each car. A real service with a thousand cars has the same rate and queue per car.
+Every second each car enters a cell that no car visited before. At the end all these cells must be
+on the map.
 """
 
 from __future__ import annotations

@@ -17,10 +17,15 @@ BatchType = TypeVar("BatchType")
 
 
 class Lives(ABC, Generic[BatchType]):
-    """One history in an empty folder. Its number is the seed of all random choices.
+    """Simulated history of an archive in an empty folder. A history consists of several lives (runs
+    of the program), which power losses separate.
+
+    Args:
+        number: number of the history; it is the seed of all random choices.
+        folder: folder of the history.
 
     Attributes:
-        lives: number of lives.
+        lives: number of lives (runs of the program) in the history.
         operations: largest number of operations before the power loss.
         full_after: largest number of operations before the disk is full for a short time.
         acknowledged: batches that were acknowledged.
@@ -39,8 +44,8 @@ class Lives(ABC, Generic[BatchType]):
         self.at_stake = 0
 
     def find_violations(self) -> list[str]:
-        """Run the simulated sequence of lives of an archive, and return a message for each broken
-        promise, such as a lost acknowledged row.
+        """Run the program several times on the same archive, with a power loss after each run
+        except the last. Return a message for each broken promise, such as a lost acknowledged row.
         """
         live = self.folder / "life-0"
         live.mkdir()
@@ -63,8 +68,8 @@ class Lives(ABC, Generic[BatchType]):
 
     @abstractmethod
     def _run_life(self, root: Path, last: bool) -> None:
-        """Run one life of the archive (from its start to the power loss) on the simulated disk
-        `root`. In the `last` life the power does not fail.
+        """Run the program on the archive in the folder `root` of the simulated disk, until the
+        power fails. In the `last` life (run of the program) the power does not fail.
         """
 
     @abstractmethod

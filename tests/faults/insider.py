@@ -41,8 +41,9 @@ WARM_S: Final = 60  # after this time the sizes of pools and windows are constan
 
 
 def _make_growth_figure(grown: float, seconds: int, *, quick: bool) -> Figure:
-    """Return the figure of the service's memory growth per hour. A quick run returns the growth
-    itself [MB], because three minutes are too short for a rate.
+    """Return a figure of the growth of the service's memory: `grown` [MB] in `seconds` [s],
+    converted to MB per hour. A quick run returns `grown` itself, because it is too short for a rate
+    per hour.
     """
     if quick:
         return replace(make_figure("faults.insider.mb_per_hour", grown), unit="MB in all")

@@ -67,8 +67,9 @@ class Direction:
     def accept_packet(
         self, packet: bytes, now: float, terms: LinkTerms, draw: random.Random
     ) -> None:
-        """Queue an IP packet for delivery at the other end of the link. Drop it if the link blocks
-        UDP and it is UDP, at random with the loss rate, or if the queue is full.
+        """Queue an IP packet for delivery at the other end of the link. Drop the packet in three
+        cases: the link blocks UDP and the packet is UDP; a random loss occurs, with the probability
+        `terms.loss`; or the queue is full.
         """
         if terms.drop_udp and len(packet) > 9 and packet[9] == UDP:
             return

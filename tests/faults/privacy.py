@@ -70,10 +70,10 @@ class Pursuit(NamedTuple):
     """Result of one attempt of a reader to follow a car.
 
     Attributes:
-        hits: for each publication of the map, the probability that the reader names the car's
+        hits: for each publication of the map, the probability that the reader guesses the car's
             place.
         chance: the same probability if the reader guesses at random.
-        street: probability that the reader names the car's street.
+        street: probability that the reader guesses the car's street.
     """
 
     hits: list[float]
@@ -231,8 +231,12 @@ def pursue(town: Town, street: int) -> Pursuit:
 
 
 def _name_street(found: list[int], street: int) -> float:
-    """Return the probability that a reader names the right side street, number `street`. The reader
-    takes the street that is nearest to the first three suspected cells in `found`.
+    """Return the probability that a reader of the map guesses the car's side street, which has the
+    number `street`.
+
+    `found` contains the cells in which the reader assumed the car, one per publication of the map.
+    The reader guesses the street that is nearest to the first three of these cells. If several
+    streets are equally near, or if `found` is empty, the reader chooses one of them at random.
     """
     if not found:
         return 1.0 / len(STREETS)
@@ -298,9 +302,12 @@ def run(site: Site) -> list[Figure]:
 
 
 def _control(folder: Path) -> float:
-    """Return the figure that shows that the method can follow a car. If the map shows every report
-    at once, the reader's guesses of the car's place are right more often than random guesses; the
-    figure is the difference of both shares.
+    """Return the result of the control run, in which the map shows every report at once and the
+    reader must therefore be able to follow the car.
+
+    The result is the share of publications after which the reader guesses the car's place
+    correctly, minus the same share for random guesses. A positive result shows that the reader's
+    method works.
     """
     with patch.object(TileCache, "source", property(lambda tiles: tiles.state.fusion)):
         town = Town(folder, 0)

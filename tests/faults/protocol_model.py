@@ -17,8 +17,9 @@ time after they began.
              up, its turn may still be written later.
     ack      The holder acknowledges only uploaded batches, and only within half a lease time after
              the beginning of its last valid renewal.
-    take     A standby that has seen the same turn for its lease time creates the next number. If
-             the turn changed since it last looked, it waits for another lease time before `list`.
+    take     A standby that has seen the same turn for its lease time creates the next number. The
+             holder may have renewed its lease since the standby last read the turn. In this case
+             the standby waits for another lease time before `list`.
     list     The new holder writes all objects of the bucket into the fence. Objects with lower
              numbers that are uploaded later do not count.
     release  The holder gives up its lease at once. It acknowledges nothing afterwards.

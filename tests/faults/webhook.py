@@ -1,9 +1,10 @@
 """Campaign on broken receivers of a webhook: every alert arrives, waits in the queue, or is counted
 as lost.
 
-Each kind of receiver fails for its first connections and then works. Two kinds never recover. A
-receiver records the ids of the alerts that it confirmed. The check uses this record, because the
-sender's own counters show only the losses that the sender noticed.
+Each kind of receiver has a different fault. Most kinds fail only for their first connections and
+then work; those in FOREVER fail for every connection. A receiver records the ids of the alerts that
+it confirmed. The check uses this record, because the sender's own counters show only the losses
+that the sender noticed.
 """
 
 from __future__ import annotations
@@ -80,8 +81,9 @@ BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
 
 
 class Receiver:
-    """HTTP server on this machine that receives alerts. It fails in one way for its first
-    connections, and some kinds fail for ever.
+    """HTTP server on this machine that receives alerts. Its `kind` selects one of the faults in
+    BREAKS. The fault affects the first BROKEN connections, or all connections if the kind is in
+    FOREVER. A working receiver records in `heard` the ids of the alerts that it confirmed.
     """
 
     def __init__(self, kind: str) -> None:

@@ -1,10 +1,10 @@
-"""Third party with only `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that cannot
-import any other part of GripMap.
+"""Example program of a third party that uses only the package `schemas` of GripMap, and
+eclipse-zenoh, protobuf and pyarrow. An import hook hides GripMap's other packages from the program.
 
 `python -m tests.schemas.third_party ENDPOINT` reports ice by two vehicles, one in protobuf and one
 in JSON. It reads acknowledgements, reports, the tile, alerts and the map's answers, and prints the
-results as one line of JSON. Run it only as a program: importing it would also block GripMap's
-modules there.
+results as one line of JSON. Do not import this module into another program: the import hook would
+then hide GripMap's packages from that program too.
 """
 
 from __future__ import annotations

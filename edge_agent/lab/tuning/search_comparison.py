@@ -60,8 +60,9 @@ def uniform_search(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> Result:
-    """Draw ants·iterations vectors uniformly from the whole range of the variables, and return the
-    best of them.
+    """Search at random: draw ants·iterations vectors of variables uniformly from their whole range,
+    evaluate each, and return the best. If the problem has a start vector, it replaces the first
+    draw.
     """
     tally = SearchTally(problem)
     for _ in range(iterations):
@@ -89,8 +90,9 @@ def compare_searches(
     quick: bool = False,
     log_line: Callable[[str], None] = lambda _line: None,
 ) -> list[Figure]:
-    """Run every search method with every seed, and score the fuzzy sets that it finds on held-out
-    drives. Return the figures (named numbers): means with standard errors.
+    """Run every search method in SEARCHES once per seed. Score the fuzzy sets that each search
+    finds on held-out drives. Return the figures (named numbers): means over the seeds with standard
+    errors.
     """
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
     train = study.record(study.TRAIN, duration)

@@ -64,10 +64,14 @@ class FilterTrace:
 
 
 def entry_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
-    """Simulate a drive through one town per seed, and return figures over all towns. Two quantities
-    are divided by their value without a map: the error of the friction estimate when a vehicle
-    enters a cell, and the delay that a wrong map causes. The last figure is the largest change of a
-    published likelihood that the map causes.
+    """Simulate a drive through one town per seed, and return figures over all towns.
+
+    - Error of the friction estimate after a vehicle enters a cell: with the map as a prior, without
+      a map, and the ratio of both.
+    - Delay until the estimate is right where the map is wrong: the delay with the wrong map,
+      divided by the delay without a map.
+    - Largest change [nat] that a wrong map causes in the log-likelihoods of published reports. The
+      expected value is 0.
     """
     errors: list[FloatArray] = []
     delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}

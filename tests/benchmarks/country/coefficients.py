@@ -105,9 +105,11 @@ def main(kind: str) -> None:
 
 
 def _measure_pair(fusion: Fusion) -> float:
-    """Return the mean size [bytes] of an entry in the table of (cell, vehicle) pairs. All visits
-    must be in this table, but the map moves them there only after a while. The function therefore
-    first adds a later visit.
+    """Return the mean size [bytes] of an entry in the sorted table of (cell, vehicle) pairs.
+
+    The map moves a pair into this table only when the map's time has advanced far enough after the
+    visit. The function therefore first adds one visit at a later time, so that the map moves all
+    earlier visits.
     """
     later_s = (fusion.next_epoch - START) / SECOND + FORGOTTEN_EVERY_S
     fusion.update(make_visits(np.random.default_rng(SEED), 1, 1, later_s, 1.0))

@@ -1,16 +1,18 @@
-"""Country made of copies of one town: positions of its vehicles, and the reports of each over time.
+"""Simulated country that consists of copies of one recorded town: the positions of its vehicles,
+and the reports of each vehicle over time.
 
-    regions    17, 17 and 16 in three zones (map squares of zoom 7) side by side, one service per
-               zone; the r-th region of a zone has a number of vehicles proportional to 1/sqrt(r)
-    towns      four in a region
-    vehicles   each repeats a part of the drive of one vehicle of the city, shifted by whole tiles;
-               if several vehicles in a town repeat the same drive, their starting points are
-               spread evenly over the drive
+    regions    50, in three adjacent zones (map squares of zoom 7) with 17, 17 and 16 regions; one
+               service per zone; the r-th region of a zone has a number of vehicles proportional to
+               1/sqrt(r)
+    towns      four copies of the recorded town in each region
+    vehicles   each repeats a part of the drive of one recorded vehicle, shifted by whole tiles; if
+               several vehicles in a town repeat the same drive, their starting points are spread
+               evenly over the drive
     reports    each vehicle sends ROWS visits (passes through map cells) every PERIOD_S, and these
                visits last PERIOD_S, as in slow traffic
 
-The sender and the observer compute the same country independently, from the seed and the city's
-observations.
+The sender and the observer compute the same country independently, from the seed and the recorded
+town's observations.
 """
 
 from __future__ import annotations
@@ -69,7 +71,7 @@ class Country:
     """Simulated country: home region and repeated drive of each vehicle.
 
     Args:
-        folder: folder of the city's observations.
+        folder: folder of the recorded town's observations.
         seed: seed of the distribution of vehicles over towns.
         vehicles: number of vehicles.
     """

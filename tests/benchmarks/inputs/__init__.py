@@ -1,3 +1,3 @@
-"""Evaluation of the inputs: readers of files, signal doctor (a check of recorded signals),
-calibration, and live sources.
+"""Evaluation of the agent's inputs: import of recorded files, signal doctor (automatic check of the
+signals), calibration, and live sources.
 """

@@ -1,5 +1,6 @@
-"""`python -m tests.benchmarks.inputs [--out DIR] [--recorded LOG] [--quick]`: evaluate readers of
-files, signal doctor (a check of recorded signals), calibration and live sources.
+"""`python -m tests.benchmarks.inputs [--out DIR] [--recorded LOG] [--quick]`: evaluate the inputs
+of the agent: import of recorded files, signal doctor (automatic check of the signals), calibration,
+and live sources.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ CARS: Final = 5  # drives with accurate sensors, and the same number with inaccu
 
 
 def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Figure]:
-    """Run the evaluations of file import, signal doctor (a check of recorded signals), calibration
-    and live sources. Return their figures.
+    """Run the four evaluations: import of recorded files, signal doctor (automatic check of the
+    signals), calibration, and live sources. Return their figures.
 
     Files are written into `folder`. If the CAN log `recorded` is given, its frames are decoded as
     well. If `quick` is True, drives are fewer and shorter.
@@ -49,8 +50,8 @@ def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Fig
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Evaluate the readers, the signal doctor, the calibration and the live sources, and write the
-    figures. Return 0 if every figure meets its target, otherwise 1.
+    """Run the evaluations of this module with command-line arguments, and write the figures to
+    files. Return 0 if every figure with a target meets it, otherwise 1.
     """
     parser = argparse.ArgumentParser(prog="tests.benchmarks.inputs", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(".evaluation/inputs"))

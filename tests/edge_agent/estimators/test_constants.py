@@ -279,9 +279,12 @@ def summarize_reports(estimates: Estimates) -> dict[str, float]:
 
 
 def inside(filters: np.ndarray) -> dict[str, float]:
-    """Return figures of the filter's internal states over one drive, by name. They include
-    probabilities and penalties of the nodes (filters of one friction hypothesis each), means and
-    standard deviations of the states, and strain (misfit of the vehicle model).
+    """Return summary numbers of the filter's internal states over one drive, by name. Most are
+    means over the drive; some are maxima, root mean squares or values at the end.
+
+    They describe the nodes (filters of one friction hypothesis each): their probabilities, and the
+    amounts [nat] charged to them for deviations of vehicle and sensor states from the prior. They
+    also describe the states of the whole filter and its strain (misfit of the vehicle model).
     """
     weight = filters["weight"]
     split = filters["split"]

@@ -1,5 +1,6 @@
-"""Tests of the update of a Cholesky factor, in which one scalar measurement is processed after the
-other. The result must equal that of textbook and orthogonal algorithms.
+"""Tests of Carlson's update of a square-root filter. A square-root filter stores the covariance as
+a Cholesky factor, and the update uses one scalar measurement of a state. The result must equal that
+of the orthogonal update in `householder`.
 """
 
 from __future__ import annotations

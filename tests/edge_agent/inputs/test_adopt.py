@@ -1,6 +1,8 @@
-"""Tests of corrections in the replay of a log. The signal doctor (a check of recorded signals) must
-find delayed sensors, and rear wheels that turn as one. The replay must correct both, and scale
-wheel speeds to given radii. It must leave a drive with exact sensors unchanged.
+"""Tests of corrections in the replay of a log. The signal doctor (automatic check of the signals)
+must find delayed sensors, and rear wheels with equal speeds, which show a locked differential. The
+replay must then correct the delays and remove the slip that the locked differential causes in
+turns. It must also scale wheel speeds to given radii, and leave a drive with exact sensors
+unchanged.
 """
 
 from __future__ import annotations

@@ -137,8 +137,11 @@ def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
 )
 def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
     """An urgent observation is sent at once. The observation of a visit (pass through a cell) must
-    be urgent in two cases only: the upper end of its interval, mu + 0.05, lies below 0.4; or its
-    median mu lies below 0.4 and enough grip was used.
+    be urgent only if it shows a slippery road (μ below 0.4) in one of two ways:
+
+    - The upper end of its interval lies below 0.4. In this test the upper end is mu + 0.05.
+    - Its median mu lies below 0.4, and the vehicle used at least the share EXCITED_SHARE of this
+      friction.
     """
     _, observations, states = Watch.of(3).step(
         wanderers(150, 3), estimates(150, 3, mu=mu, used=used)

@@ -152,8 +152,9 @@ def test_unsettled_batches_are_resent_oldest_first_at_growing_intervals(path: Pa
 
 
 def silence_route(outbox: Outbox, now: float = 0.0) -> float:
-    """Store messages that no service answers, until the outbox (store of unacknowledged messages)
-    regards the route as silent. Return the simulated time [s] at that moment.
+    """Store messages that no service acknowledges, until the outbox (store of unacknowledged
+    messages) treats the service as silent. From then on, the outbox keeps new batches on disk
+    instead of sending them at once. Return the simulated time [s] at that moment.
     """
     outbox.store([draft()], now)
     while outbox.store([draft()], now)[0].fresh:

@@ -65,11 +65,14 @@ def test_shape_of_nobody_is_the_prior() -> None:
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])
 def test_gain_error_common_to_value_and_use_is_no_shape(gain_std: float) -> None:
-    """A gain error multiplies all friction values of a vehicle, and its used grip, by the same
-    factor. It must not be learned as a slope (error of a value per unit of unused grip). Between
-    vehicles, value and used grip are then correlated: a regression cov(value, use)/var(use) would
-    find a slope that does not exist. Between visits of the same vehicle the factor cancels.
-    Therefore the fusion must learn the slope only from such visits.
+    """The slope is the error of a friction value per unit of unused grip. A gain error multiplies
+    all friction values of a vehicle, and its used grip, by the same factor. The fusion must not
+    learn a slope from gain errors.
+
+    If it compared different vehicles, values and used grip would be correlated through their gain
+    errors, and a regression would find a slope that does not exist. The fusion must therefore
+    compare only visits of the same vehicle: the factor is the same in all of them, so it causes no
+    difference that looks like a slope.
     """
     assert learned_slope(make_acquainted(0.0, gain_std, gain_in_use=True)) < 0.12
 

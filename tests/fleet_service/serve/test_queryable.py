@@ -112,7 +112,8 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
     """The service must answer a query for little data while it still answers a query for much data.
-    A query for many tiles of one cell each must count as one for much data.
+    A query can ask for much data in two ways: its answer has many cells, or many tiles with few
+    cells each. The test covers both.
     """
     key = keys.map_key(TILE)
     counts = Counter[str]()

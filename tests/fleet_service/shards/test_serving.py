@@ -252,9 +252,12 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
 def test_who_is_found_after_it_was_asked_is_asked_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The service answers map queries, but clients do not see its liveliness token (sign of a
-    connected service). The client's first query gets no reply. The client must then find that the
-    service answers, and query again.
+    """The client's first query returns nothing, because the test replaces its replies with an empty
+    list. The client must not report a missing service. It must check if a service answers in this
+    area, find the service, and send the query again.
+
+    The service has no liveliness token (sign of a connected service), so that the client cannot
+    find it by its token.
     """
     monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:

@@ -17,8 +17,8 @@ measurements are linear in the other states, such as steering error, gain of tor
 (gravity that a tilted accelerometer measures). For the linear states the derivative D is exact, so
 no cubature points are needed (a Rao-Blackwellised rule).
 
-The covariances are h = L*B' + P*D' and S = B*(B + D*L)' + D*h. The measurements are applied one
-after the other, so that the noise of each may differ from node to node.
+The covariances are h = L*B' + P*D' and S = B*(B + D*L)' + D*h. The update applies one scalar
+measurement at a time, so that the noise of each may differ from node to node.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ def take_rows(
     axle_penalty: float,
 ) -> float:
     """Update the filters of a group of nodes (friction hypotheses) with the innovations
-    node.residual, one measurement after the other. node.spread is the covariance of the
+    node.residual, one scalar measurement at a time. node.spread is the covariance of the
     innovations.
 
     Return the negative log-likelihood [nat] without constants: half of the normalised squared

@@ -49,8 +49,9 @@ class PaperRow(NamedTuple):
 
     @property
     def limit(self) -> float | None:
-        """Return the target for the number under the paper's conditions (`matched`); None if there
-        is no target."""
+        """Return the target for our result under the paper's conditions (`matched`); None if there
+        is no target.
+        """
         bar = self.printed if self.bar is None else self.bar
         return None if math.isnan(bar) else bar
 
@@ -62,14 +63,14 @@ class PaperRow(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Return True if the reproduced number (`matched`, simulated under the paper's conditions)
-        meets the target, or if there is no target.
+        """Return True if our result under the paper's conditions (`matched`) meets the target
+        (`limit`), or if there is no target.
         """
         return self.limit is None or self.figure("papers").holds
 
     def figure(self, prefix: str) -> Figure:
-        """Return the number under the paper's conditions (`matched`), with its target, as a
-        `Figure` named `prefix` plus the row's name.
+        """Return our result under the paper's conditions (`matched`), with its target, as a
+        `Figure`. The name of the figure is `prefix`, a dot, and the name of this row.
         """
         return Figure(f"{prefix}.{self.name}", self.matched, self.unit, self.limit, self.better)
 
