@@ -471,10 +471,7 @@ class _Held:
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:
-        """Yield the rows of each chunk (rows between two successive `borders`) as a table. The
-        chunks are in order of time, and empty chunks are left out.
-
-        Call this method only once, because it frees the memory of each chunk.
+        """Yield the rows between each two successive `borders`, in order of time; call only once.
         """
         for k, packed in enumerate(self._kept):
             self._kept[k] = []
@@ -483,11 +480,8 @@ class _Held:
 
 
 def _time_borders(low: int, high: int, rows: int, most: int) -> list[int]:
-    """Divide the interval from `low` to `high` [ns] into parts of whole minutes. Return the borders
-    of the parts [ns], including `low` and `high`.
-
-    The number of parts is such that each part contains about `most` of the `rows` rows of the
-    interval, if the rows are evenly distributed in time. A part is at least one minute long.
+    """Return the borders [ns] of parts of whole minutes that divide the interval from `low` to
+    `high`. Each part has about `most` rows if the interval's `rows` rows are evenly spread in time.
     """
     epochs = (high - low) // EPOCH_NS
     parts = max(1, min(-(-rows // most), epochs))
