@@ -1,7 +1,8 @@
-"""Evaluation of short situations in which the map could become wrong: many reports that are only
-lower bounds of friction, an outage of the network, careful drivers on ice, and a wet curve.
+"""Evaluation of the map in short simulated situations in which it could become wrong. The
+situations are reports that are only lower bounds of friction, an outage of the network, careful
+drivers on ice, and a wet curve.
 
-The true friction is known by construction. Pure (no I/O).
+The true friction is known, because it is simulated. The module does no I/O.
 """
 
 from __future__ import annotations

@@ -471,8 +471,7 @@ class _Held:
         self._taken.clear()
 
     def chunks(self) -> Iterator[pa.Table]:
-        """Yield the rows between each two successive `borders`, in order of time; call only once.
-        """
+        """Yield the rows between every two successive `borders`, in order. Call this only once."""
         for k, packed in enumerate(self._kept):
             self._kept[k] = []
             if packed:
