@@ -96,9 +96,9 @@ def make_bank(
     tyre: TyreOption | None = None,
     motion: MotionSetting | None = None,
 ) -> EstimatorBank:
-    """Return a bank of paper 000's joint filters, one per vehicle. `tyre` replaces the default
-    options of the tyre model. `motion` replaces the default variances of the filter of planar
-    motion.
+    """Return a bank of paper 000's estimators, one per vehicle. Each estimator consists of two
+    filters: one for planar motion, and one for the friction of the four wheels. `tyre` replaces the
+    default options of the tyre model. `motion` replaces the default variances of the motion filter.
     """
     filters = new_filters(JointMemory, vehicles, tyre)
     set_motion(filters, MotionSetting() if motion is None else motion)

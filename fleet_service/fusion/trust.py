@@ -17,13 +17,19 @@ Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
     m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST and at most 1
-    g    share of agreement, (n₀·a₀ + Σ m·ā) / (n₀ + Σ m). It starts as if the vehicle had met
-         n₀ = TRUST_PRIOR_PEERS others and had agreed with the share a₀ = TRUST_PRIOR of them
+    n₀   TRUST_PRIOR_PEERS, number of imagined other vehicles with which every vehicle starts
+    a₀   TRUST_PRIOR, share of the imagined vehicles with which it agreed
+    g    share of agreement of a vehicle; the sums run over the other vehicles
     T    trust, from 0 at g = TRUST_NONE to 1 at g = TRUST_FULL, linear between them
-    ε    share of wrong values that is assumed for a known vehicle (one that has been compared with
-         at least ESTABLISHED_PEERS others): 1 - g, limited to the range from
-         CONTAMINATION_LEAST to CONTAMINATION; for other vehicles it is CONTAMINATION
-    r    weight of the vehicle's votes: T·(1 - ε) / (1 - CONTAMINATION)
+    ε    assumed share of wrong values of a vehicle
+    r    weight of the vehicle's votes
+
+    g = (n₀·a₀ + Σ m·ā) / (n₀ + Σ m)
+    ε = 1 - g, limited to the range from CONTAMINATION_LEAST to CONTAMINATION, for a known vehicle
+    ε = CONTAMINATION, for other vehicles
+    r = T·(1 - ε) / (1 - CONTAMINATION)
+
+A vehicle is known if it has been compared with at least ESTABLISHED_PEERS other vehicles.
 """
 
 from __future__ import annotations

@@ -21,7 +21,15 @@ SIZE = (5.5, 4.2)
 def draw_plots(
     found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")
 ) -> list[Path]:
-    """Write the four plots into `folder`, in each file format; return their paths.
+    """Draw four plots from the figures `found`, and write each into `folder` in all file formats
+    `forms`. Return the paths of the files. The plots are:
+
+    - reliability: share of true μ below the stated quantiles, for a fleet without faulty vehicles.
+    - rmse: error of the median of μ by the number of vehicles that used grip in the cell.
+    - delay: share of cells in which the appearance or the end of ice is detected, by the number of
+      passes that used enough grip to measure μ.
+    - misbehaving: error of the median of μ by the share of misbehaving vehicles, for the fusion and
+      for simple rules.
 
     Raises:
         InputError: matplotlib is not installed.

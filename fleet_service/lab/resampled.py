@@ -133,9 +133,16 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
 
 
 def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """Return one element of `rows` (m,) for each friction in `mu` (n,), drawn at random from the
-    NEAREST rows with the most similar friction. `of` contains the friction of all rows, and `rows`
-    must be sorted by it. The result is -1 if there are no rows.
+    """Return a visit of similar friction for each friction in `mu` (n,), drawn at random from the
+    NEAREST visits with the most similar friction. The result (n,) contains indices into `of`; they
+    are -1 if `rows` is empty.
+
+    Args:
+        rng: random generator.
+        mu: wanted frictions (n,).
+        of: friction of every visit (k,).
+        rows: indices into `of` of the visits that may be drawn (m,), in increasing order of their
+            friction.
     """
     if not len(rows):
         return np.full(len(mu), -1)

@@ -41,8 +41,9 @@ QUEUED: Final = 20.0  # places per car in the service's input queue
 
 @dataclass
 class Made:
-    """Simulated service: a real engine (service without network), and a queue of batches that wait
-    for it. It also counts the bytes that reached the routers.
+    """Fleet service without a network: the service's real code (`engine`) behind a simulated input
+    queue of batches. While `up` is False, the service is down and every batch is lost. The class
+    also counts the messages and bytes that the cars sent to the routers.
     """
 
     cars: int

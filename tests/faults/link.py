@@ -235,9 +235,10 @@ def change_address(
     """Return how many messages a car sent and how many were lost while its address changed twice,
     and the longest gap [s] between received messages.
 
-    A router with a rate limit (`capped`) drops a message that arrives within 10 ms of the previous
-    one. The limit is off by default, because messages that a busy machine delays would then be
-    dropped and would count as losses of the link.
+    If `capped` is True, the router limits the message rate: it drops a message that arrives within
+    10 ms of the previous one. By default the router has no limit, so that every loss is a loss of
+    the link. With a limit, a busy test machine also causes losses. It delays messages, so they
+    arrive close together.
     """
     with open_namespaces(site.folder / f"address-{protocol}-{capped}") as there:
         there.start_router(capped=capped)

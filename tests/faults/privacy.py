@@ -126,8 +126,18 @@ def _visit(name: str, seq: int, when: int, trip: Trip, at: slice, mu: float) -> 
 
 
 class Town:
-    """Fleet service of a simulated town, the town's cars by day, and the map tiles that a reader
-    has stored.
+    """Simulated town with a fleet service, which makes its map. The constructor simulates one day:
+    each household's car makes two trips, and the service publishes the map in the evening.
+
+    Args:
+        folder: folder of the service's archive.
+        seed: seed of the random order of the trips and of the noise of the reports.
+        public: number of vehicles that must visit a cell before it is shown.
+
+    Attributes:
+        engine: the service without its network.
+        day: beginning of the simulated day [ns].
+        held: newest published table of each map tile, which the reader has stored.
     """
 
     def __init__(self, folder: Path, seed: int, public: int = PUBLIC) -> None:

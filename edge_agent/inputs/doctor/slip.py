@@ -196,9 +196,9 @@ def is_steady(fit: Fit) -> bool:
 
 
 def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts in which the fitted gain of an identity is near `gain`:
-    it has the same sign, and its logarithm differs by less than `within`. An identity is a pair of
-    quantities that are equal by physics, and its gain is their ratio.
+    """Return the share of a drive's parts in which the ratio of two quantities is near `gain`. Both
+    quantities are equal by physics, and `fit` contains their ratio in each part. A ratio is near
+    `gain` if it has the same sign and its logarithm differs by less than `within`.
     """
     if not fit.parts:
         return 0.0

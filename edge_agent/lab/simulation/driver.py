@@ -253,8 +253,9 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     """Return the square of the driver's target speed [m^2/s^2] at the start of a stretch of which
     the driver was warned.
 
-    The target speed is the advised speed. It is lower if the bends and junctions ahead require a
-    lower speed on a road with the grip that the warning announces.
+    The target speed is the smaller of two speeds, but at least SLOWEST. One is the advised speed.
+    The other is the speed that the bends and junctions ahead allow with the grip that the warning
+    announces.
     """
     row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
     lane = g[Route.LANE]

@@ -117,8 +117,8 @@ class StudyScores(NamedTuple):
 
 
 def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
-    """Simulate the drives, each `duration_s` [s] long, and add the measurement noise of every
-    condition.
+    """Simulate the drives, each `duration_s` [s] long. Return their readings once for each entry of
+    CONDITIONS, with the measurement noise that the entry states.
     """
     exact = []
     truth = []

@@ -290,10 +290,10 @@ class PeersRecord:
             need the same place, the one with the lower number gets it, so that frequent reporters
             have no advantage (`trust._pair_rank`).
         agreed, met: summed agreement, and number of comparisons, for each other vehicle.
-        used_squares: weighted sum of squared differences in grip used between two visits of the
-            vehicle to one cell.
-        used_products: weighted sum of products of these differences with the differences in
-            reported friction.
+        used_squares, used_products: sums from which `trust.shape_of` estimates by how much friction
+            values are too low per unit of unused grip. Each term compares two visits of the vehicle
+            to one cell, weighted by accuracy. The first sum adds the squared difference in grip
+            used. The second adds this difference times the difference in reported friction.
         flags_confirmed, flags_contradicted: how often values of other vehicles confirmed and
             contradicted the vehicle's slip controllers.
     """

@@ -1,6 +1,10 @@
 """Linearisation of the six measurement equations (rows: four wheels, two axles) of a group of nodes
-(friction hypotheses) at their means: noise of the rows, and derivatives by the states that enter
-linearly.
+(friction hypotheses) at their means. The result is the noise of the rows, and their derivatives by
+the linear states.
+
+The linear states are those in which the rows are linear or nearly linear, such as sensor offsets,
+steering error and wheel radii. The rows are nonlinear in the two velocities and the two tyre
+stiffnesses. For these four states, `node_filter` evaluates the rows at cubature points instead.
 """
 
 from __future__ import annotations

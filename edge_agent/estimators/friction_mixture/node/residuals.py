@@ -248,14 +248,17 @@ def correct_forces(
     node: NodeWorkspace,
     out: NodeForces,
 ) -> None:
-    """Compute the measured forces over load, and the slip that the tyre curve gives for them. Both
-    are corrected by the filter states in node.point: leak (gravity in a_y when the body rolls),
-    offsets, torque gain and curve shape.
+    """Compute the measured force over load of each wheel and axle (out.force), and the slip at
+    which the tyre curve gives this force (out.slip_at_force).
 
-    Without torque signals only the sum of the forces on both sides is measured. On a split road
-    (different friction left and right) the slippery side is then assumed to take at most
-    SPLIT_LIMIT of its friction, and the other side the rest. The unequal forces turn the car, and
-    the lateral forces of the axles balance that moment.
+    The filter states in node.point correct the forces. These states are the leak (gravity in a_y
+    when the body rolls), the sensor offsets, the torque gain and the curve shape.
+
+    Without torque signals, only the sum of the longitudinal forces on both sides is measured. On a
+    split road (different friction left and right), the function then divides the sum. The slippery
+    side gets at most SPLIT_LIMIT of its friction, and the other side gets the rest. The unequal
+    forces turn the car. Therefore the function also corrects the lateral forces of the axles, which
+    balance this yaw moment.
     """
     leak = lanes_at(node.point, NodeState.LEAK_Y)
     shape = lanes_at(node.point, NodeState.SHAPE)
