@@ -11,6 +11,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.report.reported_interval import (
     DRAWN_IN,
+    ICY_END,
     LEARNED_END,
     LOWER_END,
     UPPER_END,
@@ -114,6 +115,13 @@ def test_slippery_probability_agrees_with_the_quantiles(mu: float) -> None:
 def test_no_value_of_the_upper_end_is_preferred() -> None:
     ends = np.array([find_told_interval(about(mu, 0.08))[2] for mu in np.linspace(0.1, 0.4, 31)])
     assert (np.diff(ends) > 0.0).all()
+
+
+@pytest.mark.parametrize(("mu", "level"), [(0.15, ICY_END), (0.8, LOWER_END)])
+def test_lower_end_is_lower_on_a_slippery_road(mu: float, level: float) -> None:
+    weight = about(mu, 0.05)
+    lower, _, _ = find_told_interval(weight)
+    assert lower == pytest.approx(quantile(DESIGN.mu, DESIGN.prior, weight, level), abs=1e-3)
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:

@@ -23,7 +23,6 @@ from schemas.thresholds import GRAVITY
 
 # [1] share of the front axle in the driving force with rear, all-wheel and front drive
 DRIVES = (0.0, 0.45, 1.0)
-ALL_WHEELS = 1  # index of all-wheel drive
 FIRST_ODDS = (0.35, 0.3, 0.35)  # initial probabilities of rear, all-wheel and front drive
 SHARE_STD = 0.03  # [1] standard deviation of the front share if the kind is known
 BRAKES_FRONT = 0.64  # [1] share of the front axle in the brake force
@@ -80,7 +79,8 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
         asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))
         spread = constants.wheel_std + UNLIKE * (per_force + abs(asked))
         off = (apart - asked) / spread
-        if kind != ALL_WHEELS and off * asked > 0.0:
+        one_axle = DRIVES[kind] in (0.0, 1.0)
+        if one_axle and off * asked > 0.0:
             off = 0.0
         odds[kind] *= math.exp(
             -look
