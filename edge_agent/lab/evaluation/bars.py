@@ -169,6 +169,9 @@ BARS: Final = (
     ),
     EstimatorBar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
     EstimatorBar(
+        "real_world.false_ice.off_ice", in_the_world("false_ice.off_ice"), SHARE, 0.002, "less"
+    ),
+    EstimatorBar(
         "real_world.false_ice.of_all", in_the_world("false_ice.of_all"), SHARE, 0.002, "less"
     ),
     EstimatorBar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),

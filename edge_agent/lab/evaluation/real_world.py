@@ -19,6 +19,8 @@ Results
     false ice     share of the samples on wet and dry road that are called ice
     settled       false ice, without the samples within SETTLED_S (3 s) after the car has left snow
                   or ice, because an estimator notices the end of the ice only when grip is used
+    off_ice       false ice, without the samples in which a wheel is on snow or ice. The front axle
+                  reaches ice first, and the mean friction of the wheels is then still high.
     of_all        share of all samples that are called ice although the true friction is above
                   SURE_GRIP (.6)
     below         share of all samples whose friction interval is certainly wrong, because its upper
@@ -201,6 +203,7 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
     tally.add("missed_ice", ~icy, ice & excited)
     tally.add("false_grip", reported.mu_lower > mu + FALSE_GRIP, ice)
     tally.add("false_ice", icy, grips)
+    tally.add("false_ice.off_ice", icy, batch.mu_wheel.min(axis=-1) > SURFACES["wet"][0])
     tally.add("false_ice.of_all", icy & (mu > SURE_GRIP))
     tally.add("false_ice.settled", icy, grips & ~recent_maximum(~grips, SETTLED_S).astype(bool))
     tally.add("below", reported.mu_upper < in_use(batch))

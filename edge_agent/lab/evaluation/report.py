@@ -204,6 +204,7 @@ def world(values: dict[str, float]) -> str:
         "missed_ice": "missed ice",
         "false_grip": "false grip",
         "false_ice": "false ice",
+        "false_ice.off_ice": "off ice",
         "false_ice.of_all": "of all",
         "false_ice.settled": "settled",
         "below": "below",

@@ -60,6 +60,7 @@ ASKED = {
     "real_world.standing_5pct.v_max": (0.2, "less"),
     "real_world.width": (0.5, "less"),
     "real_world.false_ice": (0.002, "less"),
+    "real_world.false_ice.off_ice": (0.002, "less"),
     "real_world.false_ice.of_all": (0.002, "less"),
     "real_world.below": (0.002, "less"),
     "real_world.coverage90": (0.88, "more"),

@@ -85,9 +85,20 @@ def test_who_says_ice_of_every_road_is_right_on_ice_alone(
     found = figures(driven, saying(driven[0], 0.05, 0.2))
     assert [found[f"coverage90.{name}"] for name in ("snow", "wet", "dry")] == [0.0, 0.0, 0.0]
     assert found["false_ice"] == found["false_ice.settled"] == 1.0
+    assert found["false_ice.off_ice"] == 1.0
     assert found["false_ice.of_all"] == pytest.approx((driven[0].mu > 0.6).mean())
     assert 0.05 < found["below"] < 1.0
     assert found["score"] > 3.0
+
+
+def test_ice_below_one_wheel_is_false_ice_but_not_off_ice(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
+    reported = saying(driven[0], *PRIOR)
+    reported.values[..., Column.P_SLIPPERY] = driven[0].mu_wheel.min(axis=-1) <= 0.45
+    found = figures(driven, reported)
+    assert found["missed_ice"] == found["false_ice.off_ice"] == 0.0
+    assert found["false_ice"] > 0.0
 
 
 def test_the_prior_misses_ice_and_always_reporting_grip_is_false_grip(
