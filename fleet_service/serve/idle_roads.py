@@ -2,7 +2,7 @@
 
 Two enrolled vehicles that collude could report ice anywhere along plausible paths. On a road with
 other traffic, other vehicles contradict them. A road is idle if fewer than OTHERS_NEEDED (three)
-vehicles have ever reported it; there, nobody contradicts them.
+vehicles have ever reported it; no other vehicle contradicts them there.
 
 A vehicle supports an alert if it has reported the ice. On idle roads, the support of a vehicle
 counts in at most MOST_AREAS areas of radius AREA_M within AREA_NS. A vehicle that has reached this

@@ -8,6 +8,9 @@ the quantile level of the upper end decreases with the information gained, which
 of the node probabilities from the prior (Kullback and Leibler 1951). It decreases further if the
 car behaves as its vehicle file predicts (`trust.nominal_agreement`).
 
+The quantile level of the lower end decreases from LOWER_END to ICY_END as P(mu < SLIPPERY_MU) rises
+from .5 to 1.
+
 P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
 to its prior value.
 """
