@@ -152,7 +152,7 @@ def report_prior(design: MixtureDesign, output: FloatArray) -> None:
     """
     write_unknown(output)
     for k, level in enumerate((0.5, LOWER_END, UPPER_END)):
-        value = quantile(design.mu, design.prior, design.prior, level)
+        value = quantile(design.mu, design.width, design.prior, level)
         output[Column.MU + k] = value
         for wheel in range(4):
             output[Column.WHEELS + 3 * wheel + k] = value

@@ -65,6 +65,7 @@ MOVES = {
     # Group: road.
     "hazard": Move("least probabilities", "j-turn", 1.5),
     # Ice is expected after a longer distance without grip demand.
+    "common_mu": Move("upper", "slalom", 0.97, 0.8),
     "patch_length": Move("lower", "slalom", 1.015),
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
@@ -101,7 +102,7 @@ MOVES = {
     "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
     "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
     # The residual of a stiff tyre is divided by a larger number.
-    "stiffness_power_x": Move("nis", "acceleration", 0.6),
+    "stiffness_power_x": Move("nis", "acceleration", 0.63),
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
     "informing": Move("std LN_KX", "j-turn", 1.03),
     "steer_gain_std": Move("std STEER_GAIN", "stopping", 2.5),
@@ -117,7 +118,7 @@ MOVES = {
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    "rear_unlike": Move("adaptation", "acceleration", 1.15),
+    "rear_unlike": Move("adaptation", "acceleration", 1.07),
     "gain_std": Move("width", "acceleration", 1.1),
     # Group: sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
@@ -151,7 +152,6 @@ MOVES = {
     # Group: wheels that show the velocity without a tyre model.
     "standing_time": Move("stands", "stopping", 0.5),
     "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
-    "agreeing_width": Move("v_x told by wheels", "pulses", 0.8, LESS),
     "agreeing_std": Move("std of wheels' v_x", "turn and straight", 1.6),
     "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),

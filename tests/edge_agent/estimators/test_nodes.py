@@ -1,6 +1,7 @@
 """Tests of mathematical identities of the friction mixture (grid of friction hypotheses). The prior
-must be uniform, and a road change must conserve probability. The likelihood that a visit (passage
-of a map cell) reports must equal the likelihood that entered the filter.
+must be uniform up to the friction of common tyres, and a road change must conserve probability. The
+likelihood that a visit (passage of a map cell) reports must equal the likelihood that entered the
+filter.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from edge_agent.estimators.friction_mixture.state.constants import NODES, Consta
 from edge_agent.estimators.friction_mixture.state.friction_grid import (
     RoadChange,
     change_road,
+    friction_prior,
     multiply_likelihood,
     node_table,
     quantile,
@@ -23,13 +25,24 @@ from edge_agent.estimators.friction_mixture.state.friction_grid import (
 )
 from schemas.mugrid import CENTRES
 
-MU, PRIOR = node_table(NODES)
+MU, WIDTH = node_table(NODES)
+PRIOR = friction_prior(MU, WIDTH, Constants().common_mu)
 
 
-def test_the_prior_of_the_nodes_is_uniform_in_mu_and_its_quantiles_say_so() -> None:
-    assert PRIOR.sum() == pytest.approx(1.0)
+def test_widths_of_nodes_are_uniform_in_mu() -> None:
+    assert WIDTH.sum() == pytest.approx(1.0)
     for q in (0.05, 0.5, 0.95):
-        assert quantile(MU, PRIOR, PRIOR, q) == pytest.approx(0.05 + 1.15 * q, abs=1e-9)
+        assert quantile(MU, WIDTH, WIDTH, q) == pytest.approx(0.05 + 1.15 * q, abs=1e-9)
+
+
+def test_prior_falls_above_the_common_friction() -> None:
+    density = PRIOR / WIDTH
+    common = Constants().common_mu > MU
+    assert PRIOR.sum() == pytest.approx(1.0)
+    assert density[common] == pytest.approx(density[0])
+    assert (np.diff(density[~common]) < 0.0).all()
+    assert density[-1] > 0.1 * density[0]
+    assert density[~common].max() < 0.8 * density[0]
 
 
 def test_road_change_leaves_the_prior_as_it_is() -> None:

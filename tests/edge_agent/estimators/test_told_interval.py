@@ -22,6 +22,7 @@ from edge_agent.estimators.friction_mixture.state.design import design_of
 from edge_agent.estimators.friction_mixture.state.friction_grid import probability_below, quantile
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext
+from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import nogil
 from schemas.runtime.records import Records, put_record, records
@@ -75,9 +76,20 @@ def about(mu: float, width: float) -> FloatArray:
 
 def test_who_knows_nothing_tells_the_prior() -> None:
     lower, median, upper = find_told_interval(DESIGN.prior)
-    assert upper == pytest.approx(0.05 + UPPER_END * 1.15, abs=1e-3)
-    assert median == pytest.approx(0.625, abs=1e-3)
-    assert lower == pytest.approx(0.05 + LOWER_END * 1.15, abs=1e-3)
+    expected = [prior_quantile(level) for level in (LOWER_END, 0.5, UPPER_END)]
+    assert [lower, median, upper] == pytest.approx(expected, abs=0.01)
+
+
+def prior_quantile(level: float) -> float:
+    """Return the quantile of the prior: uniform from .05 to `common_mu`, then falling linearly to 0
+    at 1.2.
+    """
+    common = DESIGN.constants.common_mu
+    tail = 0.5 * (UPPER - common)
+    above = (1.0 - level) * (common - LOWER + tail)
+    if above <= tail:
+        return UPPER - float(np.sqrt(2.0 * above * (UPPER - common)))
+    return common + tail - above
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.3, 0.5, 0.8])
@@ -95,21 +107,21 @@ def test_correct_vehicle_file_lowers_only_the_upper_end(
 def test_learned_upper_end_is_below_the_quantile_of_tempered_evidence() -> None:
     weight = about(0.8, 0.1)
     _, median, upper = find_told_interval(weight)
-    assert median < upper < quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
-    assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.prior, weight, LEARNED_END), abs=2e-3)
+    assert median < upper < quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
+    assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, LEARNED_END), abs=2e-3)
 
 
 def test_a_long_upper_tail_is_not_cut_off() -> None:
     weight = 0.85 * about(0.35, 0.05) + 0.15 * about(0.9, 0.05)
-    widest = quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
+    widest = quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
     assert find_told_interval(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.2, 0.3, 0.38, 0.42, 0.6])
 def test_slippery_probability_agrees_with_the_quantiles(mu: float) -> None:
     weight = about(mu, 0.08)
-    below = probability_below(DESIGN.mu, DESIGN.prior, weight, SLIPPERY_MU)
-    assert quantile(DESIGN.mu, DESIGN.prior, weight, below) == pytest.approx(SLIPPERY_MU, abs=1e-6)
+    below = probability_below(DESIGN.mu, DESIGN.width, weight, SLIPPERY_MU)
+    assert quantile(DESIGN.mu, DESIGN.width, weight, below) == pytest.approx(SLIPPERY_MU, abs=1e-6)
 
 
 def test_no_value_of_the_upper_end_is_preferred() -> None:
@@ -121,7 +133,7 @@ def test_no_value_of_the_upper_end_is_preferred() -> None:
 def test_lower_end_is_lower_on_a_slippery_road(mu: float, level: float) -> None:
     weight = about(mu, 0.05)
     lower, _, _ = find_told_interval(weight)
-    assert lower == pytest.approx(quantile(DESIGN.mu, DESIGN.prior, weight, level), abs=1e-3)
+    assert lower == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, level), abs=1e-3)
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:

@@ -93,7 +93,7 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         return
     middle = total / seen
     turning = TURN_SHARE * abs(features.yaw_rate) * row[Parameter.TRACK_FRONT]
-    allowed = constants.agreeing_width * abs(middle) + AGREE_FLOOR + 2.0 * step + turning
+    allowed = 2.0 * (constants.agreeing_std * abs(middle) + step) + AGREE_FLOOR + turning
     if not most - least <= allowed:
         rolling.disagreed_time = time
     unsure = memory.trust.distrust > 0.0

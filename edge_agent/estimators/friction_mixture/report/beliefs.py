@@ -39,9 +39,9 @@ def report_beliefs(
         elif memory.split:
             project_weights(design.sides.prior, design.sides.share[BOTH], scratch.expected)
             project_weights(memory.weight, design.sides.share[BOTH], scratch.projected)
-            visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, own[n])
+            visit_evidence(design.mu, design.width, scratch.projected, CENTRES, own[n])
             project_weights(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
             visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, visit[n])
         else:
-            visit_evidence(design.mu, design.prior, memory.weight[:NODES], CENTRES, own[n])
+            visit_evidence(design.mu, design.width, memory.weight[:NODES], CENTRES, own[n])
             visit_evidence(design.mu, design.prior, memory.visit_weight[:NODES], CENTRES, visit[n])

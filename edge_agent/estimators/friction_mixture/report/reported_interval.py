@@ -69,9 +69,9 @@ def find_interval(
     `likeness`, 0 to 1, is the agreement of the car with its vehicle file. `blended` (NODES,) is
     scratch memory.
     """
-    friction.median = quantile(design.mu, design.prior, weight, 0.5)
+    friction.median = quantile(design.mu, design.width, weight, 0.5)
     friction.upper = upper_end(design, weight, likeness)
-    friction.p_slippery = probability_below(design.mu, design.prior, weight, SLIPPERY_MU)
+    friction.p_slippery = probability_below(design.mu, design.width, weight, SLIPPERY_MU)
     rest = 1.0
     for j in range(PATCH_NODES):
         rest -= patch[j]
@@ -79,7 +79,7 @@ def find_interval(
         blended[j] = rest * weight[j] + (patch[j] if j < PATCH_NODES else 0.0)
     icy = max(2.0 * friction.p_slippery - 1.0, 0.0)
     level = LOWER_END + (ICY_END - LOWER_END) * icy
-    friction.lower = quantile(design.mu, design.prior, blended, level)
+    friction.lower = quantile(design.mu, design.width, blended, level)
 
 
 @compiled
@@ -96,8 +96,8 @@ def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> flo
             learned += weight[j] * math.log(weight[j] / design.prior[j])
     learned_end = LEARNED_END - NEARER * likeness
     level = learned_end + (UPPER_END - learned_end) * math.exp(-max(learned, 0.0) / LEARNED)
-    widest = quantile(design.mu, design.prior, weight, UPPER_END)
+    widest = quantile(design.mu, design.width, weight, UPPER_END)
     return max(
-        quantile(design.mu, design.prior, weight, level),
+        quantile(design.mu, design.width, weight, level),
         widest - DRAWN_IN - NEARER * likeness,
     )

@@ -93,6 +93,10 @@ class Constants(NamedTuple):
     window: float = 1.0
 
     # --- Road changes ---
+    # [1] friction up to which all values are equally likely without measurements; above it, the
+    # prior density falls linearly to 0 at 1.2. Ordinary tyres have .8 to 1.0 on dry asphalt, and
+    # few have more than 1.1.
+    common_mu: float = 1.0
     # [1/m] rate of changes to any other friction: one per 270 m. With one per 190 m, the belief
     # faded before the car used grip again.
     hazard: float = 1 / 270
@@ -131,7 +135,7 @@ class Constants(NamedTuple):
     # Errors of tyre curve and offsets then repeat from block to block.
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
-    sliding_slope: float = 0.38
+    sliding_slope: float = 0.33
     # [1] weight of the penalty for sliding wheels, whose slip may have any value. It is below 1
     # because a braking car seldom slides on all wheels.
     sliding_penalty: float = 0.22
@@ -289,9 +293,8 @@ class Constants(NamedTuple):
     standing_time: float = 0.5
     # [s] time for which the wheels must agree before the speed is computed from them
     agreeing_time: float = 1.0
-    # [1] largest difference of agreeing wheels, relative to the speed, from radii and slip
-    agreeing_width: float = 0.02
-    # [1] relative error of the speed computed from agreeing wheels, from radii and slip
+    # [1] relative error of the speed computed from agreeing wheels, from radii and slip. Wheels
+    # agree if their speeds differ by less than twice as much.
     agreeing_std: float = 0.01
     # [m/s] smallest error of the speed computed from agreeing wheels. At its first sample, a car
     # slower than this counts as standing.

@@ -17,7 +17,10 @@ from edge_agent.estimators.friction_mixture.state.constants import (
     Constants,
     NodeState,
 )
-from edge_agent.estimators.friction_mixture.state.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.state.friction_grid import (
+    friction_prior,
+    node_table,
+)
 from edge_agent.estimators.friction_mixture.state.split_sides import Sides, side_table
 from edge_agent.estimators.friction_mixture.state.tyre_curve import (
     Curve,
@@ -45,6 +48,7 @@ class MixtureDesign(NamedTuple):
 
     constants: Constants
     mu: Annotated[FloatArray, NODES]  # friction of the nodes with one friction for both sides
+    width: Annotated[FloatArray, NODES]  # share of the friction range that a node represents
     prior: Annotated[FloatArray, NODES]
     sides: Sides  # friction and prior of all nodes
     curve: TyreCurve
@@ -100,11 +104,13 @@ def design_of(
     """Return the tables of a friction mixture (grid of friction hypotheses) for the given fuzzy
     sets. Studies pass other `constants`; other tyres need another `curve`.
     """
-    mu, prior = node_table(NODES)
     constants = constants or Constants()
+    mu, width = node_table(NODES)
+    prior = friction_prior(mu, width, constants.common_mu)
     return MixtureDesign(
         constants=constants,
         mu=mu,
+        width=width,
         prior=prior,
         sides=side_table(mu, prior, constants.split_prior),
         curve=curve_tables(

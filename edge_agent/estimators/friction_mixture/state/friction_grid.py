@@ -2,10 +2,11 @@
 prior, change of the road, quantiles and evidence.
 
 Legend
-    mu          node values, equidistant in sqrt(mu)              (K,)
-    prior       probability of each node under a uniform prior on [.05, 1.20]    (K,)
-    w           probabilities of the nodes                        (K,)
-    density     w/prior, the posterior over the uniform prior, linear between nodes
+    mu          node values, equidistant in sqrt(mu)                                  (K,)
+    width       share of the range [.05, 1.20] of mu that each node represents        (K,)
+    prior       probability of each node without measurements                         (K,)
+    w           probabilities of the nodes                                            (K,)
+    density     w/width, the posterior over a uniform distribution, linear between nodes
 """
 
 from __future__ import annotations
@@ -23,14 +24,27 @@ SMALLEST = 1e-12  # [1] smallest probability of a node, above 0 so that it can g
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return (mu, prior), shape (K,) each, for K = `count` nodes (assumed friction values).
+    """Return (mu, width), shape (K,) each, for K = `count` nodes (assumed friction values).
 
     The range of sqrt(mu) is divided into K equal cells. `mu` has the friction at the middle of each
-    cell, `prior` the probability of each cell under a uniform distribution of mu.
+    cell, `width` the share of the range of mu that the cell covers.
     """
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), count + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
     return middle**2, np.diff(edges**2) / (UPPER - LOWER)
+
+
+def friction_prior(mu: FloatArray, width: FloatArray, common: float) -> FloatArray:
+    """Return the probability (K,) of each node (assumed friction value) without measurements, for
+    the `mu` and `width` of `node_table`.
+
+    Up to the friction `common` all values are equally likely. Above it, the density falls linearly
+    to 0 at the end of the friction range, because few tyres have so much grip. If `common` lies
+    beyond this range, all values are equally likely.
+    """
+    fall = max(UPPER - common, SMALLEST)
+    mass = width * np.clip((UPPER - mu) / fall, 0.0, 1.0)
+    return np.asarray(mass / mass.sum())
 
 
 class RoadChange(NamedTuple):
@@ -103,7 +117,7 @@ def multiply_likelihood(w: FloatArray, log_likelihood: FloatArray) -> None:
 
 
 @compiled
-def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
+def quantile(mu: FloatArray, width: FloatArray, w: FloatArray, q: float) -> float:
     """Return the q-quantile of the friction, given probabilities w (K,) of the grid values mu (K,).
     The density between grid values is interpolated linearly; beyond the first and last value it is
     constant.
@@ -111,15 +125,15 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
     count = mu.shape[0]
     total = 0.0
     for j in range(count + 1):
-        total += _segment_mass(mu, prior, w, j)
+        total += _segment_mass(mu, width, w, j)
     target = q * total
     for j in range(count + 1):
-        mass = _segment_mass(mu, prior, w, j)
+        mass = _segment_mass(mu, width, w, j)
         if target <= mass or j == count:
             left = LOWER if j == 0 else mu[j - 1]
             right = UPPER if j == count else mu[j]
-            first = w[0] / prior[0] if j == 0 else w[j - 1] / prior[j - 1]
-            last = w[count - 1] / prior[count - 1] if j == count else w[j] / prior[j]
+            first = w[0] / width[0] if j == 0 else w[j - 1] / width[j - 1]
+            last = w[count - 1] / width[count - 1] if j == count else w[j] / width[j]
             slope = (last - first) / (right - left)
             root = math.sqrt(max(first * first + 2.0 * slope * target, 0.0))
             return float(min(left + 2.0 * target / max(first + root, SMALLEST), right))
@@ -128,19 +142,19 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
 
 
 @compiled
-def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: float) -> float:
+def probability_below(mu: FloatArray, width: FloatArray, w: FloatArray, limit: float) -> float:
     """Return the probability that the friction is below `limit`, given probabilities w (K,) of the
     grid values mu (K,). The density between grid values is interpolated linearly.
     """
     count = mu.shape[0]
     below = total = 0.0
     for j in range(count + 1):
-        mass = _segment_mass(mu, prior, w, j)
+        mass = _segment_mass(mu, width, w, j)
         total += mass
         if 0 < j < count and mu[j - 1] <= limit < mu[j]:
             share = (limit - mu[j - 1]) / (mu[j] - mu[j - 1])
-            first = w[j - 1] / prior[j - 1]
-            at_limit = first + share * (w[j] / prior[j] - first)
+            first = w[j - 1] / width[j - 1]
+            at_limit = first + share * (w[j] / width[j] - first)
             below += 0.5 * (limit - mu[j - 1]) * (first + at_limit)
         elif j < count and mu[j] <= limit:
             below += mass
@@ -148,18 +162,18 @@ def probability_below(mu: FloatArray, prior: FloatArray, w: FloatArray, limit: f
 
 
 @compiled
-def _segment_mass(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
+def _segment_mass(mu: FloatArray, width: FloatArray, w: FloatArray, j: int) -> float:
     """Return the unnormalised probability mass between nodes j - 1 and j. Nodes are the grid values
-    `mu` of friction, with the prior probabilities `prior` and the current probabilities `w`. For j
-    = 0, and for j equal to the number of nodes, the segment extends from the outer node to the end
-    of the friction range.
+    `mu` of friction; `width` is the share of the range that each represents, and `w` its
+    probability. For j = 0, and for j equal to the number of nodes, the segment extends from the
+    outer node to the end of the friction range.
     """
     count = mu.shape[0]
     if j == 0:
-        return float((mu[0] - LOWER) * w[0] / prior[0])
+        return float((mu[0] - LOWER) * w[0] / width[0])
     if j == count:
-        return float((UPPER - mu[count - 1]) * w[count - 1] / prior[count - 1])
-    return float(0.5 * (mu[j] - mu[j - 1]) * (w[j - 1] / prior[j - 1] + w[j] / prior[j]))
+        return float((UPPER - mu[count - 1]) * w[count - 1] / width[count - 1])
+    return float(0.5 * (mu[j] - mu[j - 1]) * (w[j - 1] / width[j - 1] + w[j] / width[j]))
 
 
 @compiled
