@@ -4,18 +4,14 @@ an estimator's posterior. For a reliable estimator, the share equals the level o
 Estimates contain only the quantiles 5, 50 and 95 %. The posterior at other levels is found as
 follows.
 
-- The default estimator can also output the likelihood of friction over a stretch of the drive. It
-  does so when the caller marks the end of the stretch. In the vehicle, a stretch is the passage of
-  a map cell. Here the stretch is the whole drive so far. The prior is uniform, so the posterior is
-  proportional to this likelihood. The end is marked in a copy of the estimator, so that the
-  original estimator can continue the drive.
+- The default estimator gives its posterior on the bins of the friction grid
+  (`EstimatorBank.beliefs`).
 - For other estimators, the posterior is assumed to be Gaussian, or uniform if the interval is as
   wide as the prior's (see `between_quantiles`).
 """
 
 from __future__ import annotations
 
-import copy
 from itertools import pairwise
 from typing import Final
 
@@ -44,7 +40,7 @@ def estimate_with_ranks(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates
     for first, end in pairwise([*range(0, samples, step), samples]):
         parts.append(bank.advance(batch.t[first:end], batch.signals[first:end]))
         if end < samples:
-            ranks.append(_rank_of_truth(bank, batch, end, parts[-1]))
+            ranks.append(_rank_of_truth(bank, batch.mu[end - 1], parts[-1]))
     return join_estimates(parts), np.array(ranks).reshape(-1, batch.t.shape[1])
 
 
@@ -55,32 +51,24 @@ def join_estimates(parts: list[Estimates]) -> Estimates:
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
-def _rank_of_truth(
-    bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates
-) -> FloatArray:
-    """Return, for each of N drives, the rank of the true friction at the sample before the index
-    `now`. The rank is the probability, according to the estimator's posterior, that the friction is
-    smaller than the true one.
+def _rank_of_truth(bank: EstimatorBank, truth: FloatArray, reported: Estimates) -> FloatArray:
+    """Return, for each of N drives, the rank of the true friction `truth` (N,) now. The rank is the
+    probability, according to the estimator's posterior, that the friction is smaller than the true
+    one. `reported` contains the estimates up to now.
     """
-    truth = batch.mu[now - 1]
-    closes = np.ones((1, len(truth)), np.bool_)
-    likelihood = (
-        copy.deepcopy(bank)
-        .advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes)
-        .evidence
-    )
-    if likelihood is None:
+    beliefs = bank.beliefs()
+    if beliefs is None:
         return between_quantiles(
             truth, reported.mu_lower[-1], reported.mu[-1], reported.mu_upper[-1]
         )
-    return on_the_grid(truth, likelihood[0])
+    return on_the_grid(truth, beliefs[0])
 
 
-def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
+def on_the_grid(truth: FloatArray, log_density: FloatArray) -> FloatArray:
     """Return the probability (N,) of friction below the true value `truth` (N,), according to
-    posteriors with log-likelihoods (N, 32) and a uniform prior.
+    posteriors on the friction grid, given as log(posterior/uniform) (N, 32).
     """
-    weight = np.exp(log_likelihood)
+    weight = np.exp(log_density)
     below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
     return np.array(
         [np.interp(mu, EDGES, [0.0, *row]) for mu, row in zip(truth, below, strict=True)]

@@ -118,7 +118,7 @@ MOVES = {
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    "rear_unlike": Move("adaptation", "acceleration", 1.07),
+    "rear_unlike": Move("least probabilities", "split-braking", 1.2),
     "gain_std": Move("width", "acceleration", 1.1),
     # Group: sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),

@@ -10,10 +10,9 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.report.reported_interval import (
-    DRAWN_IN,
     ICY_END,
-    LEARNED_END,
     LOWER_END,
+    NEARER,
     UPPER_END,
     find_interval,
 )
@@ -104,17 +103,18 @@ def test_correct_vehicle_file_lowers_only_the_upper_end(
     assert find_told_interval(DESIGN.prior, likeness=1.0) == find_told_interval(DESIGN.prior)
 
 
-def test_learned_upper_end_is_below_the_quantile_of_tempered_evidence() -> None:
+@pytest.mark.parametrize(("likeness", "level"), [(0.0, UPPER_END), (1.0, UPPER_END - NEARER)])
+def test_upper_end_of_much_evidence_is_its_quantile(likeness: float, level: float) -> None:
     weight = about(0.8, 0.1)
-    _, median, upper = find_told_interval(weight)
-    assert median < upper < quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
-    assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, LEARNED_END), abs=2e-3)
+    upper = find_told_interval(weight, likeness=likeness)[2]
+    assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, level), abs=2e-3)
 
 
 def test_a_long_upper_tail_is_not_cut_off() -> None:
     weight = 0.85 * about(0.35, 0.05) + 0.15 * about(0.9, 0.05)
     widest = quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
-    assert find_told_interval(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
+    upper = find_told_interval(weight, likeness=1.0)[2]
+    assert upper == pytest.approx(widest - NEARER, abs=1e-3)
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.2, 0.3, 0.38, 0.42, 0.6])

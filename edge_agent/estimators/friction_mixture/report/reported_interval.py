@@ -1,18 +1,17 @@
 """The reported friction interval. The quantile levels of both ends are chosen so that the interval
 covers the true friction as often as stated.
 
-The filter weakens (tempers) evidence so that a repeated error does not count twice. Therefore,
-after many measurements, the node probabilities (of the friction hypotheses) are spread wider than
-the actual errors. Without measurements they equal the prior, which has the right width. Therefore
-the quantile level of the upper end decreases with the information gained, which is the divergence
-of the node probabilities from the prior (Kullback and Leibler 1951). It decreases further if the
-car behaves as its vehicle file predicts (`trust.nominal_agreement`).
+The upper end is the UPPER_END quantile of the node probabilities (of the friction hypotheses). It
+is lower for a car that behaves as its vehicle file predicts (`trust.nominal_agreement`), once its
+measurements have changed the probabilities. The measure of this change is their divergence from the
+prior (Kullback and Leibler 1951).
 
 The quantile level of the lower end decreases from LOWER_END to ICY_END as P(mu < SLIPPERY_MU) rises
 from .5 to 1.
 
-P(mu < SLIPPERY_MU) is computed from the same node probabilities. Therefore it tends to be too close
-to its prior value.
+P(mu < SLIPPERY_MU) is computed from the same node probabilities. The filter weakens (tempers)
+evidence so that a repeated error does not count twice. Therefore P tends to be too close to its
+prior value.
 """
 
 from __future__ import annotations
@@ -34,19 +33,13 @@ LOWER_END = 0.03
 # (load, slope of the road), which more measurements do not reduce. On ice in four towns, the
 # interval contained the true friction in .89 of the samples with .03 and in .92 with .015.
 ICY_END = 0.015
-UPPER_END = 0.95  # [1] quantile level of the upper end without information
-# [1] quantile level of the upper end with much information. With .95 the true friction was above
-# the upper end in only 1 of 30 cases in town, and in 1 of 80 on level drives, not in 1 of 20.
-LEARNED_END = 0.86
-# [nat] scale of the information (divergence from the prior) over which the level changes
-LEARNED = 0.05
-# [1] largest reduction of the upper end, in friction. A belief that tends to ice has a long upper
-# tail, so the lower level alone could reduce the upper end too far.
-DRAWN_IN = 0.085
-# [1] further reduction of the level, and of the upper end, for a car that agrees with its vehicle
-# file, because its other errors are small too. The lower end stays, because safe deceleration
-# depends on it.
+UPPER_END = 0.95  # [1] quantile level of the upper end
+# [1] reduction of this level, and largest reduction of the upper end (in friction), for a car that
+# agrees with its vehicle file, because its other errors are small too. The lower end stays, because
+# safe deceleration depends on it.
 NEARER = 0.15
+# [nat] scale of the information (divergence from the prior) from which the level is reduced
+LEARNED = 0.05
 
 
 @compiled
@@ -94,10 +87,6 @@ def upper_end(design: MixtureDesign, weight: FloatArray, likeness: float) -> flo
     for j in range(weight.shape[0]):
         if weight[j] > 0.0:
             learned += weight[j] * math.log(weight[j] / design.prior[j])
-    learned_end = LEARNED_END - NEARER * likeness
-    level = learned_end + (UPPER_END - learned_end) * math.exp(-max(learned, 0.0) / LEARNED)
+    nearer = NEARER * likeness * (1.0 - math.exp(-max(learned, 0.0) / LEARNED))
     widest = quantile(design.mu, design.width, weight, UPPER_END)
-    return max(
-        quantile(design.mu, design.width, weight, level),
-        widest - DRAWN_IN - NEARER * likeness,
-    )
+    return max(quantile(design.mu, design.width, weight, UPPER_END - nearer), widest - nearer)

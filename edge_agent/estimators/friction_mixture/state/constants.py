@@ -94,9 +94,10 @@ class Constants(NamedTuple):
 
     # --- Road changes ---
     # [1] friction up to which all values are equally likely without measurements; above it, the
-    # prior density falls linearly to 0 at 1.2. Ordinary tyres have .8 to 1.0 on dry asphalt, and
-    # few have more than 1.1.
-    common_mu: float = 1.0
+    # prior density falls linearly to 0 at 1.2. Dry asphalt has .8 to .9 on average (Wong, Theory of
+    # Ground Vehicles, table 1.2), and few tyres reach 1.1. With a uniform prior, a drive at .6 g
+    # on a road of .85 was reported as 1.03.
+    common_mu: float = 0.9
     # [1/m] rate of changes to any other friction: one per 270 m. With one per 190 m, the belief
     # faded before the car used grip again.
     hazard: float = 1 / 270
@@ -135,7 +136,7 @@ class Constants(NamedTuple):
     # Errors of tyre curve and offsets then repeat from block to block.
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
-    sliding_slope: float = 0.33
+    sliding_slope: float = 0.38
     # [1] weight of the penalty for sliding wheels, whose slip may have any value. It is below 1
     # because a braking car seldom slides on all wheels.
     sliding_penalty: float = 0.22

@@ -12,7 +12,6 @@ import pytest
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.friction_mixture.report.reported_interval import (
-    LEARNED_END,
     LOWER_END,
     NEARER,
     UPPER_END,
@@ -92,7 +91,7 @@ def test_posterior_of_the_default_has_its_reported_quantiles(
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),
         (0.5, 0.5, reported.mu),
-        (LEARNED_END - NEARER, UPPER_END, reported.mu_upper),
+        (UPPER_END - NEARER, UPPER_END, reported.mu_upper),
     ):
         for side, level in ((-1.0, most), (1.0, least)):
             beside = output + side * 1.15 / BINS
