@@ -107,6 +107,7 @@ CAMPAIGNS: Final = {
         ".evaluation/worth",
         "edge-agent evaluate --only worth",
     ),
+    "coverage": Campaign("make coverage", ".evaluation/coverage", "coverage"),
     "faults": Campaign("make faults", ".faults", "faults"),
     "link": Campaign(
         "python -m tests.faults --only link --out .faults/link",

@@ -36,13 +36,13 @@ def test_widths_of_nodes_are_uniform_in_mu() -> None:
 
 
 def test_prior_falls_above_the_common_friction() -> None:
-    density = PRIOR / WIDTH
-    common = Constants().common_mu > MU
+    prior_density = PRIOR / WIDTH
+    is_common = Constants().common_mu > MU
     assert PRIOR.sum() == pytest.approx(1.0)
-    assert density[common] == pytest.approx(density[0])
-    assert (np.diff(density[~common]) < 0.0).all()
-    assert density[-1] > 0.1 * density[0]
-    assert density[~common].max() < 0.8 * density[0]
+    assert prior_density[is_common] == pytest.approx(prior_density[0])
+    assert (np.diff(prior_density[~is_common]) < 0.0).all()
+    assert prior_density[-1] > 0.1 * prior_density[0]
+    assert prior_density[~is_common].max() < 0.8 * prior_density[0]
 
 
 def test_road_change_leaves_the_prior_as_it_is() -> None:

@@ -65,7 +65,7 @@ def find_told_interval(
     )
 
 
-def about(mu: float, width: float) -> FloatArray:
+def weights_around(mu: float, width: float) -> FloatArray:
     """Return the probabilities (nodes,) of the friction hypotheses as a bell curve of width `width`
     around the friction `mu`.
     """
@@ -83,62 +83,64 @@ def prior_quantile(level: float) -> float:
     """Return the quantile of the prior: uniform from .05 to `common_mu`, then falling linearly to 0
     at 1.2.
     """
-    common = DESIGN.constants.common_mu
-    tail = 0.5 * (UPPER - common)
-    above = (1.0 - level) * (common - LOWER + tail)
-    if above <= tail:
-        return UPPER - float(np.sqrt(2.0 * above * (UPPER - common)))
-    return common + tail - above
+    common_mu = DESIGN.constants.common_mu
+    tail_mass = 0.5 * (UPPER - common_mu)
+    mass_above = (1.0 - level) * (common_mu - LOWER + tail_mass)
+    if mass_above <= tail_mass:
+        return UPPER - float(np.sqrt(2.0 * mass_above * (UPPER - common_mu)))
+    return common_mu + tail_mass - mass_above
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.3, 0.5, 0.8])
 def test_correct_vehicle_file_lowers_only_the_upper_end(
     mu: float,
 ) -> None:
-    weight = about(mu, 0.1)
-    rough = find_told_interval(weight)
-    alike = find_told_interval(weight, likeness=0.7)
-    assert alike[:2] == rough[:2]
-    assert alike[2] <= rough[2] - (0.02 if mu > 0.4 else 0.0)
+    weight = weights_around(mu, 0.1)
+    usual_interval = find_told_interval(weight)
+    nearer_interval = find_told_interval(weight, likeness=0.7)
+    assert nearer_interval[:2] == usual_interval[:2]
+    assert nearer_interval[2] <= usual_interval[2] - (0.02 if mu > 0.4 else 0.0)
     assert find_told_interval(DESIGN.prior, likeness=1.0) == find_told_interval(DESIGN.prior)
 
 
 @pytest.mark.parametrize(("likeness", "level"), [(0.0, UPPER_END), (1.0, UPPER_END - NEARER)])
 def test_upper_end_of_much_evidence_is_its_quantile(likeness: float, level: float) -> None:
-    weight = about(0.8, 0.1)
+    weight = weights_around(0.8, 0.1)
     upper = find_told_interval(weight, likeness=likeness)[2]
     assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, level), abs=2e-3)
 
 
 def test_a_long_upper_tail_is_not_cut_off() -> None:
-    weight = 0.85 * about(0.35, 0.05) + 0.15 * about(0.9, 0.05)
-    widest = quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
+    weight = 0.85 * weights_around(0.35, 0.05) + 0.15 * weights_around(0.9, 0.05)
+    widest_end = quantile(DESIGN.mu, DESIGN.width, weight, UPPER_END)
     upper = find_told_interval(weight, likeness=1.0)[2]
-    assert upper == pytest.approx(widest - NEARER, abs=1e-3)
+    assert upper == pytest.approx(widest_end - NEARER, abs=1e-3)
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.2, 0.3, 0.38, 0.42, 0.6])
 def test_slippery_probability_agrees_with_the_quantiles(mu: float) -> None:
-    weight = about(mu, 0.08)
+    weight = weights_around(mu, 0.08)
     below = probability_below(DESIGN.mu, DESIGN.width, weight, SLIPPERY_MU)
     assert quantile(DESIGN.mu, DESIGN.width, weight, below) == pytest.approx(SLIPPERY_MU, abs=1e-6)
 
 
 def test_no_value_of_the_upper_end_is_preferred() -> None:
-    ends = np.array([find_told_interval(about(mu, 0.08))[2] for mu in np.linspace(0.1, 0.4, 31)])
-    assert (np.diff(ends) > 0.0).all()
+    upper_ends = np.array(
+        [find_told_interval(weights_around(mu, 0.08))[2] for mu in np.linspace(0.1, 0.4, 31)]
+    )
+    assert (np.diff(upper_ends) > 0.0).all()
 
 
 @pytest.mark.parametrize(("mu", "level"), [(0.15, ICY_END), (0.8, LOWER_END)])
 def test_lower_end_is_lower_on_a_slippery_road(mu: float, level: float) -> None:
-    weight = about(mu, 0.05)
+    weight = weights_around(mu, 0.05)
     lower, _, _ = find_told_interval(weight)
     assert lower == pytest.approx(quantile(DESIGN.mu, DESIGN.width, weight, level), abs=1e-3)
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:
-    lower, median, upper = find_told_interval(about(0.8, 0.1))
-    icy, same_median, same_upper = find_told_interval(about(0.8, 0.1), 0.1)
+    lower, median, upper = find_told_interval(weights_around(0.8, 0.1))
+    icy, same_median, same_upper = find_told_interval(weights_around(0.8, 0.1), 0.1)
     assert icy < 0.2 < lower
     assert (same_median, same_upper) == (median, upper)
 
