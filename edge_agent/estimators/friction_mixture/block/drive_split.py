@@ -59,6 +59,26 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
 
 
 @compiled
+def free_axle(row: FloatArray, odds: FloatArray, ax: float) -> int:
+    """Return the index of the axle whose wheels roll freely: 0 front, 1 rear; -1 if none does so
+    for certain.
+
+    The wheels of an axle that is not driven roll freely while the car accelerates, because it does
+    not brake then. The kind of drive is that of the vehicle file (`row`), or else the learned one,
+    once its probability in `odds` (3,) leaves little doubt. `ax` [m/s^2] is the acceleration.
+    """
+    if not ax > PULLS * GRAVITY:
+        return -1
+    front = row[Parameter.DRIVE_FRONT]
+    doubt = 100.0 * LEAST_ODDS
+    if front == 0.0 or (math.isnan(front) and odds[0] > 1.0 - doubt):
+        return 0
+    if front == 1.0 or (math.isnan(front) and odds[2] > 1.0 - doubt):
+        return 1
+    return -1
+
+
+@compiled
 def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Update the probabilities that a car has front, rear or all-wheel drive, from the slip of its
     axles in the block (the samples within 0.05 s).

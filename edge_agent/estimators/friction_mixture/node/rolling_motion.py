@@ -4,7 +4,8 @@ alike, or the rear axle does not slide.
 - Rolling wheels: if the wheel speeds agree for a second, the wheels do not slide. The speed of the
   car is computed from them, corrected for the slip that their force needs. Reason: a tyre beyond
   its peak locks or spins up within a tenth of a second unless a controller acts. Four tyres never
-  do so alike.
+  do so alike. While the car accelerates with one driven axle, only the wheels of the other axle
+  count. They roll freely, even if the driven wheels spin.
 - Rear axle: with little lateral force, the rear axle does not slide sideways. The lateral velocity
   of the car is computed from its yaw rate and the small slip of the rear axle.
 
@@ -18,6 +19,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import ROUNDING, at_centre, mean_or
+from edge_agent.estimators.friction_mixture.block.drive_split import free_axle
 from edge_agent.estimators.friction_mixture.node.covariance import subtract_row, symmetric_at
 from edge_agent.estimators.friction_mixture.node.residuals import gained_by
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
@@ -73,22 +75,26 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     seen = 0
     step = 0.0
     fastest = 0.0
+    free = free_axle(row, memory.drive_odds, features.change)
+    needed = 3 if free < 0 else 2
     for wheel in range(4):
         speed = features.rolling[wheel]
         if math.isnan(speed):
+            continue
+        fastest = max(fastest, abs(speed))
+        if free >= 0 and wheel // 2 != free:
             continue
         ahead = at_centre(row, features, wheel)
         least = min(least, ahead)
         most = max(most, ahead)
         total = total + ahead
         seen = seen + 1
-        fastest = max(fastest, abs(speed))
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
-    still = seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
+    still = seen >= needed and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
     _update_standstill(memory, constants, features, still)
     held = fastest < LOCKED_SHARE * features.speed and abs(features.change) > SLIDES_M_S2
     locked = features.speed >= SLOW_M_S and (held or (still and not rolling.stands))
-    if seen < 3 or locked:
+    if seen < needed or locked:
         rolling.disagreed_time = time
         return
     middle = total / seen
@@ -100,7 +106,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     if unsure and seen == 4:
         middle = 0.5 * (total - least - most)
     if unsure or time - rolling.disagreed_time >= constants.agreeing_time:
-        _compute_velocities(memory, constants, features, middle, step)
+        pull = features.change / GRAVITY if free < 0 else 0.0
+        _compute_velocities(memory, constants, features, (middle, step, pull))
 
 
 @compiled
@@ -124,17 +131,20 @@ def _update_standstill(
 
 @compiled
 def _compute_velocities(
-    memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float
+    memory: MixtureMemory,
+    constants: Constants,
+    features: BlockFeatures,
+    seen: tuple[float, float, float],
 ) -> None:
     """Compute the velocity (v_x, v_y) that follows if the wheels roll, and its standard deviations.
-    `middle` [m/s] is the forward speed according to the wheels, and `step` the resolution of this
-    speed.
-
     The results are written into memory.rolling.
+
+    `seen` contains the forward speed according to the wheels [m/s], the resolution of this speed
+    [m/s], and the longitudinal force of these wheels over their load [1].
     """
     rolling = memory.rolling
     row = memory.row
-    pull = features.change / GRAVITY
+    middle, step, pull = seen
     slip = pull / row[Parameter.SLOPE_X]
     share = (
         constants.agreeing_std
