@@ -153,7 +153,8 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     below = [float(str(cell["mu_lower"])) for cell in excited]
     # In the cells where the vehicles stop, the drift of the median also moves the lower bound.
     assert max(below) <= ICE + 0.02
-    assert sum(lower <= ICE for lower in below) >= 0.9 * len(below)
+    # A bin of the friction grid is .036 wide.
+    assert sum(lower <= ICE + 0.01 for lower in below) >= 0.9 * len(below)
     for cell in excited:
         assert float(str(cell["mu_upper"])) >= ICE
         assert float(str(cell["p_slippery"])) >= 0.5  # an unknown road has .3

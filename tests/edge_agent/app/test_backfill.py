@@ -139,12 +139,15 @@ def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
 ) -> None:
     (pipe, *_) = (task.vehicle for task in piped_tasks(drives, tmp_path))
     words = ["replay", *map(str, logs(drives)), "--vehicle", str(pipe), "--estimator", "ckf"]
+    # A background job of a shell ignores Ctrl-C, and its child processes inherit this.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         [sys.executable, "-m", "edge_agent.cli", *words, "--out", str(tmp_path), "--jobs", jobs],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,  # a process group of its own, like a command in a shell
     )
+    signal.signal(signal.SIGINT, before)
     # `open` waits until a drive has begun. The drive cannot end while the pipe is open.
     with pipe.open("wb"), suppress(subprocess.TimeoutExpired):
         os.killpg(process.pid, signal.SIGINT)
@@ -152,7 +155,7 @@ def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
     # Python handles a signal late if it comes just before a blocking call, so no call may block.
     until(lambda: has_ended(process, pipe))
     _, reported = process.communicate()
-    assert process.returncode == 130
+    assert process.returncode == 130, reported
     assert reported.splitlines()[-1] == "interrupted"
     assert "Traceback" not in reported
     assert not logs(tmp_path)
