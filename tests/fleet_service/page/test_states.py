@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pytest
@@ -25,6 +25,9 @@ from tests.fleet_service.page.test_page import (
     open_map,
     waits,
 )
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
 
 pytestmark = pytest.mark.campaign  # starting a browser takes seconds
 
@@ -57,6 +60,29 @@ def card(seen: Opened, state: str) -> str:
     return seen.page.locator("#card").inner_text()
 
 
+class HeldRequests:
+    """A page's requests that match a URL pattern, held back until they are released. Later requests
+    pass at once, so that none of them is held for ever.
+    """
+
+    def __init__(self, seen: Opened, pattern: str) -> None:
+        self._waiting: list[Route] = []
+        self._released = False
+        seen.page.route(pattern, self._arrive)
+
+    def _arrive(self, route: Route) -> None:
+        if self._released:
+            route.continue_()
+        else:
+            self._waiting.append(route)
+
+    def release(self) -> None:
+        """Let all requests pass, those that wait and those that will come."""
+        self._released = True
+        for route in self._waiting:
+            route.continue_()
+
+
 def show_ice(seen: Opened, zoom: float = 17.2) -> None:
     """Show the part of the test street with ice, and wait until the page has drawn it."""
     seen.page.set_viewport_size(LAPTOP)
@@ -87,17 +113,14 @@ def test_map_without_a_service_says_so_and_is_hatched(bare: str) -> None:
 def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_page("about:blank") as seen:
-        held = list[Any]()
         seen.page.set_viewport_size(LAPTOP)
-        seen.page.route("**/blocks*", lambda route: held.append(route))
+        held = HeldRequests(seen, "**/blocks*")
         seen.page.goto(page.address)
         assert "Loading the map" in card(seen, "loading")
         assert not seen.page.locator("#slider").is_visible()
         assert "as vehicles report" not in seen.page.locator("#panel").inner_text()
         keep_picture(seen, "loading")
-        for one in held:
-            one.continue_()
-        seen.page.unroute("**/blocks*")
+        held.release()
         seen.page.wait_for_selector(READY, state="attached")
         waits(seen, "document.getElementById('card').hidden")
 
@@ -121,13 +144,10 @@ def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive)
         blocks = [url for url in seen.requests if "/blocks" in url]
         assert seen.requests.index(blocks[0]) < seen.requests.index(f"{page.address}moments")
     with open_page("about:blank") as seen:
-        held = list[Any]()
-        seen.page.route("**/blocks*", lambda route: held.append(route))
+        held = HeldRequests(seen, "**/blocks*")
         seen.page.goto(link)
         seen.page.wait_for_selector("#tab-alerts")
-        for one in held:
-            one.continue_()
-        seen.page.unroute("**/blocks*")
+        held.release()
         waits(seen, ICE_DRAWN)
 
 
