@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from deploy.demo import town
+from edge_agent.lab.simulation.fleet import vehicle_names
 from edge_agent.lab.simulation.scenarios import scenario_named
 
 START_S = 300.0  # time for the first start after a change, which compiles the kernels
@@ -97,12 +98,22 @@ class ManagedProcess:
         return counts
 
 
+def write_enrolment(folder: Path, vehicles: int) -> Path:
+    """Write the operator's list of the demo's vehicles, and return its path. The service accepts
+    only these, so it trusts them from their first report on.
+    """
+    path = folder / "enrolled.json"
+    path.write_text(json.dumps({"routers": {"demo": {}}, "vehicles": vehicle_names(vehicles)}))
+    return path
+
+
 @contextmanager
-def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
+def run_system(folder: Path, vehicles: int) -> Iterator[tuple[str, ManagedProcess]]:
     """Run a router and a fleet service on a free port of the loopback interface, until the `with`
     block ends. Yield the endpoint of the router and the process of the service.
 
-    The configuration for the agents is written to `folder/agent.json`.
+    The service accepts only the simulated `vehicles` (their number). The configuration for the
+    agents is written to `folder/agent.json`.
     """
     scripts = Path(sys.executable).parent
     router = ManagedProcess(
@@ -111,7 +122,10 @@ def run_system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
     try:
         endpoint = router.line_with("router: ").removeprefix("router: ").split()[0]
         zenoh = {"connect": [endpoint]}
-        (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo", **SHOWN}))
+        enrolled = str(write_enrolment(folder, vehicles))
+        (folder / "service.json").write_text(
+            json.dumps({"zenoh": zenoh, "name": "demo", "fleet": enrolled, **SHOWN})
+        )
         (folder / "agent.json").write_text(
             json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")})
         )

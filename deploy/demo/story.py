@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         "ice appears."
     )
     with (
-        processes.run_system(FOLDER) as (endpoint, service),
+        processes.run_system(FOLDER, args.vehicles) as (endpoint, service),
         processes.run_page(FOLDER, endpoint, service, args.page_port) as address,
     ):
         print(f"\n  Live map: {address}\n", flush=True)

@@ -150,9 +150,9 @@ def load_state(
     Raises:
         OSError: the archive cannot be read.
     """
-    begin = load_restart(root, config.lateness_s, (VISITORS, WAITING, PRESENT))
+    enrolled = config.fleet is not None
+    begin = load_restart(root, config.lateness_s, (VISITORS, WAITING, PRESENT), enrolled=enrolled)
     fusion = begin.fusion
-    fusion.enrolled = config.fleet is not None
     streams = begin.streams
     public = None
     # If the checkpoint contains no public cells, a cell is shown only after new visits.

@@ -78,8 +78,7 @@ class Fusion(BeliefMap):
         lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
             L) is late, and is fused with an aged (less certain) likelihood.
         enrolled: True if the service accepts only vehicles on the operator's list. Then nobody can
-            invent a name, so a vehicle without a history is not given the small weight of a
-            newcomer (`trust.compute_vote_weights`).
+            invent a name, so a vehicle without a history has full weight (`trust.initial_trust`).
 
     Attributes:
         reports: weather reports that a later update may still need.
@@ -93,7 +92,9 @@ class Fusion(BeliefMap):
         self._epoch: int | None = None
         self.reports: Reports = no_reports()
         super().__init__(
-            Store(), [initial_vote_weights(initial_trust(False))], weather_of(self.reports)
+            Store(),
+            [initial_vote_weights(initial_trust(enrolled=enrolled))],
+            weather_of(self.reports),
         )
 
     def resume(self, epoch: int | None, vote_weights: list[VoteWeights], reports: Reports) -> None:
@@ -242,7 +243,8 @@ class Fusion(BeliefMap):
             store.forget(before // NS)
             last = self.vote_weights[-1]
             joined = store.vehicles - len(last.weight)
-            weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
+            initial = initial_trust(enrolled=self.enrolled)
+            weight = np.append(last.weight, np.full(joined, initial, np.float32))
             votes = compute_vote_weights(
                 store.peers, last._replace(weight=weight), self._epoch, enrolled=self.enrolled
             )

@@ -77,6 +77,10 @@ _Y: Final = _WHOLE - _X
 _EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
 # sides of a cell; across: the opposite direction of the road
 _BEFORE, _BEHIND, _ACROSS = range(3)
+# [quarter turns] from the heading of a sector to its left and right
+_SIDEWAYS: Final = (1, 3)
+# Number of cells in which the other direction of the road may lie: the same cell, left and right.
+ACROSS: Final = 1 + len(_SIDEWAYS)
 
 
 @refcount_free_inlined
@@ -240,7 +244,7 @@ def _choose_message(
     sector = key % grid.SECTORS
     towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
     there = key // grid.SECTORS
-    for step in range(1, 4 if side == _ACROSS else c.NEIGHBOURS + 1):
+    for step in range(1, (ACROSS if side == _ACROSS else c.NEIGHBOURS) + 1):
         there = _step_to(key // grid.SECTORS, there, sector, side, step)
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
         if row == NONE or cells[row].vehicles == 0:
@@ -277,18 +281,19 @@ def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
         return next_cell(there, (sector + 2 * side) % grid.SECTORS)
     if step == 1:
         return cell
-    return next_cell(cell, (sector + 2 * step - 3) % grid.SECTORS)
+    return next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)
 
 
 @compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
-    """Return each slot (cell and heading sector), and the slots before and behind it that may
-    belong to the same slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS). Positions
-    without such a slot are NONE.
+    """Return each slot (cell and heading sector), and the other slots that may belong to the same
+    slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS + ACROSS). First comes the slot
+    itself, then those before it, those behind it, and those of the other direction of the road.
+    Positions without such a slot are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
-    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS), NONE)
+    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS + ACROSS), NONE)
     for k in range(len(slots)):
         out[k, 0] = slots[k]
         key = live.cells[slots[k]].key
@@ -303,6 +308,15 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
                 if _stored_slippery(live, row) < _ASKED:
                     break
                 out[k, 1 + side * c.NEIGHBOURS + step] = row
+        cell = key // grid.SECTORS
+        towards = (sector + 2) % grid.SECTORS
+        for step in range(ACROSS):
+            there = _step_to(cell, cell, sector, _ACROSS, step + 1)
+            row = find_row(table, live.cells, there * grid.SECTORS + towards)
+            if row == NONE or live.cells[row].vehicles == 0:
+                continue
+            if _stored_slippery(live, row) >= _ASKED:
+                out[k, 1 + 2 * c.NEIGHBOURS + step] = row
     return out
 
 

@@ -18,14 +18,16 @@ Legend
     ā    mean q of a pair of vehicles over their last meetings
     m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST and at most 1
     n₀   TRUST_PRIOR_PEERS, number of imagined other vehicles with which every vehicle starts
-    a₀   TRUST_PRIOR, share of the imagined vehicles with which it agreed
+    a₀   share of the imagined vehicles with which it agreed: TRUST_PRIOR, or 1 -
+         CONTAMINATION_LEAST if the service accepts only enrolled vehicles
     g    share of agreement of a vehicle; the sums run over the other vehicles
     T    trust, from 0 at g = TRUST_NONE to 1 at g = TRUST_FULL, linear between them
     ε    assumed share of wrong values of a vehicle
     r    weight of the vehicle's votes
 
     g = (n₀·a₀ + Σ m·ā) / (n₀ + Σ m)
-    ε = 1 - g, limited to the range from CONTAMINATION_LEAST to CONTAMINATION, for a known vehicle
+    ε = 1 - g, limited to the range from CONTAMINATION_LEAST to CONTAMINATION, for a known or
+        enrolled vehicle
     ε = CONTAMINATION, for other vehicles
     r = T·(1 - ε) / (1 - CONTAMINATION)
 
@@ -49,6 +51,9 @@ from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, SLIPPERY_MU
 
+# Assumed share of agreement of an enrolled vehicle that has not been compared with others: the
+# operator vouches for it, so it starts like a vehicle that agreed with all others.
+_ENROLLED_AGREEMENT: Final = 1.0 - c.CONTAMINATION_LEAST
 _LEAST_VARIANCE: Final = 1e-4  # relative; no vehicle measures μ more exactly than to 1 %
 
 
@@ -245,12 +250,15 @@ def compute_vote_weights(
     most NEWCOMER, so that an attacker gains nothing by reporting under a new name.
 
     `enrolled` is True if the service accepts only vehicles on the operator's list. Then nobody can
-    invent a name, and no vehicle is treated as a newcomer.
+    invent a name: no vehicle is a newcomer, and each starts with full weight (`initial_trust`).
     """
     weight = np.empty(len(before.weight), np.float32)
     established = _update_weights(peers, before.weight, weight, enrolled)
     return VoteWeights(
-        epoch, weight, initial_trust(established), heeded_flags(peers[: len(weight)])
+        epoch,
+        weight,
+        initial_trust(established=established, enrolled=enrolled),
+        heeded_flags(peers[: len(weight)]),
     )
 
 
@@ -264,6 +272,7 @@ def _update_weights(
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
+    prior = _ENROLLED_AGREEMENT if enrolled else c.TRUST_PRIOR
     for v in range(len(out)):
         this = peers[v]
         heard = 0.0
@@ -275,12 +284,11 @@ def _update_weights(
                 weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
                 heard += weight
                 agreed += weight * float(this.agreed[k]) / max(met, 1.0)
-        mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + heard)
+        mean = (prior * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + heard)
         known[v], trust = heard >= c.ESTABLISHED_PEERS, _scale_trust(mean)
         if known[v]:
             trusted += trust >= c.SOURCE_TRUST
-            trust *= max(min(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0)
-        out[v] = trust
+        out[v] = _known_weight(mean) if known[v] or enrolled else trust
     if enrolled or trusted < c.ESTABLISHED_VEHICLES:
         return False
     for v in range(len(out)):
@@ -321,13 +329,26 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     return Shape(float(np.clip(slope, 0.0, 1.0)), (squares + prior) ** -0.5)
 
 
-def initial_trust(established: bool) -> float:
-    """Return the weight of a vehicle that has not been compared with others yet; it is at most
-    NEWCOMER if the service is `established`, which means that it knows and trusts enough other
-    vehicles.
+def initial_trust(*, established: bool = False, enrolled: bool = False) -> float:
+    """Return the weight of a vehicle that has not been compared with others yet.
+
+    If the service accepts only `enrolled` vehicles, it is the weight of a vehicle that agreed with
+    all others. Otherwise it is at most NEWCOMER if the service is `established`, which means that
+    it knows and trusts enough other vehicles.
     """
+    if enrolled:
+        return float(_known_weight(_ENROLLED_AGREEMENT))
     weight = _scale_trust(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight
+
+
+@compiled
+def _known_weight(agreement: float) -> float:
+    """Return the vote weight r of a known or enrolled vehicle from its share of agreement g. It is
+    above 1 if the vehicle disagreed with others in less than the share CONTAMINATION.
+    """
+    right = min(agreement, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION)
+    return _scale_trust(agreement) * max(right, 1.0)
 
 
 @compiled

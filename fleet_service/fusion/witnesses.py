@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleet_service.fusion.constants import NEIGHBOURS
 from fleet_service.fusion.fuse import Fusion
 from fleet_service.fusion.neighbours import stretches
 from fleet_service.fusion.store.records import NONE, SOURCES, Side
@@ -16,7 +17,8 @@ from schemas.numeric import BoolArray, IntArray
 
 def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
     """Return, for each slot (cell and heading sector), the slots of the slippery stretch of road
-    around it, (k, n). The slot itself comes first; positions without a slot are NONE.
+    around it, in both directions of the road, (k, n). The slot itself comes first; positions
+    without a slot are NONE.
     """
     return stretches(fusion.store.state.live, fusion.store.table, slots)
 
@@ -28,7 +30,8 @@ class StretchSources(NamedTuple):
     Attributes:
         who: index of each of at most n vehicles per slot, (k, n).
         when: time of the vehicle's newest report [ns], (k, n); 0 for no vehicle.
-        around: mask (k,): True if such vehicles reported ice both before and behind the slot.
+        around: mask (k,): True if such vehicles reported ice both before and behind the slot, in
+            the slot's own direction of the road.
     """
 
     who: IntArray
@@ -48,8 +51,9 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
     )
     when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places, SOURCES)
     found = when.max(axis=2) > 0
-    middle = 1 + places // 2
-    around = found[:, 1:middle].any(axis=1) & found[:, middle:].any(axis=1)
+    middle = 1 + NEIGHBOURS
+    end = middle + NEIGHBOURS
+    around = found[:, 1:middle].any(axis=1) & found[:, middle:end].any(axis=1)
     who, when = _newest_first(who.reshape(-1, places * SOURCES), when.reshape(-1, places * SOURCES))
     again = np.tril(who[:, :, None] == who[:, None, :], -1).any(axis=2)
     return StretchSources(*_newest_first(who, np.where(again, 0, when)), around)

@@ -51,12 +51,15 @@ class Restart(NamedTuple):
     extra_tables: dict[str, dict[str, IntArray]]
 
 
-def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()) -> Restart:
+def load_restart(
+    root: Path, lateness_s: float, extra_tables: Sequence[str] = (), *, enrolled: bool = False
+) -> Restart:
     """Return the initial state from the newest usable checkpoint (saved state) of an archive; an
     empty state if there is none.
 
     A checkpoint contains the tables that `image_of` makes. The service may have added further
-    tables; `extra_tables` are the names of those to read.
+    tables; `extra_tables` are the names of those to read. `enrolled` is True if the service accepts
+    only vehicles on the operator's list.
     """
     refused = 0
     for path in checkpoints.list_checkpoints(root):
@@ -75,6 +78,7 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
                 for n, t in extra.items()
             }
             fusion = fusion_from(tables, lateness_s)
+            fusion.enrolled = enrolled
         except Exception as error:  # noqa: BLE001 for any problem: the archive has all rows
             log.warning("checkpoint %s is not used: %s", path.name, error)
             refused += 1
@@ -83,7 +87,8 @@ def load_restart(root: Path, lateness_s: float, extra_tables: Sequence[str] = ()
         return Restart(
             fusion, streams, standing, taken.cut, frozenset(taken.weather), refused, others
         )
-    return Restart(Fusion(lateness_s), SequenceTrackers(), [], None, frozenset(), refused, {})
+    fusion = Fusion(lateness_s, enrolled=enrolled)
+    return Restart(fusion, SequenceTrackers(), [], None, frozenset(), refused, {})
 
 
 def image_of(

@@ -154,6 +154,11 @@ def run(
     return records
 
 
+def vehicle_names(vehicles: int) -> list[str]:
+    """Return the names of the vehicles of a simulated fleet: sim-001, sim-002 and so on."""
+    return [f"sim-{k + 1:03d}" for k in range(vehicles)]
+
+
 class SimulatedFleet:
     """N vehicles on the roads of a scenario. A vehicle's drive depends only on its index and the
     other arguments, not on how many vehicles there are.
@@ -193,7 +198,7 @@ class SimulatedFleet:
         seed = checked_seed(seed)
         self.scenario = scenario_named(scenario)
         self.rate_hz = rate_hz
-        self.names = [f"sim-{k + 1:03d}" for k in range(vehicles)]
+        self.names = vehicle_names(vehicles)
         rngs = [np.random.default_rng([seed, k, VEHICLE_STREAM]) for k in range(vehicles)]
         truths = [
             one_of_a_fleet(k, name, rng)

@@ -46,8 +46,8 @@ def test_group_that_agrees_only_with_itself_loses_its_vote(
 
 
 def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
-    assert initial_trust(False) == pytest.approx(0.75)
-    assert Fusion(120.0).trust(7) == pytest.approx(initial_trust(False))
+    assert initial_trust() == pytest.approx(0.75)
+    assert Fusion(120.0).trust(7) == pytest.approx(initial_trust())
     assert drive_liars().trust(999) == pytest.approx(c.NEWCOMER)
 
 
@@ -62,6 +62,22 @@ def test_two_enrolled_vehicles_that_nobody_met_raise_an_alert() -> None:
         alerts = Alerts(fusion).update(updated.slots)
         raised.append([alert.vehicles for alert in alerts])
     assert raised == [[], [2]]
+
+
+def test_an_enrolled_vehicle_starts_like_one_that_agreed_with_all_others() -> None:
+    most = (1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION)
+    assert Fusion(120.0, enrolled=True).trust(7) == pytest.approx(most)
+    assert drive_liars(enrolled=True).trust(999) == pytest.approx(most)
+
+
+def test_two_enrolled_witnesses_outweigh_two_dry_visits_of_the_last_minute() -> None:
+    told = []
+    for enrolled in (False, True):
+        fusion = Fusion(120.0, enrolled=enrolled)
+        fusion.update(observations(np.arange(2.0), np.arange(2), value(np.full(2, 0.8))))
+        fusion.update(observations(20.0 + np.arange(2), 10 + np.arange(2), value(np.full(2, 0.15))))
+        told.append(slippery(belief(fusion)))
+    assert told[0] < 0.9 < told[1]
 
 
 def test_enrolled_liars_still_lose_their_vote() -> None:

@@ -211,6 +211,25 @@ def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
     assert [slot in alerts.slots for slot in slots.tolist()] == alerted
 
 
+@pytest.mark.parametrize(
+    ("sector", "mu", "alerted"),
+    [(2, 0.2, [True, True]), (1, 0.2, [False, False]), (2, 0.85, [False, False])],
+)
+def test_one_source_of_ice_in_each_direction_of_a_road_is_enough(
+    sector: int, mu: float, alerted: list[bool]
+) -> None:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    cells = grid.interleave(np.full(2, COLUMN), ROW + np.arange(2))
+    sectors = np.array([0, sector])
+    for vehicle, reported in ((0, 0.2), (1, mu)):
+        o = observations([10.0 * vehicle], [vehicle], value([reported]), int(cells[vehicle]))
+        o.sector[:] = sectors[vehicle]
+        alerts.update(fusion.update(o).slots)
+    slots = fusion.slots_of(cells, sectors)
+    assert [slot in alerts.slots for slot in slots.tolist()] == alerted
+
+
 def test_a_cell_between_two_sources_needs_none_of_its_own() -> None:
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
