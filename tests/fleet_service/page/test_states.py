@@ -68,15 +68,15 @@ class HeldRequests:
     def __init__(self, seen: Opened, pattern: str) -> None:
         self._waiting: list[Route] = []
         self._released = False
-        seen.page.route(pattern, self._arrive)
+        seen.page.route(pattern, self._hold_route)
 
-    def _arrive(self, route: Route) -> None:
+    def _hold_route(self, route: Route) -> None:
         if self._released:
             route.continue_()
         else:
             self._waiting.append(route)
 
-    def release(self) -> None:
+    def release_all(self) -> None:
         """Let all requests pass, those that wait and those that will come."""
         self._released = True
         for route in self._waiting:
@@ -120,7 +120,7 @@ def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
         assert not seen.page.locator("#slider").is_visible()
         assert "as vehicles report" not in seen.page.locator("#panel").inner_text()
         keep_picture(seen, "loading")
-        held.release()
+        held.release_all()
         seen.page.wait_for_selector(READY, state="attached")
         waits(seen, "document.getElementById('card').hidden")
 
@@ -147,7 +147,7 @@ def test_link_is_drawn_before_there_are_buttons(page: RunningPage, drive: Drive)
         held = HeldRequests(seen, "**/blocks*")
         seen.page.goto(link)
         seen.page.wait_for_selector("#tab-alerts")
-        held.release()
+        held.release_all()
         waits(seen, ICE_DRAWN)
 
 
