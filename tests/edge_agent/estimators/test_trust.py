@@ -18,6 +18,7 @@ from edge_agent.estimators.friction_mixture.mixture.trust import (
     FACTOR,
     axles_ratio,
     belief_strain,
+    update_consistency,
     used_evidence_share,
 )
 from edge_agent.estimators.friction_mixture.state.constants import Constants
@@ -94,6 +95,19 @@ def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
     trust, said = after(signals, t, vehicle)
     assert not said.any()
     assert trust["odd"] < CONSTANTS.odd_least
+
+
+@pytest.mark.parametrize(("held", "grows"), [(0.0, True), (1.0, False)])
+def test_a_slide_explains_the_errors_before_it_too(held: float, grows: bool) -> None:
+    t, signals, vehicle = drive("slalom", 0.85, seconds=6.0)
+    bank = mixture_bank(parameter_table([vehicle]), design_of(Memberships(), adaptive=True))
+    bank.advance(t[:500, None], signals[:500, None])
+    memory = bank._filters[0]
+    memory["slip"]["held"] = held
+    memory["trust"]["ratio"] = 2.0 * FACTOR
+    before = float(memory["trust"]["odd"])
+    update_consistency(memory, bank._contexts["design"][0], 0.05, 1.0, 0)
+    assert (float(memory["trust"]["odd"]) > before) == grows
 
 
 def test_unexplained_side_force_contradicts_until_patience_ends() -> None:

@@ -16,7 +16,7 @@ log-likelihood ratios against the model is `odd` [nat]; old terms fade within mi
 driving does not count in favour of the model, because the model cannot fail there. Once `odd`
 reaches the threshold `odd_least`, the filter draws no conclusions. The friction interval and the
 vehicle states then return to their prior, and the axles do not affect the motion. The test leaves
-out slides, slippery road and walking pace (`unexplained_ratio`).
+out slides, slippery road and walking pace (`unexplained_share`).
 
 While the filter draws no conclusions, the model cannot be tested. Therefore the filter uses the
 model again after `patience` [s]. Each further contradiction makes this time four times as long,
@@ -95,8 +95,10 @@ def update_consistency(
         return
     keep = math.exp(-duration / FORGIVEN_S)
     fading = math.exp(-duration / constants.window)
-    trust.ratio = fading * trust.ratio + (1.0 - fading) * unexplained_ratio(memory, design, ratio)
-    pace = axles_ratio(trust.ratio) / constants.window
+    share = unexplained_share(memory, design)
+    trust.ratio = fading * trust.ratio + (1.0 - fading) * share * ratio
+    # A slide explains the errors before it too: the front axle reaches ice before a wheel slides.
+    pace = axles_ratio(share * trust.ratio) / constants.window
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
     if health & flags.RESET:
@@ -109,20 +111,17 @@ def update_consistency(
 
 
 @compiled
-def unexplained_ratio(memory: MixtureMemory, design: MixtureDesign, ratio: float) -> float:
-    """Return the part of `ratio` that counts as a contradiction of the model, because neither a
-    slide nor slippery road explains it.
+def unexplained_share(memory: MixtureMemory, design: MixtureDesign) -> float:
+    """Return the share of the axles' squared innovations (measurement minus prediction) that counts
+    as a contradiction of the model, because neither a slide nor slippery road explains it.
 
-    `ratio` is the sum of the axles' squared innovations (measurement minus prediction) over their
-    stated variance. While a wheel slides, or the road is estimated to be slippery, the axles'
-    forces differ from the model for a while. Tight turns at walking pace are outside the model's
-    range and do not count either.
+    While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
+    model for a while. Tight turns at walking pace are outside the model's range and do not count
+    either.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max(speed / SLOW_M_S - 1.0, 0.0), 1.0)
-    return float(
-        moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)) * ratio
-    )
+    return float(moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)))
 
 
 @compiled
