@@ -37,7 +37,7 @@ FADE_BELOW: Final = 0.5
 # no alert. They may have reported it on the stretch, or in the cell only if a source of grip
 # opposes. In eight tuning towns, alerts covered .926 of the slippery cell-minutes with stretches,
 # .907 without. A stretch includes the other direction of the road: with it, ten tuning drives of
-# the demo needed 3.1 passes until an alert (mean of the drives' medians), and 3.5 without.
+# the demo needed 3.2 passes until an alert (mean of the drives' medians), and 3.6 without.
 LEAST_SOURCES: Final = 2
 # [ns] MOST_SOURCES sources of ice in the cell are needed, unless every source of grip is older than
 # the second newest source of ice by at least this. Earlier sources of grip do not contradict ice,
