@@ -98,7 +98,7 @@ def update_consistency(
     share = unexplained_share(memory, design)
     trust.ratio = fading * trust.ratio + (1.0 - fading) * share * ratio
     # A slide explains the errors before it too: the front axle reaches ice before a wheel slides.
-    pace = axles_ratio(share * trust.ratio) / constants.window
+    pace = axles_ratio((1.0 - memory.slip.held) * trust.ratio) / constants.window
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
     if health & flags.RESET:
