@@ -110,6 +110,10 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
 
     Without a reset, nodes (friction hypotheses) that assume these wheels slide would not recover:
     the tyre curve is flat there, so the measurements hardly change their velocity.
+
+    The lateral velocity counts only if the filter itself is unsure of it. The rear axle is assumed
+    to follow because the lateral acceleration is small, which is always so on ice. In a short slide
+    the filter is sure of the lateral velocity, and the assumption is wrong.
     """
     rolling = memory.rolling
     if math.isnan(rolling.ahead):
@@ -117,7 +121,8 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
     near = design.constants.diverged_x + FAR_SHARE * abs(rolling.ahead)
     far = near + FAR_SPREADS * rolling.ahead_std
     astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
-    if not math.isnan(rolling.left):
+    own_std = math.sqrt(memory.overall_covariance[NodeState.VY, NodeState.VY])
+    if not math.isnan(rolling.left) and own_std > FAR_SPREADS * rolling.left_std:
         far = near + FAR_SPREADS * rolling.left_std
         astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
     return _begin_anew(memory, design, rolling.ahead) if astray else 0
