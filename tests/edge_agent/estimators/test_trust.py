@@ -12,6 +12,7 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.block.block_features import strained_noise
 from edge_agent.estimators.friction_mixture.mixture.trust import (
@@ -21,7 +22,7 @@ from edge_agent.estimators.friction_mixture.mixture.trust import (
     update_consistency,
     used_evidence_share,
 )
-from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import design_of
 from edge_agent.estimators.friction_mixture.state.memory import Trust
 from schemas.numeric import BoolArray, FloatArray
@@ -108,6 +109,24 @@ def test_a_slide_explains_the_errors_before_it_too(held: float, grows: bool) -> 
     before = float(memory["trust"]["odd"])
     update_consistency(memory, bank._contexts["design"][0], 0.05, 1.0, 0)
     assert (float(memory["trust"]["odd"]) > before) == grows
+
+
+@pytest.mark.parametrize(
+    ("speed", "held", "share"), [(20.0, 0.0, 0.5), (1.0, 0.0, 0), (20.0, 1.0, 0)]
+)
+def test_a_reset_counts_half_unless_it_is_explained(
+    speed: float, held: float, share: float
+) -> None:
+    t, signals, vehicle = drive("slalom", 0.85, seconds=6.0)
+    bank = mixture_bank(parameter_table([vehicle]), design_of(Memberships(), adaptive=True))
+    bank.advance(t[:500, None], signals[:500, None])
+    memory = bank._filters[0]
+    memory["overall_mean"][NodeState.VX] = speed
+    memory["slip"]["held"] = held  # a wheel slides
+    memory["trust"]["odd"] = memory["trust"]["ratio"] = 0.0
+    update_consistency(memory, bank._contexts["design"][0], 0.05, 0.0, flags.RESET)
+    expected = share * CONSTANTS.odd_least
+    assert float(memory["trust"]["odd"]) == pytest.approx(expected, rel=0.1, abs=0.01)
 
 
 def test_unexplained_side_force_contradicts_until_patience_ends() -> None:

@@ -21,7 +21,8 @@ out slides, slippery road and walking pace (`unexplained_share`).
 While the filter draws no conclusions, the model cannot be tested. Therefore the filter uses the
 model again after `patience` [s]. Each further contradiction makes this time four times as long,
 because sensors do not repair themselves. A reset of the motion to the wheel speeds counts as half a
-contradiction.
+contradiction, where no slide, slippery road or walking pace explains it. For example, many wheel
+sensors give no signal below 1 m/s, so that a car that starts seems to jump.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def update_consistency(
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
     if health & flags.RESET:
-        trust.odd += CALLED_BACK * constants.odd_least
+        trust.odd += share * CALLED_BACK * constants.odd_least
     if trust.odd >= constants.odd_least:
         trust.patience = min(max(RELAPSE * trust.patience, constants.patience), LONGEST_PATIENCE)
         trust.left = trust.patience
