@@ -30,8 +30,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-LOST_SPREAD_M_S = 5.0  # [m/s] standard deviation of v_x after a reset without a known speed
-# The motion is reset if it differs from the wheels by more than `diverged_x` plus two terms:
+# The motion is reset if it differs from the wheels by more than `diverged` plus two terms:
 FAR_SHARE = 0.04  # [1] share of the wheels' speed
 FAR_SPREADS = 2.0  # [1] number of standard deviations of the wheels' speed
 
@@ -118,7 +117,7 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
     rolling = memory.rolling
     if math.isnan(rolling.ahead):
         return 0
-    near = design.constants.diverged_x + FAR_SHARE * abs(rolling.ahead)
+    near = design.constants.diverged + FAR_SHARE * abs(rolling.ahead)
     far = near + FAR_SPREADS * rolling.ahead_std
     astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
     own_std = math.sqrt(memory.overall_covariance[NodeState.VY, NodeState.VY])
@@ -130,12 +129,12 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
 
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
-    """Restart the motion estimate at `speed` [m/s], or at its current value if `speed` is NaN.
-    Reset all other states and the friction to the prior.
+    """Restart the motion estimate at `speed` [m/s]. Reset all other states and the friction to the
+    prior.
     """
     # The states learned while the motion was wrong are wrong too.
     forget_vehicle(memory)
-    restart_motion(memory, speed, LOST_SPREAD_M_S)
+    restart_motion(memory, speed, FIRST_V_STD)
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0

@@ -92,15 +92,12 @@ MOVES = {
     "farthest": Move("penalty", "braking", 0.5, LESS),
     # With a smaller limit, R adapts less to large innovations.
     "huber": Move("nis", "stopping", 3.0, LESS),
-    "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
-    "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
+    "diverged": Move("nodes apart in v_x", "braking", 0.6, LESS),
     # Group: tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the
     # state SHAPE.
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
-    "curve_e": Move("sharpness", "j-turn", 0.95),
     "shape_std": Move("std SHAPE", "gaining-slalom", 2.0),
-    "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
-    "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
+    "stiffness_std": Move("std LN_KX", "gaining-slalom", 2.0),
     # The residual of a stiff tyre is divided by a larger number.
     "stiffness_power_x": Move("nis", "acceleration", 0.63),
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
@@ -118,7 +115,7 @@ MOVES = {
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    "rear_unlike": Move("least probabilities", "split-braking", 1.2),
+    "rear_unlike": Move("least probabilities", "split-braking", 1.1),
     "gain_std": Move("width", "acceleration", 1.1),
     # Group: sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
@@ -147,7 +144,6 @@ MOVES = {
     "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "constant-radius", 0.95),
     "lag": Move("nis", "pulses", 0.85),
-    "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.91),
     # Group: wheels that show the velocity without a tyre model.
     "standing_time": Move("stands", "stopping", 0.5),
@@ -155,11 +151,8 @@ MOVES = {
     "agreeing_std": Move("std of wheels' v_x", "turn and straight", 1.6),
     "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
-    "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
-    "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),
     # Group: guard against a friction below the grip in use.
-    "guard_margin": Move("least probabilities", "braking", 1.4),
     "guard_std": Move("least probabilities", "acceleration", 1.25),
     # Group: contradiction between the car and the vehicle model.
     "strain_prior": Move("strain", "turn and straight", 1.1),  # the strain is learned more slowly

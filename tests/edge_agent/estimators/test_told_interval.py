@@ -10,7 +10,6 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.report.reported_interval import (
-    ICY_END,
     LOWER_END,
     NEARER,
     UPPER_END,
@@ -131,7 +130,7 @@ def test_no_value_of_the_upper_end_is_preferred() -> None:
     assert (np.diff(upper_ends) > 0.0).all()
 
 
-@pytest.mark.parametrize(("mu", "level"), [(0.15, ICY_END), (0.8, LOWER_END)])
+@pytest.mark.parametrize(("mu", "level"), [(0.15, 0.5 * LOWER_END), (0.8, LOWER_END)])
 def test_lower_end_is_lower_on_a_slippery_road(mu: float, level: float) -> None:
     weight = weights_around(mu, 0.05)
     lower, _, _ = find_told_interval(weight)

@@ -42,7 +42,6 @@ from schemas.thresholds import GRAVITY
 SLOWEST_COMPARED_M_S = 1.0
 NO_FORCE_SHARE = 0.3  # [1] standard deviation of force over load without torque and a_x
 ROUNDING = 1 / math.sqrt(12.0)  # [1] standard deviation of rounding, over the step
-STEEPEST = 0.3  # [1] smallest cosine of a steering angle by which a wheel speed is divided
 # A difference of slip between the sides must exceed these numbers of standard deviations:
 CERTAIN = 4.0  # of the wheel-speed noise
 LIKELY = 2.0  # of the estimated difference of the wheel radii
@@ -169,7 +168,7 @@ def _compute_wheel_forces(
             known = row[Parameter.MASS] * features.change
             unit = 0.5 * (front if wheel < 2 else 1.0 - front) * row[Parameter.MASS]
             force = unit * features.change
-            apart = math.hypot(constants.no_torque_share * force, 0.5 * front_std * known)
+            apart = math.hypot(constants.force_share * force, 0.5 * front_std * known)
             spread = math.hypot(apart, 0.25 * row[Parameter.MASS] * constants.no_torque_floor)
             if math.isnan(ax):
                 unit = 0.0
@@ -177,7 +176,7 @@ def _compute_wheel_forces(
             elif lone >= 0 and not brakes:  # the other axle provides the rest of the force m*a_x
                 unit = 0.5 * row[Parameter.MASS]
                 force = 0.5 * (known - axle_force(memory, features, lone))
-                spread = math.hypot(spread, constants.no_torque_share * unit * features.change)
+                spread = math.hypot(spread, constants.force_share * unit * features.change)
         features.force[wheel], features.force_unit[wheel] = (
             force / loads[wheel],
             unit / loads[wheel],
@@ -375,8 +374,7 @@ def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
     px, py = wheel_position(row, wheel)
     across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
     return float(
-        (features.rolling[wheel] - across) / max(features.steer_cos[wheel], STEEPEST)
-        + py * features.yaw_rate
+        (features.rolling[wheel] - across) / features.steer_cos[wheel] + py * features.yaw_rate
     )
 
 

@@ -24,7 +24,6 @@ from schemas.thresholds import GRAVITY
 # [1] share of the front axle in the driving force with rear, all-wheel and front drive
 DRIVES = (0.0, 0.45, 1.0)
 FIRST_ODDS = (0.35, 0.3, 0.35)  # initial probabilities of rear, all-wheel and front drive
-SHARE_STD = 0.03  # [1] standard deviation of the front share if the kind is known
 BRAKES_FRONT = 0.64  # [1] share of the front axle in the brake force
 BRAKES_STD = 0.06  # [1] standard deviation of BRAKES_FRONT between cars
 # [m/s^2] scale of engine braking, which acts on the driven axle only: from twice this deceleration
@@ -43,13 +42,13 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
     all-wheel and front drive.
     """
     front = row[Parameter.DRIVE_FRONT]
-    spread = SHARE_STD
+    spread = 0.0
     if math.isnan(front):
         front = square = 0.0
         for kind in range(3):
             front += odds[kind] * DRIVES[kind]
             square += odds[kind] * DRIVES[kind] ** 2
-        spread = math.sqrt(max(square - front * front, 0.0) + SHARE_STD**2)
+        spread = math.sqrt(max(square - front * front, 0.0))
     if ax >= 0.0:
         return front, spread
     brakes = min(-0.5 * ax / ENGINE_BRAKE, 1.0)  # weight of the brakes, 0 to 1

@@ -47,8 +47,8 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
     (2,) is the hypothetical friction on the left and right side; their mean counts. The penalty is
     0 if this mean is not below the grip in use.
     """
-    lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
-    return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, constants.largest_loss))
+    lack = (grip.slow - 0.5 * (side_mu[0] + side_mu[1])) / constants.guard_std - 1.0
+    return float(min(0.5 * max(lack, 0.0) ** 2, constants.largest_loss))
 
 
 @compiled

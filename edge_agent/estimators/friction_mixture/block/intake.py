@@ -38,7 +38,6 @@ from schemas.signals import S
 # [m/s^2] largest change between two readings of an accelerometer. A real jump is accepted at its
 # second reading.
 JUMP_M_S2 = 3.0
-HOLD_S = 0.025  # [s] a shorter gap of an accelerometer is filled with its last reading
 EARLY_S = 1e-6  # [s] tolerance of the block length for rounding of the sample times
 YAW_WALK = 3.0  # [rad/s/s^.5] random walk of the yaw rate: yaw acceleration of a lively car
 REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and slip difference
@@ -158,7 +157,7 @@ def _integrate_motion(
     time = last.time + dt
     if not math.isnan(ax + ay):
         last.inertial_time = time
-    elif time - last.inertial_time < HOLD_S:
+    elif time - last.inertial_time < 0.5 * constants.block_time:  # a short gap is filled
         ax = last.ax if math.isnan(ax) else ax
         ay = last.ay if math.isnan(ay) else ay
     leak_y = ay

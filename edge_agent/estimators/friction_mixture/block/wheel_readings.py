@@ -16,9 +16,9 @@ from schemas.signals import S
 # [m/s] largest difference from the second slowest wheel. A larger one is not a spinning wheel but a
 # decoding error (512 km/h occurred).
 SPINS_M_S = 20.0
-SAME_RAD_S = 0.02  # [rad/s] a reading that changes by less counts as unchanged
 HELD = 3  # number of unchanged readings after which a change counts as a step, not as noise
-# [rad/s] range of steps that occur in wheel speed signals; a step of 1 km/h is .9 rad/s
+# [rad/s] range of steps that occur in wheel speed signals; a step of 1 km/h is .9 rad/s. A reading
+# that changes by less than STEP_LEAST counts as unchanged.
 STEP_LEAST = 0.05
 STEP_MOST = 2.0
 STEP_PACE = 0.1  # [1] weight of a new step in the moving average of steps
@@ -53,9 +53,9 @@ def note_step(last: LastInputs, wheel: int, omega: float) -> None:
     one step.
     """
     change = abs(omega - last.omega[wheel])
-    if change < SAME_RAD_S:
+    if change < STEP_LEAST:
         last.omega_held[wheel] += 1
     elif not math.isnan(change):
-        if last.omega_held[wheel] >= HELD and STEP_LEAST < change < STEP_MOST:
+        if last.omega_held[wheel] >= HELD and change < STEP_MOST:
             last.omega_step[wheel] += STEP_PACE * (change - last.omega_step[wheel])
         last.omega_held[wheel] = 0

@@ -14,18 +14,15 @@ import math
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
 from edge_agent.estimators.friction_mixture.state.constants import NodeState
+from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.thresholds import UTILISED_WINDOW_S
 
-SLOWEST_M_S = 2.5  # [m/s] below this speed the resolution of wheel speeds looks like slip
-# [1] difference of two wheel speeds over the speed: a wheel may slide (foot), or slides (peak)
-APART_FOOT = 0.04
-APART_PEAK = 0.08
-# [m/s^2] difference of a wheel's acceleration from the car's: it may slide (foot), or slides (peak)
-SPIN_FOOT = 6.0
-SPIN_PEAK = 12.0
+# Each membership is 1 from the value below on, 0 up to half of it, and linear between them.
+APART_SLIDES = 0.08  # [1] difference of two wheel speeds over the speed
+SPIN_SLIDES = 12.0  # [m/s^2] difference of a wheel's acceleration from the car's
 SEEN = 0.3  # [1] increase of the membership from which a new slide counts as begun
 # [s] allowance added to the time that the rear axle needs to reach the place of the front axle
 REAR_LAG_S = 0.1
@@ -44,7 +41,7 @@ def update_slip(memory: MixtureMemory, features: BlockFeatures) -> None:
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
         slip.rear_unlike_until = (
-            memory.last.time + wheelbase / max(features.speed, SLOWEST_M_S) + REAR_LAG_S
+            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + REAR_LAG_S
         )
 
 
@@ -62,12 +59,12 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
             spin = max(
                 spin, abs(memory.row[Parameter.RADIUS] * features.spin[wheel] - features.change)
             )
-    if fastest < SLOWEST_M_S:
+    # Below this speed the resolution of the wheel speeds looks like slip.
+    if fastest < SLOW_M_S:
         return 0.0
     apart = (fastest - slowest) / fastest
-    by_speed = (apart - APART_FOOT) / (APART_PEAK - APART_FOOT)
-    by_spin = (spin - SPIN_FOOT) / (SPIN_PEAK - SPIN_FOOT)
-    return float(min(max(by_speed, by_spin, 0.0), 1.0))
+    degree = 2.0 * max(apart / APART_SLIDES, spin / SPIN_SLIDES) - 1.0
+    return float(min(max(degree, 0.0), 1.0))
 
 
 @compiled

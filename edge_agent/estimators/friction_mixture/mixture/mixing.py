@@ -21,7 +21,6 @@ import numpy as np
 
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.common.arrays import copy_vector
-from edge_agent.estimators.friction_mixture.mixture.trust import used_evidence_share
 from edge_agent.estimators.friction_mixture.node.covariance import mix_states
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
@@ -47,10 +46,6 @@ from schemas.runtime.records import LANES
 LEAST_MIXING = 1e-3  # [1] smaller shares are not mixed, because they change no digit of the output
 # [1] The split nodes are deactivated if their probability is below this share of `split_prior`.
 SLEEPING_SHARE = 0.5
-FORGOTTEN_S = 0.5  # [s] time in which friction returns to its prior while the model is distrusted
-# [1] exponent of the doubt about the model in the return to the prior. It is large, so that
-# friction is hardly forgotten before the model counts as contradicted.
-BRINK = 4
 # [1] largest share of a node's probability that moves to its neighbours in a block. A larger share
 # would overshoot the balance between neighbours.
 LARGEST_DRIFT = 0.5
@@ -117,12 +112,12 @@ def apply_road_change(
     constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
     hazard = 1.0 - math.exp(-metres * constants.hazard)
-    doubt = 1.0 - used_evidence_share(memory.trust, constants)
-    forgotten = 1.0 - math.exp(-(doubt**BRINK) * scratch.features.duration / FORGOTTEN_S)
     ended = max(memory.slip.ended, memory.slip.axle_ended)
     ended *= carried_degree(memory, constants, scratch.features.demand)
     slid = 1.0 - math.exp(-metres * constants.slip_hazard * ended)
-    hazard = max(hazard, forgotten, slid, constants.slip_change * memory.slip.begins)
+    hazard = max(hazard, slid, constants.slip_change * memory.slip.begins)
+    # While the model is distrusted, friction returns to its prior.
+    hazard = max(hazard, memory.trust.distrust)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
     predicted = scratch.predicted[:count]
@@ -231,10 +226,10 @@ def reset_diverged(
     for j in range(weight.shape[0]):
         own = velocity[j // LANES]
         astray = max(
-            abs(own[0, j % LANES] - velocity[group, 0, lane]) / constants.diverged_x,
-            abs(own[1, j % LANES] - velocity[group, 1, lane]) / constants.diverged_y,
+            abs(own[0, j % LANES] - velocity[group, 0, lane]),
+            abs(own[1, j % LANES] - velocity[group, 1, lane]),
         )
-        if astray > 1.0:
+        if astray > constants.diverged:
             _copy_node(memory, j, best)
             weight[j] = SMALLEST
 

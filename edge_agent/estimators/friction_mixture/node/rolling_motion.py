@@ -48,11 +48,8 @@ LOCKED_SHARE = 0.1
 LOST_S = 2.0
 # [s] longest slide with locked wheels: after it, standing wheels mean that the car stands
 LONGEST_SLIDE_S = 10.0
-AGREE_FLOOR = 0.15  # [m/s] wheel speeds that differ by less always count as equal
 # [1] relative error of the speed difference of both sides in a turn, from track and yaw rate
 TURN_SHARE = 0.05
-# [1] relative error of the sideslip computed from lateral force and nominal stiffness
-SIDE_SHARE = 0.5
 LEFT_FLOOR = 0.03  # [m/s] smallest error of the lateral velocity
 # [1] limit of v*r over the limit of a_y: both must be small, so that the rear axle cannot slide
 TURNING = 1.5
@@ -99,7 +96,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         return
     middle = total / seen
     turning = TURN_SHARE * abs(features.yaw_rate) * row[Parameter.TRACK_FRONT]
-    allowed = 2.0 * (constants.agreeing_std * abs(middle) + step) + AGREE_FLOOR + turning
+    error = constants.agreeing_std * abs(middle) + constants.agreeing_floor + step
+    allowed = 2.0 * error + turning
     if not most - least <= allowed:
         rolling.disagreed_time = time
     unsure = memory.trust.distrust > 0.0
@@ -146,11 +144,7 @@ def _compute_velocities(
     row = memory.row
     middle, step, pull = seen
     slip = pull / row[Parameter.SLOPE_X]
-    share = (
-        constants.agreeing_std
-        + constants.agreeing_slip * abs(slip)
-        + constants.agreeing_cube * abs(pull) ** 3
-    )
+    share = constants.agreeing_std + constants.agreeing_slip * abs(slip)
     rolling.ahead = (1.0 - slip) * middle
     rolling.ahead_std = math.sqrt((share * middle) ** 2 + constants.agreeing_floor**2 + step * step)
     side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
@@ -159,7 +153,8 @@ def _compute_velocities(
         rolling.left = (
             row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
         )
-        share = constants.following_std + SIDE_SHARE * abs(side) / row[Parameter.SLOPE_Y]
+        needed = abs(side) / row[Parameter.SLOPE_Y]
+        share = constants.steer_std + constants.agreeing_slip * needed
         rolling.left_std = share * abs(middle) + LEFT_FLOOR
 
 

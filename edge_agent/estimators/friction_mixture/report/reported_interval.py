@@ -6,8 +6,8 @@ is lower for a car that behaves as its vehicle file predicts (`trust.nominal_agr
 measurements have changed the probabilities. The measure of this change is their divergence from the
 prior (Kullback and Leibler 1951).
 
-The quantile level of the lower end decreases from LOWER_END to ICY_END as P(mu < SLIPPERY_MU) rises
-from .5 to 1.
+The quantile level of the lower end decreases from LOWER_END to half of it as P(mu < SLIPPERY_MU)
+rises from .5 to 1.
 
 P(mu < SLIPPERY_MU) is computed from the same node probabilities. The filter weakens (tempers)
 evidence so that a repeated error does not count twice. Therefore P tends to be too close to its
@@ -28,11 +28,10 @@ from schemas.thresholds import SLIPPERY_MU
 
 # [1] quantile level of the lower end. Safe deceleration depends on it: with .04 the lower end was
 # above the true friction for a sixth of the ice in town.
-LOWER_END = 0.03
-# [1] the same for a road that is certainly slippery. The forces of sliding wheels share an error
-# (load, slope of the road), which more measurements do not reduce. On ice in four towns, the
+# On a road that is certainly slippery, half of it applies. The forces of sliding wheels share an
+# error (load, slope of the road), which more measurements do not reduce. On ice in four towns, the
 # interval contained the true friction in .89 of the samples with .03 and in .92 with .015.
-ICY_END = 0.015
+LOWER_END = 0.03
 UPPER_END = 0.95  # [1] quantile level of the upper end
 # [1] reduction of this level, and largest reduction of the upper end (in friction), for a car that
 # agrees with its vehicle file, because its other errors are small too. The lower end stays, because
@@ -71,7 +70,7 @@ def find_interval(
     for j in range(weight.shape[0]):
         blended[j] = rest * weight[j] + (patch[j] if j < PATCH_NODES else 0.0)
     icy = max(2.0 * friction.p_slippery - 1.0, 0.0)
-    level = LOWER_END + (ICY_END - LOWER_END) * icy
+    level = LOWER_END * (1.0 - 0.5 * icy)
     friction.lower = quantile(design.mu, design.width, blended, level)
 
 

@@ -150,25 +150,20 @@ class Constants(NamedTuple):
     farthest: float = 3.6
     # [1] innovation, in standard deviations, beyond which R of a measurement is increased
     huber: float = 1.95
-    # [m/s] difference of v_x from the most probable node beyond which a node has diverged. The
-    # accelerometers exclude such a difference.
-    diverged_x: float = 0.7
-    # [m/s] difference of v_y from the most probable node beyond which a node has diverged
-    diverged_y: float = 1.0
+    # [m/s] difference of v_x or v_y from the most probable node beyond which a node has diverged.
+    # The accelerometers exclude such a difference.
+    diverged: float = 1.0
 
     # --- Tyre ---
     # [1] shape factor C of the Magic Formula, between 1.3 (lateral) and 1.65 (longitudinal) of
     # passenger car tyres
     curve_c: float = 1.45
-    # [1] curvature factor E of the Magic Formula, between the lateral and the longitudinal value
-    curve_e: float = -0.1
     # [1] standard deviation of the state SHAPE: most tyres lie between -1 (round) and 1 (sharp)
     shape_std: float = 0.85
-    # [1] standard deviation of ln of the longitudinal stiffness factor. Vehicle files of real cars
-    # are a third off (BMW M8, AV-21), which is within 3.6 standard deviations.
-    stiffness_x_std: float = 0.125
-    # [1] standard deviation of ln of the cornering stiffness factor (vehicle)
-    stiffness_y_std: float = 0.12
+    # [1] standard deviation of ln of the stiffness factors, longitudinal and cornering (vehicle).
+    # Vehicle files of real cars are a third off (BMW M8, AV-21), which is within 3.6 standard
+    # deviations.
+    stiffness_std: float = 0.12
     # [1] exponent of the stiffness factor by which a wheel's residual is divided. It exceeds 1
     # because slip is noisier than force.
     stiffness_power_x: float = 1.4
@@ -205,8 +200,8 @@ class Constants(NamedTuple):
     slope_length: float = 120.0
 
     # --- Steering ---
-    # [rad] standard deviation of the steering offset, with toe: 1 to 17 mrad on logs of real cars,
-    # mostly below 4
+    # [rad] standard deviation of the direction of an axle's wheels, from steering offset and toe: 1
+    # to 17 mrad on logs of real cars, mostly below 4
     steer_std: float = 0.004
     # [1] standard deviation of the steering gain: steering ratios in vehicle files of real
     # cars are 3 to 8 % off
@@ -260,7 +255,8 @@ class Constants(NamedTuple):
     # [1] error of the lateral force over load from toe, compliance, and the imperfect relation of
     # steering and a_y
     floor_y: float = 0.014
-    # [1] relative error of the longitudinal force: torque gain, mass and load 3 % each (vehicle)
+    # [1] relative error of the longitudinal force: torque gain, mass and load 3 % each (vehicle).
+    # Without torque: relative difference between the forces of an axle's wheels.
     force_share: float = 0.04
     # [1] relative error of an axle's lateral force: load transfer and inertia (vehicle)
     axle_share: float = 0.02
@@ -269,8 +265,6 @@ class Constants(NamedTuple):
     # [s] delay of lateral force behind slip (relaxation, roll). The error is this time multiplied
     # by the rate of the force.
     lag: float = 0.015
-    # [1] without torque: relative difference between the forces of an axle's wheels
-    no_torque_share: float = 0.1
     # [m/s^2] without torque: part of a_x that is neither force nor offset
     no_torque_floor: float = 0.1
     # [1] relative error of the force that accelerates a wheel's rotation. Torque and wheel speed
@@ -302,21 +296,14 @@ class Constants(NamedTuple):
     agreeing_floor: float = 0.1
     # [1] relative error of slip computed from force over load with the nominal stiffness
     agreeing_slip: float = 0.6
-    # [1] additional slip error near the limit of grip, per cubed force over load
-    agreeing_cube: float = 0.05
     # [1] a_y over g up to which the rear axle is assumed not to slide. Beyond it, a sliding axle
     # cannot be distinguished from one that follows.
     following_most: float = 0.15
-    # [rad] error of the sideslip of a following rear axle, besides the slip that its lateral force
-    # needs
-    following_std: float = 0.004
 
     # --- Grip in use as a lower limit of friction (`grip_guard.py`) ---
-    # [1] a node's friction may lie this far below the grip in use without penalty: accelerometer
-    # offset, slope, smoothing
-    guard_margin: float = 0.06
-    # [1] standard deviation of `guard_margin`
-    guard_std: float = 0.03
+    # [1] standard deviation of the grip in use: accelerometer offset, slope, smoothing. A node gets
+    # no penalty if its friction lies less than this below the grip in use.
+    guard_std: float = 0.045
 
     # --- Strain (`trust.py`) ---
     # [1] weight, in degrees of freedom, of the initial strain of 1, because a few measurements do
@@ -331,7 +318,8 @@ class Constants(NamedTuple):
     # [1] smallest factor of strain on R of the axles. A search for the best R of the axles found
     # .24 on level drives.
     strain_least: float = 0.25
-    # [1] largest factor of strain on R of the axles
+    # [1] largest factor of strain on R of the axles. Without it the car AV-21, whose strain is 4,
+    # was distrusted for .8 of a drive instead of .26.
     strain_most: float = 3.0
 
     # --- Contradiction of the model (`trust.py`) ---

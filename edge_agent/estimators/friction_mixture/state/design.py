@@ -69,8 +69,8 @@ def nominal_states(constants: Constants) -> Nominal:
     c = constants
     x = NodeState
     for state, spread in (
-        (x.LN_KX, c.stiffness_x_std),
-        (x.LN_KY, c.stiffness_y_std),
+        (x.LN_KX, c.stiffness_std),
+        (x.LN_KY, c.stiffness_std),
         (x.LEAK_Y, c.leak_y_std),
         (x.STEER, c.steer_std),
         (x.SHAPE, c.shape_std),
@@ -113,9 +113,7 @@ def design_of(
         width=width,
         prior=prior,
         sides=side_table(mu, prior, constants.split_prior),
-        curve=curve_tables(
-            curve or partial(magic_formulas, c=constants.curve_c, e=constants.curve_e)
-        ),
+        curve=curve_tables(curve or partial(magic_formulas, c=constants.curve_c, e=0.0)),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),
