@@ -14,7 +14,7 @@ from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import NOBODY, NONE, Rows, Side
+from fleet_service.fusion.store.records import NONE, Rows, Side
 from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Weather
@@ -154,10 +154,10 @@ class BeliefMap:
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters
-        who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
+        who = np.where(row[:, None] == NONE, NONE, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
         trusted = self.vote_weights[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
-        counted = (who != NOBODY) & trusted & (when > np.reshape(since, (-1, 1)))
+        counted = (who != NONE) & trusted & (when > np.reshape(since, (-1, 1)))
         return who, np.where(counted, when, 0)
 
 

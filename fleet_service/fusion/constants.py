@@ -71,9 +71,9 @@ SHARED_MOST: Final = 0.275
 # from differences between visits of the same vehicle. This amount is added to the learned slope,
 # because other tyres and surfaces may have other curves.
 SHAPE_DOUBT: Final = 0.1
-# Prior mean and standard deviation of the slope. The prior weighs as much as about 20 comparisons.
+# Prior mean of the slope, and its standard deviation. The prior weighs as much as about 20
+# comparisons.
 SHAPE_PRIOR: Final = 0.15
-SHAPE_STD: Final = 0.15
 # A comparison weighs as much as its squared difference in grip used, divided by its variance. When
 # a vehicle's weights exceed this sum, all its comparisons so far count half. The sum is almost
 # seven times the weight of the prior.
@@ -131,10 +131,8 @@ VOTE_RENEWAL_S: Final = 3600.0
 PEERS_DISAGREE: Final = 4.0
 
 # A value that differs from the vehicle's own last value in the cell counts again at once; the
-# vehicle's bias cancels in the difference. Up to NOVELTY_FROM standard deviations the difference
-# is noise. From NOVELTY_FULL on the vote counts in full.
-NOVELTY_FROM: Final = 2.0
-NOVELTY_FULL: Final = PEERS_DISAGREE
+# vehicle's bias cancels in the difference. Up to PEERS_AGREE standard deviations the difference is
+# noise. From PEERS_DISAGREE on the vote counts in full.
 # [μ] Smallest standard deviation that is believed in such a comparison.
 NOVELTY_STD: Final = 0.05
 # Number of whole votes that a vehicle has in a cell per VOTE_RENEWAL_S, however often its values
@@ -152,8 +150,6 @@ WAITING_MOST: Final = 32
 # visits give bounds, so the memory holds the visits of one hour and the values of three.
 FORGOTTEN_S: Final = 3.0 * VOTE_RENEWAL_S
 FORGOTTEN_EVERY_S: Final = 900  # [s] time between two deletions of reports too old to remember
-# Increase of the grip used from which a new bound counts as new information in full.
-NOVELTY_UTILISED: Final = 0.10
 
 # --- Visits without a value ---
 
@@ -198,7 +194,6 @@ UTILISED_MOST: Final = 0.9
 BOUND_CONTAMINATION: Final = 0.3
 # [μ] Standard deviation of a posterior sent without an interval: the distance from wet to dry road.
 POSTERIOR_STD: Final = 0.15
-POSTERIOR_STD_LEAST: Final = 0.02  # [μ] half a bin: the grid cannot represent less
 
 # --- Trust: comparison of values of different vehicles in the same cell ---
 
@@ -219,8 +214,7 @@ REPORTERS: Final = 6  # number of latest values per cell with which a new value 
 # enough for a mean.
 PEERS: Final = 48
 # Trust begins as if the vehicle had been compared with TRUST_PRIOR_PEERS others and had agreed
-# with the share TRUST_PRIOR.
-TRUST_PRIOR: Final = 0.85
+# with the share of values that contain information about the road, 1 - CONTAMINATION.
 TRUST_PRIOR_PEERS: Final = 8.0
 # Share of agreement at or below which a vehicle has no weight: it disagrees with 30 % of the
 # trusted vehicles. If less than a third of a fleet colludes, only the colluders fall below it.

@@ -155,4 +155,5 @@ def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) ->
 
 def _side_std(to_bound: FloatArray) -> FloatArray:
     std = np.nan_to_num(to_bound / Z_95, nan=c.POSTERIOR_STD)
-    return np.maximum(std, c.POSTERIOR_STD_LEAST)
+    # The grid cannot represent less than half a bin.
+    return np.maximum(std, 0.5 * c.BIN_WIDTH)

@@ -120,7 +120,7 @@ class Shape(NamedTuple):
 
 # Slopes (error of a value per unit of unused grip) with a table of kernels; the nearest is used.
 SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)
-UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_STD)
+UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_PRIOR)
 
 
 def shared_kernel(

@@ -18,7 +18,7 @@ Legend
     ā    mean q of a pair of vehicles over their last meetings
     m    weight of the other vehicle: its trust, at least TRUST_HEARD_LEAST and at most 1
     n₀   TRUST_PRIOR_PEERS, number of imagined other vehicles with which every vehicle starts
-    a₀   share of the imagined vehicles with which it agreed: TRUST_PRIOR, or 1 -
+    a₀   share of the imagined vehicles with which it agreed: 1 - CONTAMINATION, or 1 -
          CONTAMINATION_LEAST if the service accepts only enrolled vehicles
     g    share of agreement of a vehicle; the sums run over the other vehicles
     T    trust, from 0 at g = TRUST_NONE to 1 at g = TRUST_FULL, linear between them
@@ -43,7 +43,7 @@ import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.shared import Shape
-from fleet_service.fusion.store.records import NOBODY, USED
+from fleet_service.fusion.store.records import NONE, USED
 from fleet_service.fusion.vote_weights import VoteWeights
 from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array
@@ -54,6 +54,7 @@ from schemas.thresholds import NS, SLIPPERY_MU
 # Assumed share of agreement of an enrolled vehicle that has not been compared with others: the
 # operator vouches for it, so it starts like a vehicle that agreed with all others.
 _ENROLLED_AGREEMENT: Final = 1.0 - c.CONTAMINATION_LEAST
+_AGREEMENT: Final = 1.0 - c.CONTAMINATION
 _LEAST_VARIANCE: Final = 1e-4  # relative; no vehicle measures μ more exactly than to 1 %
 
 
@@ -109,7 +110,7 @@ def compare_reports(
     for k in range(c.REPORTERS):
         other = int(reporter[k])
         # Numba does not compile `other in (...)`
-        if other == NOBODY or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109
+        if other == NONE or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109
             continue
         spread = math.hypot(max(std, c.NOVELTY_STD), max(float(here.std[k]), c.NOVELTY_STD))
         if spread > c.PEER_STD:
@@ -151,7 +152,7 @@ def judge_flag(
     for k in range(c.REPORTERS):
         other = int(here.reporter[k])
         time = int(here.time[k])
-        if other == NOBODY or other == vehicle:  # noqa: SIM109 as above
+        if other == NONE or other == vehicle:  # noqa: SIM109 as above
             continue
         if now - time > c.PEER_S or time <= newest:
             continue
@@ -225,7 +226,7 @@ def _record_meeting(
     place = rank % c.PEERS
     known = this.other[place]
     if known != other:
-        if known != NOBODY and this.rank[place] < rank:
+        if known != NONE and this.rank[place] < rank:
             return
         this.rank[place] = rank
         this.other[place] = other
@@ -272,13 +273,13 @@ def _update_weights(
     """
     known = np.empty(len(out), np.bool_)
     trusted = 0
-    prior = _ENROLLED_AGREEMENT if enrolled else c.TRUST_PRIOR
+    prior = _ENROLLED_AGREEMENT if enrolled else _AGREEMENT
     for v in range(len(out)):
         this = peers[v]
         heard = 0.0
         agreed = 0.0
         for k in range(c.PEERS):
-            if this.other[k] != NOBODY:
+            if this.other[k] != NONE:
                 theirs = float(before[this.other[k]])
                 met = float(this.met[k])
                 weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
@@ -302,12 +303,12 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
     (flags) may support an alert.
 
     For each vehicle the service counts cells where other vehicles confirmed or contradicted a flag.
-    The count starts with TRUST_PRIOR_PEERS imagined cells, of which a share TRUST_PRIOR was
+    The count starts with TRUST_PRIOR_PEERS imagined cells, of which a share 1 - CONTAMINATION was
     confirmed. If the share of confirmations is below TRUST_NONE, the flags support no alert. For
     example, the flags of a vehicle that always reports an intervention support no alert after two
     dry cells.
     """
-    right = c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
+    right = _AGREEMENT * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
     whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
     return np.asarray(right >= c.TRUST_NONE * whole)
 
@@ -322,7 +323,7 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)
-    prior = 1.0 / c.SHAPE_STD**2
+    prior = 1.0 / c.SHAPE_PRIOR**2
     squares = float((trust * peers["used_squares"][:vehicles]).sum())
     products = float((trust * peers["used_products"][:vehicles]).sum())
     slope = (products + c.SHAPE_PRIOR * prior) / (squares + prior)
@@ -338,7 +339,7 @@ def initial_trust(*, established: bool = False, enrolled: bool = False) -> float
     """
     if enrolled:
         return float(_known_weight(_ENROLLED_AGREEMENT))
-    weight = _scale_trust(c.TRUST_PRIOR)
+    weight = _scale_trust(_AGREEMENT)
     return min(weight, c.NEWCOMER) if established else weight
 
 

@@ -198,10 +198,11 @@ def _from_parts(parts: int) -> np.float32:
 def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
     # If the bound u rises, the mean of "at least u" under the uniform prior rises by half as much.
     if kind == BOUND:
-        share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
+        # It is new in full from two standard deviations of the grip used on.
+        share = (new_mean - mean) / c.UTILISED_STD
     else:
         deviations = abs(new_mean - mean) / math.hypot(std, new_std)
-        share = (deviations - c.NOVELTY_FROM) / (c.NOVELTY_FULL - c.NOVELTY_FROM)
+        share = (deviations - c.PEERS_AGREE) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
     return min(max(share, 0.0), 1.0)
 
 

@@ -26,7 +26,6 @@ from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pai
 from fleet_service.fusion.store.records import (
     FREE_ENTRIES,
     FREE_WINDOWS,
-    NOBODY,
     NONE,
     REPORTERS_USED,
     Int32Array,
@@ -267,8 +266,8 @@ def _open_reporters(state: State, slot: int, window: int) -> None:
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
     state.live.cells[slot].reporters = row
-    state.live.reporters[row].reporter[:] = NOBODY
-    state.live.reporters[row].source[:] = NOBODY
+    state.live.reporters[row].reporter[:] = NONE
+    state.live.reporters[row].source[:] = NONE
     copy_sources(state.live.reporters, row, state.base.reporters, window)
 
 

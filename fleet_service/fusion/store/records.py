@@ -33,8 +33,7 @@ from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.records import RecordArray, record_type
 
-NONE: Final = -1  # no row
-NOBODY: Final = -1  # no vehicle
+NONE: Final = -1  # no row, or no vehicle
 
 
 class Side(IntEnum):

@@ -22,7 +22,6 @@ from fleet_service.fusion.store.records import (
     ENTRY,
     FREE_ENTRIES,
     FREE_WINDOWS,
-    NOBODY,
     NONE,
     PAIRS,
     PEER,
@@ -304,7 +303,7 @@ def no_peers(vehicles: int) -> RecordArray:
     been compared with others yet.
     """
     peers = np.zeros(vehicles, PEER)
-    peers["other"] = NOBODY
+    peers["other"] = NONE
     return peers
 
 
