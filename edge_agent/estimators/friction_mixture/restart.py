@@ -30,7 +30,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# The motion is reset if it differs from the wheels by more than `diverged` plus two terms:
+# The motion is reset if it differs from the wheels by more than `diverged_x` plus two terms:
 FAR_SHARE = 0.04  # [1] share of the wheels' speed
 FAR_SPREADS = 2.0  # [1] number of standard deviations of the wheels' speed
 
@@ -117,7 +117,7 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
     rolling = memory.rolling
     if math.isnan(rolling.ahead):
         return 0
-    near = design.constants.diverged + FAR_SHARE * abs(rolling.ahead)
+    near = design.constants.diverged_x + FAR_SHARE * abs(rolling.ahead)
     far = near + FAR_SPREADS * rolling.ahead_std
     astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
     own_std = math.sqrt(memory.overall_covariance[NodeState.VY, NodeState.VY])

@@ -92,7 +92,8 @@ MOVES = {
     "farthest": Move("penalty", "braking", 0.5, LESS),
     # With a smaller limit, R adapts less to large innovations.
     "huber": Move("nis", "stopping", 3.0, LESS),
-    "diverged": Move("nodes apart in v_x", "braking", 0.6, LESS),
+    "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
+    "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
     # Group: tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the
     # state SHAPE.
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
@@ -115,7 +116,8 @@ MOVES = {
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    "rear_unlike": Move("least probabilities", "split-braking", 1.1),
+    # With a smaller factor on R, the rear axle determines the force gain better.
+    "rear_unlike": Move("std GAIN", "split-braking", 0.92, LESS),
     "gain_std": Move("width", "acceleration", 1.1),
     # Group: sensors.
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),

@@ -226,10 +226,10 @@ def reset_diverged(
     for j in range(weight.shape[0]):
         own = velocity[j // LANES]
         astray = max(
-            abs(own[0, j % LANES] - velocity[group, 0, lane]),
-            abs(own[1, j % LANES] - velocity[group, 1, lane]),
+            abs(own[0, j % LANES] - velocity[group, 0, lane]) / constants.diverged_x,
+            abs(own[1, j % LANES] - velocity[group, 1, lane]) / constants.diverged_y,
         )
-        if astray > constants.diverged:
+        if astray > 1.0:
             _copy_node(memory, j, best)
             weight[j] = SMALLEST
 

@@ -150,9 +150,11 @@ class Constants(NamedTuple):
     farthest: float = 3.6
     # [1] innovation, in standard deviations, beyond which R of a measurement is increased
     huber: float = 1.95
-    # [m/s] difference of v_x or v_y from the most probable node beyond which a node has diverged.
-    # The accelerometers exclude such a difference.
-    diverged: float = 1.0
+    # [m/s] difference of v_x from the most probable node beyond which a node has diverged. The
+    # accelerometers exclude such a difference.
+    diverged_x: float = 0.7
+    # [m/s] difference of v_y from the most probable node beyond which a node has diverged
+    diverged_y: float = 1.0
 
     # --- Tyre ---
     # [1] shape factor C of the Magic Formula, between 1.3 (lateral) and 1.65 (longitudinal) of
