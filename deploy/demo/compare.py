@@ -18,12 +18,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from edge_agent.lab.simulation.listeners import warned_ones
+from edge_agent.lab.simulation.scenarios import Scenario
 from fleet_service.archive.format import reading
 from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
+from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
-from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
+from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 from schemas.wire import Alert, Kind
 
 PASSES: Final = "demo.passes"
@@ -32,12 +34,10 @@ DELAY: Final = "demo.alert.delay_passes"
 WALL: Final = "demo.wall_s"
 COVERAGE: Final = "demo.map.coverage90"
 WIDEST: Final = 0.99  # target: highest coverage of the map's intervals; above it they are too wide
+SAMPLED_M: Final = 0.5  # [m] distance of the points at which a patch of ice is sampled
 # [ns] a longer time between two visits of a vehicle begins a new pass.
 PASS_GAP_NS: Final = 10_000_000_000
 NEVER: Final = int(np.iinfo(np.int64).max)
-# Drop of mu in a cell that counts as new ice. Visits differ by less where a surface ends in the
-# cell.
-BORDER_MU: Final = 0.1
 LOST: Final = 0.98  # share of the available grip at which a wheel counts as sliding
 
 
@@ -97,6 +97,51 @@ class MapComparison:
         return np.where(self.is_measured, mu, np.nan)
 
 
+@dataclass(frozen=True)
+class NewIce:
+    """Ice that appears on the road during the demo: the time `since_ns` [ns] at which it appears,
+    and the map cells that it touches.
+    """
+
+    since_ns: int
+    cells: IntArray
+
+    def find_visits(self, visits: pa.Table) -> BoolArray:
+        """Return a mask of the visits (passages of a map cell), (visits,): True for visits to the
+        new ice after it appeared.
+
+        Visits to snow and ice that were there from the start do not count, even if no vehicle drove
+        there before the new ice appeared.
+        """
+        enter = visits["enter_time"].cast(pa.int64()).to_numpy()
+        in_cells = np.isin(visits["cell"].to_numpy(), self.cells)
+        return np.asarray(
+            in_cells & (enter >= self.since_ns) & (visits["mu"].to_numpy() < SLIPPERY_MU)
+        )
+
+
+def new_ice(scenario: Scenario, start_ns: int) -> NewIce:
+    """Return the ice that appears in a scenario whose drive begins at `start_ns` [ns].
+
+    Each patch that appears is sampled at a grid of points. A cell counts if the road was not
+    slippery at one of its points and is slippery after the patch appeared.
+    """
+    first_s = scenario.events[0].start
+    cells = [np.zeros(0, np.int64)]
+    for patch in scenario.events:
+        along, across = np.meshgrid(
+            np.arange(-patch.length / 2, patch.length / 2, SAMPLED_M),
+            np.arange(-patch.width / 2, patch.width / 2, SAMPLED_M),
+        )
+        x = (patch.x + along * np.cos(patch.angle) - across * np.sin(patch.angle)).ravel()
+        y = (patch.y + along * np.sin(patch.angle) + across * np.cos(patch.angle)).ravel()
+        appeared = (scenario.friction(first_s - 1.0, x, y) >= SLIPPERY_MU) & (
+            scenario.friction(patch.start, x, y) < SLIPPERY_MU
+        )
+        cells.append(grid.cell_of(*scenario.to_latlon(x[appeared], y[appeared])))
+    return NewIce(start_ns + int(first_s * NS), np.unique(np.concatenate(cells)))
+
+
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Return the true friction of each visited (cell, sector) at the end of the demo. It is the
     mean over the visits (passages of a cell) after the road changed at `changed_ns` [ns]. Without
@@ -142,9 +187,7 @@ def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison
     return MapComparison(cells.filter(pa.array(known)), found[known])
 
 
-def delay_passes(
-    visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
-) -> float:
+def delay_passes(visits: pa.Table, ice: NewIce, alerts: list[tuple[int, Alert]]) -> float:
     """Return the number of passes over a new patch of ice before the first alert for the patch, as
     the median over all patches. Only excited passes count, in which a vehicle used enough grip to
     measure the friction.
@@ -154,34 +197,35 @@ def delay_passes(
 
     Args:
         visits: true values of all visits (passages of a map cell).
-        patch: (visits,) True for visits to a cell of a patch after the patch appeared.
+        ice: the new ice.
         alerts: pairs of time of receipt [ns] and alert.
-        changed_ns: time at which the patch appeared.
     """
     left: IntArray = visits["leave_time"].cast(pa.int64()).to_numpy()
+    on = ice.find_visits(visits)
     excited = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     cell = visits["cell"].to_numpy()
     delays = []
-    for cells, known in known_patches(visits, patch, alerts, changed_ns):
-        rows = visits.filter(pa.array(patch & excited & np.isin(cell, cells) & (left <= known)))
+    for cells, known in known_patches(visits, ice, alerts):
+        rows = visits.filter(pa.array(on & excited & np.isin(cell, cells) & (left <= known)))
         delays.append(float(count_passes(rows)) if known < NEVER else float("inf"))
     return float(np.median(delays)) if delays else float("inf")
 
 
 def known_patches(
-    visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int
+    visits: pa.Table, ice: NewIce, alerts: list[tuple[int, Alert]]
 ) -> list[tuple[IntArray, int]]:
-    """Return a pair for each patch of ice: the grid numbers of the patch's cells, and the time [ns]
-    of the first alert for the patch (NEVER if there was no alert). `patch` is a mask of the visits,
-    True for visits to a patch.
+    """Return a pair for each patch of new ice that vehicles visited: the grid numbers of its cells,
+    and the time [ns] of the first alert for the patch (NEVER if there was no alert).
     """
-    cells = np.unique(visits["cell"].to_numpy()[patch])
+    cells = np.unique(visits["cell"].to_numpy()[ice.find_visits(visits)])
     label = link_cells(cells)
     found = []
     for number in range(int(label.max(initial=-1)) + 1):
         own = cells[label == number]
         inside = set(own.tolist())
-        heard = [at for at, one in alerts if one.raised and one.cell in inside and at >= changed_ns]
+        heard = [
+            at for at, one in alerts if one.raised and one.cell in inside and at >= ice.since_ns
+        ]
         found.append((own, min(heard, default=NEVER)))
     return found
 
@@ -200,12 +244,12 @@ def count_passes(rows: pa.Table) -> int:
 
 class DemoRun(NamedTuple):
     """Results of one run of the demo: the true values of all visits (passages of a map cell), the
-    alerts with their times [ns], the time [ns] at which ice appears, and the counts of the agents.
+    alerts with their times [ns], the ice that appears, and the counts of the agents.
     """
 
     visits: pa.Table
     alerts: list[tuple[int, Alert]]
-    changed_ns: int
+    ice: NewIce
     counts: dict[str, float]
 
 
@@ -215,11 +259,10 @@ def demo_figures(
     """Return all figures (measured values) of the demo about map, alerts and archive, each with its
     target. `wall_s` [s] is the duration of the demo.
     """
-    visits, alerts, changed_ns, counts = run
+    visits, alerts, ice, counts = run
     several = comparison.has_several_vehicles
     value = comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
-    patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     rows, distinct, vehicles = archive_counts(archive)
     false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
@@ -230,7 +273,7 @@ def demo_figures(
         Figure("demo.map.rmse", float(np.sqrt(_mean_or_nan(error[value] ** 2))), "", 0.12),
         Figure(
             DELAY,
-            delay_passes(visits, patch, alerts, changed_ns),
+            delay_passes(visits, ice, alerts),
             "passes, median of the new patches",
             3,
         ),
@@ -292,17 +335,17 @@ class LostGrip:
 
 
 def lost_grip(
-    visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float
+    visits: pa.Table, alerts: list[tuple[int, Alert]], ice: NewIce, share: float
 ) -> LostGrip:
     """Find the passes of cars over new ice after the first alert for the patch of ice. Return for
     each pass if the driver was warned and if a wheel lost its grip.
 
     `share` is the share of the drivers who receive warnings. It determines which of the vehicles
-    have a warned driver. `changed_ns` is the time [ns] at which the new ice appeared.
+    have a warned driver.
     """
-    on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
+    on = ice.find_visits(visits)
     since = np.full(visits.num_rows, NEVER)
-    for cells, known in known_patches(visits, on, alerts, changed_ns):
+    for cells, known in known_patches(visits, ice, alerts):
         since[np.isin(visits["cell"].to_numpy(), cells)] = known
     vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
     count = max((_vehicle_number(name) for name in vehicles), default=0)
@@ -330,22 +373,6 @@ def lost_grip(
 
 def _vehicle_number(vehicle: str) -> int:
     return int(vehicle.rpartition("-")[2])
-
-
-def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
-    """Return a mask of the visits (passages of a map cell), (visits,). It is True for visits after
-    the time `changed_ns` [ns] with clearly less friction than all earlier visits to the same cell.
-
-    Visits to cells that were slippery before the change, such as old snow, do not count.
-    """
-    enter = visits["enter_time"].cast(pa.int64()).to_numpy()
-    cell = visits["cell"].to_numpy()
-    mu = visits["mu"].to_numpy()
-    cells, index = np.unique(cell, return_inverse=True)
-    least = np.full(len(cells), np.nan)
-    np.fmin.at(least, index[enter < changed_ns], mu[enter < changed_ns])
-    old_snow = least < SLIPPERY_MU
-    return np.asarray((enter >= changed_ns) & ~old_snow[index] & (mu < least[index] - BORDER_MU))
 
 
 def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:

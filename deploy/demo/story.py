@@ -23,7 +23,6 @@ from fleet_service.cli.common import stop_on_signals
 from schemas.config import ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.zenoh_session import open_session
-from schemas.thresholds import NS
 
 FOLDER = Path(".demo")
 REPORT_S = 5.0
@@ -104,7 +103,8 @@ def run(args: argparse.Namespace) -> int:
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
-    appears_s = scenario_named(processes.SCENARIO).events[0].start
+    scenario = scenario_named(processes.SCENARIO)
+    appears_s = scenario.events[0].start
     print(
         f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s black "
         "ice appears."
@@ -118,15 +118,15 @@ def run(args: argparse.Namespace) -> int:
             webbrowser.open(address)
         listener, counts = drive_fleet(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
-        changed_ns = compare.start_time(visits) + int(appears_s * NS)
-        comparison = compare.compare(listener.whole_map(), visits, changed_ns)
-        compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
+        ice = compare.new_ice(scenario, compare.start_time(visits))
+        comparison = compare.compare(listener.whole_map(), visits, ice.since_ns)
+        compare.write_truth(visits, ice.since_ns, FOLDER / "overlay.parquet")
         show_clients(FOLDER, endpoint, comparison)
         listener.close()
         wall_s = time.monotonic() - began
-        demo = compare.DemoRun(visits, listener.alerts, changed_ns, counts)
+        demo = compare.DemoRun(visits, listener.alerts, ice, counts)
         measured = compare.demo_figures(comparison, demo, FOLDER / "archive", wall_s)
-        grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
+        grip = compare.lost_grip(visits, listener.alerts, ice, args.warned)
         found = report_figures(FOLDER, comparison, measured, grip, args.seed)
         if args.screenshot is not None:
             screenshot.take_screenshot(address, args.screenshot)

@@ -14,6 +14,9 @@ import pytest
 
 from deploy.demo import compare, page, picture
 from deploy.demo.story import report_figures
+from edge_agent.lab.simulation.friction import Patch
+from edge_agent.lab.simulation.scenarios import scenario_named
+from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Alert
 from tests.browser import open_page
@@ -94,32 +97,50 @@ def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
         ("a", 40, 7, 0.2, 0.9),
         ("d", 60, 7, 0.2, 0.9),  # vehicle d comes after the alert
     )
-    patch = compare.newly_slippery(road, 10 * S) & (road["mu"].to_numpy() < 0.4)
-    assert compare.delay_passes(road, patch, [(50 * S, make_alert(7))], 10 * S) == 3.0
+    ice = compare.NewIce(10 * S, np.array([7, 8]))
+    assert compare.delay_passes(road, ice, [(50 * S, make_alert(7))]) == 3.0
 
 
 def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     road = make_visits(("a", 11, 7, 0.2, 0.9))
-    patch = np.array([True])
-    assert compare.delay_passes(road, patch, [(50 * S, make_alert(99))], 10 * S) == float("inf")
-    assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
+    ice = compare.NewIce(10 * S, np.array([7]))
+    assert compare.delay_passes(road, ice, [(50 * S, make_alert(99))]) == float("inf")
+    assert compare.delay_passes(road, ice, []) == float("inf")
 
 
-def test_old_snow_and_unvisited_places_are_not_the_new_patch() -> None:
-    before = (
-        ("a", 1, 7, 0.2, 0.9),
+def test_visits_to_new_ice_are_those_after_it_appeared_on_the_slippery_lane() -> None:
+    road = make_visits(
         ("a", 2, 8, 0.9, 0.9),
-        ("a", 3, 9, 0.41, 0.9),
-        ("b", 4, 9, 0.6, 0.9),
-    )
-    after = (
-        ("a", 11, 7, 0.2, 0.9),
+        ("a", 11, 7, 0.2, 0.9),  # old snow
         ("a", 12, 8, 0.2, 0.9),
-        ("a", 13, 9, 0.39, 0.9),
-        ("a", 14, 10, 0.2, 0.9),
+        ("b", 13, 8, 0.5, 0.9),  # beside the ice, in the same cell
+        ("b", 14, 10, 0.2, 0.9),  # elsewhere
     )
-    new = compare.newly_slippery(make_visits(*before, *after), 10 * S)
-    assert new.tolist() == [False, False, False, False, False, True, False, False]
+    new = compare.NewIce(10 * S, np.array([8])).find_visits(road)
+    assert new.tolist() == [False, False, True, False, False]
+
+
+def test_new_ice_is_where_a_dry_or_wet_road_becomes_slippery() -> None:
+    """Ice appears on dry road, and on snow that was there before. Only the cells with dry road
+    before are new ice: the snow was slippery already.
+    """
+    road = replace(
+        scenario_named("test"),
+        background=0.9,
+        patches=(
+            Patch("old snow", 100.0, 0.0, 40.0, 40.0, 0.35),
+            Patch("ice on dry road", 0.0, 0.0, 40.0, 10.0, 0.15, start=30.0),
+            Patch("ice on snow", 100.0, 0.0, 20.0, 10.0, 0.15, start=30.0),
+        ),
+    )
+    ice = compare.new_ice(road, 5 * S)
+
+    def cell_at(x: float, y: float) -> int:
+        return int(grid.cell_of(*road.to_latlon(np.array([x]), np.array([y])))[0])
+
+    assert ice.since_ns == 35 * S
+    assert np.isin([cell_at(0.0, 0.0), cell_at(-15.0, 3.0)], ice.cells).all()
+    assert not np.isin([cell_at(100.0, 0.0), cell_at(60.0, 0.0)], ice.cells).any()
 
 
 def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
@@ -180,7 +201,8 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         ("sim-004", 40.0, 7, 0.2, 0.7),
     )
     alerts = [(20 * S, Alert(7, 0, True, 20 * S, 0.2, 0.1, 0.3, 0.95, 2, 0.0, 0.0, "ice"))]
-    grip = compare.lost_grip(driven, alerts, 10 * S, 0.5)
+    ice = compare.NewIce(10 * S, np.array([7]))
+    grip = compare.lost_grip(driven, alerts, ice, 0.5)
     assert sorted(zip(grip.warned.tolist(), grip.lost.tolist(), strict=True)) == [
         (False, True),
         (True, False),
@@ -192,7 +214,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         "unwarned "
         "drivers."
     )
-    nobody = compare.lost_grip(driven, [], 10 * S, 0.5)
+    nobody = compare.lost_grip(driven, [], ice, 0.5)
     assert not len(nobody.lost), "nobody knew of it"
     assert {one.name: one.value for one in nobody.figures()} == {
         "demo.passes.warned": 0,
