@@ -68,6 +68,18 @@ def axle_lateral_forces(
 
 
 @compiled
+def locked_axle_force(row: FloatArray, loads: FloatArray) -> float:
+    """Return the lateral force [N] of the front axle that balances the yaw moment of a locked rear
+    axle, per force over load of the rear wheels. The rear axle has the opposite force.
+
+    Both rear wheels turn at the same speed. In a turn the inner one therefore slips forwards and
+    the outer one backwards, and their forces turn the car back. `loads` (4,) are wheel loads [N].
+    """
+    base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
+    return float(0.5 * row[Parameter.TRACK_REAR] * (loads[2] + loads[3]) / base)
+
+
+@compiled
 def advance_velocity(
     vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float
 ) -> tuple[float, float]:

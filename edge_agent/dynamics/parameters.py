@@ -35,10 +35,11 @@ class Parameter(IntEnum):
     QUADRATIC = 13
     # [1] ratio of rear to front cornering stiffness per load (002, table 1)
     REAR_SLOPE = 14
+    REAR_LOCKED = 15  # 1 if the rear wheels turn as one (locked differential), else 0
 
 
 def parameter_row(vehicle: Vehicle) -> FloatArray:
-    """Return the parameters of `vehicle`, shape (15,), indexed by `Parameter`.
+    """Return the parameters of `vehicle`, shape (16,), indexed by `Parameter`.
 
     The stiffnesses in the vehicle file are means over the four wheels at static load. The row
     contains stiffness per newton of load, which is valid for lightly and heavily loaded wheels.
@@ -69,12 +70,13 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
             0.0,
             0.0,
             1.0,
+            float(vehicle.rear_axle_locked),
         ]
     )
 
 
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
-    """Return the parameters of all vehicles, one row each, shape (N, 15). A vehicle that occurs
+    """Return the parameters of all vehicles, one row each, shape (N, 16). A vehicle that occurs
     several times is converted once.
     """
     models = {id(vehicle): vehicle for vehicle in vehicles}

@@ -238,7 +238,7 @@ def turn_wheels(
 ) -> None:
     """Advance the wheel speeds ω in the vehicle's state `x` by one linearly implicit Euler step of
     `dt` [s]. Torques that decrease with ω are in the implicit part of the step, so that the step is
-    stable.
+    stable. The wheels of a locked rear axle turn as one.
 
     `change` contains dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. The function computes from
     it how much each wheel's speed over the ground changes. `w` (8, 4) is the array of wheel data
@@ -268,6 +268,9 @@ def turn_wheels(
         if abs(omega) < BRAKED:
             damping += u[Control.BRAKE, i] / BRAKED
         x[Motion.OMEGA + i] = omega + dt * excess / (p[Parameter.WHEEL_INERTIA] + dt * damping)
+    if p[Parameter.REAR_LOCKED] > 0.0:
+        mean = 0.5 * (x[Motion.OMEGA + 2] + x[Motion.OMEGA + 3])
+        x[Motion.OMEGA + 2] = x[Motion.OMEGA + 3] = mean
 
 
 @compiled

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.adaptation.rule_base import wide_noise
-from edge_agent.dynamics.body import axle_lateral_forces
+from edge_agent.dynamics.body import axle_lateral_forces, locked_axle_force
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body_of
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
@@ -25,6 +25,7 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.block.drive_split import (
     BRAKES_FRONT,
     ENGINE_BRAKE,
+    UNLIKE,
     front_share,
 )
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
@@ -71,6 +72,8 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     constants = design.constants
     _average_kinematics(block, features)
     features.yaw_rate = mean_or(block, S.YAW_RATE, last.yaw_rate)
+    slip = 0.5 * row[Parameter.TRACK_REAR] * features.yaw_rate / max(features.speed, SLOWEST_M_S)
+    features.locked_pull = row[Parameter.REAR_LOCKED] * row[Parameter.SLOPE_X] * slip
     ax = mean_or(block, S.AX, 0.0)
     ay = mean_or(block, S.AY, 0.0)
     loads = features.loads
@@ -322,6 +325,8 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         * (strained_noise(memory.trust, constants) if design.adaptive else 1.0)
     )
     features.axle_scale = scale
+    locked = features.locked_pull / math.hypot(1.0, features.locked_pull)
+    locked *= UNLIKE * locked_axle_force(row, features.loads)
     for axle in range(2):
         side = features.side[axle]
         turning = (
@@ -337,6 +342,7 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         before[axle] = side
         shape = constants.shape_share * side * side
         variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
+        variance += (locked / (features.loads[2 * axle] + features.loads[2 * axle + 1])) ** 2
         wide = (
             wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
             if design.adaptive

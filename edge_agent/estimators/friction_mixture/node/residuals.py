@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 
+from edge_agent.dynamics.body import locked_axle_force
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
@@ -195,19 +196,20 @@ def find_ratios(
     `slip`.
 
     - slip.ratio, for each wheel: force divided by the force of a linear tyre (constant stiffness)
-      at the same slip.
+      at the same slip. The slip of a locked axle in a turn counts too.
     - slip.size and slip.place, for each wheel: total slip, and its position in the tables of the
       tyre curve.
     - slip.axle_force, for each axle: lateral force over load.
     - slip.axle_slip, for each axle: mean lateral slip of its wheels, weighted by load.
     """
     for axle in range(2):
+        locked = features.locked_pull if axle == 1 else 0.0
         model = 0.0
         mean = 0.0
         for wheel in range(2 * axle, 2 * axle + 2):
             g_x = lanes_at(slip.along, wheel)
             g_y = lanes_at(slip.across, wheel)
-            square = g_x * g_x + g_y * g_y
+            square = g_x * g_x + g_y * g_y + locked * locked
             size = square * inverse_root_of(square)
             theta = size * lanes_at(node.per_mu, wheel % 2)
             place = theta * inverse_of(1.0 + theta)
@@ -258,13 +260,20 @@ def correct_forces(
     split road (different friction left and right), the function then divides the sum. The slippery
     side gets at most SPLIT_LIMIT of its friction, and the other side gets the rest. The unequal
     forces turn the car. Therefore the function also corrects the lateral forces of the axles, which
-    balance this yaw moment.
+    balance this yaw moment. So do the forces of a locked rear axle, whose wheels pull forwards on
+    one side and backwards on the other.
     """
     leak = lanes_at(node.point, NodeState.LEAK_Y)
     shape = lanes_at(node.point, NodeState.SHAPE)
     bias_y = lanes_at(node.point, NodeState.BIAS_Y)
     turning = _share_forces(row, features, node, out)
+    held = (
+        0.5 * features.locked_pull * (lanes_at(node.slip.ratio, 2) + lanes_at(node.slip.ratio, 3))
+    )
+    if features.locked_pull != 0.0:
+        turning -= held * locked_axle_force(row, features.loads)
     for axle in range(2):
+        beside = held if axle == 1 else 0.0 * held
         left = 2 * axle
         right = 2 * axle + 1
         side = (
@@ -284,13 +293,17 @@ def correct_forces(
             per_mu = lanes_at(node.per_mu, wheel % 2)
             mu = lanes_at(node.mu, wheel % 2)
             put_lanes(out.force, wheel, force)
-            put_lanes(out.slip_at_force, wheel, _slip_at_force(curve, mu, per_mu, force, across))
+            put_lanes(
+                out.slip_at_force,
+                wheel,
+                _slip_at_force(curve, mu, per_mu, force, size_of(across, beside)),
+            )
         if known:
             force = side - shape * lanes_at(node.shape_force, 4 + axle)
             per_mu = lanes_at(node.per_axle_mu, axle)
             mu = lanes_at(node.axle_mu, axle)
             put_lanes(out.force, 4 + axle, force)
-            found = _slip_at_force(curve, mu, per_mu, force, mean_along)
+            found = _slip_at_force(curve, mu, per_mu, force, size_of(mean_along, beside))
             put_lanes(out.slip_at_force, 4 + axle, found)
 
 
@@ -336,6 +349,13 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
     more = size + max(size - most_other, 0.0)
     shared = select(most < most_other, min(size, most), more)
     return select(mean < 0.0, -shared, shared)
+
+
+@inlined
+def size_of(along: float, across: float) -> float:
+    """Return the size of a vector [1] with two components at right angles."""
+    square = along * along + across * across
+    return square * inverse_root_of(square)
 
 
 @inlined

@@ -36,6 +36,9 @@ class BlockFeatures:
     sin: float  # mean sine of the yaw angle since the beginning
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # [rad/s] mean
+    # [1] force over load of a rear wheel with linear tyre that turns at the same speed as the other
+    # one (locked axle); 0 for a car with a differential
+    locked_pull: float
     novelty: float  # [1] `new`, raised to at least `steady_share`
     new: float  # [1] fuzzy truth of "forces or lateral slips are new"
     demand: float  # [1] larger force over load of the two axles
