@@ -37,7 +37,7 @@ def mixture_bank(
     means: FloatArray | None = None,
 ) -> EstimatorBank:
     """Return a bank of friction mixtures (filters with a grid of friction hypotheses), one per
-    vehicle. `rows` (N, 15) are the vehicles' parameters.
+    vehicle. `rows` (N, 16) are the vehicles' parameters.
 
     `spreads` and `means` (N, STATES) are standard deviations and means of the priors of the
     filter's states. By default they are the priors in the tables of `design`.

@@ -206,7 +206,7 @@ class MixtureMemory:
 def new_filters(
     rows: FloatArray, nominal: Nominal, means: FloatArray, spreads: FloatArray
 ) -> RecordArray:
-    """Return the filter records of vehicles with the parameters `rows` (N, 15), before the first
+    """Return the filter records of vehicles with the parameters `rows` (N, 16), before the first
     sample.
 
     `means` and `spreads` (N, STATES) are the means and standard deviations of the state priors; the
