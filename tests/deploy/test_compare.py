@@ -108,7 +108,7 @@ def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     assert compare.delay_passes(road, ice, []) == float("inf")
 
 
-def test_visits_to_new_ice_are_those_after_it_appeared_on_the_slippery_lane() -> None:
+def test_visits_to_new_ice_begin_when_it_appears() -> None:
     road = make_visits(
         ("a", 2, 8, 0.9, 0.9),
         ("a", 11, 7, 0.2, 0.9),  # old snow

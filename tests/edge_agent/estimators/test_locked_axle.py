@@ -52,7 +52,7 @@ def run(log: pa.Table, vehicle: Vehicle) -> tuple[FloatArray, FloatArray]:
     return error[settled], interval[settled]
 
 
-def test_wheels_of_a_locked_axle_turn_as_one_and_widen_the_turn() -> None:
+def test_locked_rear_wheels_turn_as_one_and_widen_the_turn() -> None:
     log, _ = turn("j-turn", 8.0, 0.9)
     free = simulate_manoeuvre("j-turn", mu=0.9, speed=8.0, seed=1, duration_s=10.0)[0]
     settled = log["t"].to_numpy() > SETTLED_S
