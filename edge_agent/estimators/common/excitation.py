@@ -13,7 +13,7 @@ from schemas.thresholds import UTILISED_WINDOW_S
 
 SLOTS = 64
 # [s] shortest slot, so that the ring covers the last second at any sample rate
-SLOT_S = 0.02
+SLOT_S = UTILISED_WINDOW_S / (SLOTS - 1)
 
 
 class Excitation:

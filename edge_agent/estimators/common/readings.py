@@ -13,7 +13,7 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 # Number of channels before the position: ax, ay, yaw rate, steering, wheel speeds, torques
-INPUTS = 15
+INPUTS = int(S.LATITUDE)
 # Limits of readings: a larger one is a sensor error, because no car moves like that.
 LARGEST_ACCELERATION = 40.0  # [m/s^2]
 LARGEST_YAW_RATE = 6.0  # [rad/s]

@@ -13,9 +13,8 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
-# [s] time constants that smooth the noise of the accelerometers and the shaking of the body
-SLOW_S = 0.15  # for the penalty of nodes
-FAST_S = 0.06  # for the upper end of the interval
+# [s] time constant that smooths the noise of the accelerometers, for the upper end of the interval
+FAST_S = 0.06
 # [1/s] rate at which the recent maximum of grip in use decreases after UTILISED_WINDOW_S, because
 # the road may have changed
 FORGOTTEN = 0.5
@@ -26,12 +25,14 @@ AT_PEAK = 0.95
 
 
 @compiled
-def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
+def note_grip(grip: GripInUse, constants: Constants, ax: float, ay: float, dt: float) -> None:
     """Update the smoothed grip in use (horizontal acceleration over g) with the accelerations
     [m/s^2] measured over the last dt [s].
+
+    For the penalty of nodes it is smoothed over `abrupt_time`, because a bump shakes the body.
     """
     size = math.hypot(ax, ay) / GRAVITY
-    grip.slow += (1.0 - math.exp(-dt / SLOW_S)) * (size - grip.slow)
+    grip.slow += (1.0 - math.exp(-dt / constants.abrupt_time)) * (size - grip.slow)
     grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
     grip.age += dt
     if grip.fast >= grip.held:

@@ -171,7 +171,7 @@ def _integrate_motion(
         leak_y = 0.0
     last.ax = ax
     last.ay = ay
-    note_grip(memory.grip, ax, ay, dt)
+    note_grip(memory.grip, constants, ax, ay, dt)
     gain = block.gain
     total = block.gain_sum
     _advance_gain(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)

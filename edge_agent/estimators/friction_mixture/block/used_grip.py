@@ -19,7 +19,8 @@ from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-SMOOTH_S = 0.1  # [s] two blocks, about the time in which a tyre builds up its force
+# [s] smoothing time of forces: two blocks, about the time in which a tyre builds up its force
+SMOOTH_S = 0.1
 # [1] largest reported grip. Tyres of road cars cannot use more; a larger value comes from a bump or
 # from a wrong load.
 MOST_USED = 1.5

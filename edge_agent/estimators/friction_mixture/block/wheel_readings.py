@@ -18,7 +18,8 @@ from schemas.signals import S
 SPINS_M_S = 20.0
 HELD = 3  # number of unchanged readings after which a change counts as a step, not as noise
 # [rad/s] range of steps that occur in wheel speed signals; a step of 1 km/h is .9 rad/s. A reading
-# that changes by less than STEP_LEAST counts as unchanged.
+# that changes by less than STEP_LEAST counts as unchanged, and a wheel that turns more slowly than
+# it counts as standing.
 STEP_LEAST = 0.05
 STEP_MOST = 2.0
 STEP_PACE = 0.1  # [1] weight of a new step in the moving average of steps

@@ -13,6 +13,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
+from edge_agent.estimators.friction_mixture.block.used_grip import SMOOTH_S
 from edge_agent.estimators.friction_mixture.state.constants import NodeState
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
@@ -24,8 +25,6 @@ from schemas.thresholds import UTILISED_WINDOW_S
 APART_SLIDES = 0.08  # [1] difference of two wheel speeds over the speed
 SPIN_SLIDES = 12.0  # [m/s^2] difference of a wheel's acceleration from the car's
 SEEN = 0.3  # [1] increase of the membership from which a new slide counts as begun
-# [s] allowance added to the time that the rear axle needs to reach the place of the front axle
-REAR_LAG_S = 0.1
 
 
 @compiled
@@ -40,8 +39,9 @@ def update_slip(memory: MixtureMemory, features: BlockFeatures) -> None:
     slip.ended = slip.held - seen
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
+        # The rear tyres need SMOOTH_S to build up their force at the place of the front axle.
         slip.rear_unlike_until = (
-            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + REAR_LAG_S
+            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + SMOOTH_S
         )
 
 

@@ -20,6 +20,7 @@ import math
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import ROUNDING, at_centre, mean_or
 from edge_agent.estimators.friction_mixture.block.drive_split import free_axle
+from edge_agent.estimators.friction_mixture.block.wheel_readings import STEP_LEAST
 from edge_agent.estimators.friction_mixture.node.covariance import subtract_row, symmetric_at
 from edge_agent.estimators.friction_mixture.node.residuals import gained_by
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
@@ -35,7 +36,6 @@ from schemas.thresholds import GRAVITY
 
 # [m/s] error of velocity zero at standstill, because wheel sensors do not detect creeping wheels
 STANDING_STD = 0.05
-STANDING_RAD_S = 0.05  # [rad/s] a wheel that turns more slowly counts as standing
 # [m/s^2] deviation of a_x from its average at standstill beyond which the car may start to move
 STARTS = 0.25
 # [m/s^2] smallest deceleration of a car with locked wheels, except on the most slippery ice. With
@@ -87,7 +87,7 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         total = total + ahead
         seen = seen + 1
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
-    still = seen >= needed and fastest < STANDING_RAD_S * row[Parameter.RADIUS]
+    still = seen >= needed and fastest < STEP_LEAST * row[Parameter.RADIUS]
     _update_standstill(memory, constants, features, still)
     held = fastest < LOCKED_SHARE * features.speed and abs(features.change) > SLIDES_M_S2
     locked = features.speed >= SLOW_M_S and (held or (still and not rolling.stands))

@@ -32,8 +32,8 @@ EXCLUDED = math.exp(-3.0)
 ALMOST_WHOLE = 0.9  # [1] part of the current belief at excluded frictions that means a jump
 # [1] part at excluded frictions up to which the current belief may replace the kept one
 COMPATIBLE = 0.5
-# [nat] least information of a belief that can show a jump: about half of the range is excluded
-KNOWING = 0.7
+# [nat] least information of a belief that can show a jump: half of the range is excluded
+KNOWING = math.log(2.0)
 
 
 @compiled

@@ -88,7 +88,7 @@ class GripInUse:
     acceleration over g [1].
     """
 
-    slow: float  # smoothed over SLOW_S, for the penalty of nodes
+    slow: float  # smoothed over `abrupt_time`, for the penalty of nodes
     fast: float  # smoothed over FAST_S
     held: float  # recent maximum of `fast`: the reported upper end is not below it
     age: float  # [s] time since `held` was last reached
