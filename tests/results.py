@@ -238,7 +238,7 @@ LINES: Final = (
     Line("car: passes over ice found", "detection", "ice.passes.long.rough", "{:.0%}"),
     Line("car: false ice, share of time", "edge", "real_world.false_ice", "{:.2%}"),
     Line("map: true μ inside the 90 % interval", "fleet", "fusion.clean.coverage90", "{:.0%}"),
-    Line("demo: passes over ice until the alert", "demo", "demo.alert.delay_passes", "{:.0f}"),
+    Line("demo: passes over ice until the alert", "demo", "demo.alert.delay_passes", "{:.1f}"),
     Line("acknowledged batches lost in failovers", "cluster", "cluster.lost", "{:.0f}"),
     Line("alert latency, p99 [ms]", "bench", "bench.alert.p99_ms", "{:.0f}"),
     Line("fusion: observations/s", "bench", "bench.fusion.per_s", "{:,.0f}"),
