@@ -17,15 +17,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from deploy.demo.ice import NewIce
 from edge_agent.lab.simulation.listeners import warned_ones
-from edge_agent.lab.simulation.scenarios import Scenario
 from fleet_service.archive.format import reading
 from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
-from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
-from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 from schemas.wire import Alert, Kind
 
 PASSES: Final = "demo.passes"
@@ -34,7 +33,6 @@ DELAY: Final = "demo.alert.delay_passes"
 WALL: Final = "demo.wall_s"
 COVERAGE: Final = "demo.map.coverage90"
 WIDEST: Final = 0.99  # target: highest coverage of the map's intervals; above it they are too wide
-SAMPLED_M: Final = 0.5  # [m] distance of the points at which a patch of ice is sampled
 # [ns] a longer time between two visits of a vehicle begins a new pass.
 PASS_GAP_NS: Final = 10_000_000_000
 NEVER: Final = int(np.iinfo(np.int64).max)
@@ -95,51 +93,6 @@ class MapComparison:
         """
         mu = self.cells["mu"].to_numpy()
         return np.where(self.is_measured, mu, np.nan)
-
-
-@dataclass(frozen=True)
-class NewIce:
-    """Ice that appears on the road during the demo: the time `since_ns` [ns] at which it appears,
-    and the map cells that it touches.
-    """
-
-    since_ns: int
-    cells: IntArray
-
-    def find_visits(self, visits: pa.Table) -> BoolArray:
-        """Return a mask of the visits (passages of a map cell), (visits,): True for visits to the
-        new ice after it appeared.
-
-        Visits to snow and ice that were there from the start do not count, even if no vehicle drove
-        there before the new ice appeared.
-        """
-        enter = visits["enter_time"].cast(pa.int64()).to_numpy()
-        in_cells = np.isin(visits["cell"].to_numpy(), self.cells)
-        return np.asarray(
-            in_cells & (enter >= self.since_ns) & (visits["mu"].to_numpy() < SLIPPERY_MU)
-        )
-
-
-def new_ice(scenario: Scenario, start_ns: int) -> NewIce:
-    """Return the ice that appears in a scenario whose drive begins at `start_ns` [ns].
-
-    Each patch that appears is sampled at a grid of points. A cell counts if the road was not
-    slippery at one of its points and is slippery after the patch appeared.
-    """
-    first_s = scenario.events[0].start
-    cells = [np.zeros(0, np.int64)]
-    for patch in scenario.events:
-        along, across = np.meshgrid(
-            np.arange(-patch.length / 2, patch.length / 2, SAMPLED_M),
-            np.arange(-patch.width / 2, patch.width / 2, SAMPLED_M),
-        )
-        x = (patch.x + along * np.cos(patch.angle) - across * np.sin(patch.angle)).ravel()
-        y = (patch.y + along * np.sin(patch.angle) + across * np.cos(patch.angle)).ravel()
-        appeared = (scenario.friction(first_s - 1.0, x, y) >= SLIPPERY_MU) & (
-            scenario.friction(patch.start, x, y) < SLIPPERY_MU
-        )
-        cells.append(grid.cell_of(*scenario.to_latlon(x[appeared], y[appeared])))
-    return NewIce(start_ns + int(first_s * NS), np.unique(np.concatenate(cells)))
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:

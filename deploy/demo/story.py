@@ -16,6 +16,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from deploy.demo import compare, page, processes, screenshot
+from deploy.demo.ice import new_ice
 from deploy.demo.listener import Listener
 from edge_agent.lab.simulation.scenarios import scenario_named
 from fleet_service.archive.maintenance.compaction import compact
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
             webbrowser.open(address)
         listener, counts = drive_fleet(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
-        ice = compare.new_ice(scenario, compare.start_time(visits))
+        ice = new_ice(scenario, compare.start_time(visits))
         comparison = compare.compare(listener.whole_map(), visits, ice.since_ns)
         compare.write_truth(visits, ice.since_ns, FOLDER / "overlay.parquet")
         show_clients(FOLDER, endpoint, comparison)

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 
 from deploy.demo import compare, page, picture
+from deploy.demo.ice import NewIce, new_ice
 from deploy.demo.story import report_figures
 from edge_agent.lab.simulation.friction import Patch
 from edge_agent.lab.simulation.scenarios import scenario_named
@@ -97,13 +98,13 @@ def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
         ("a", 40, 7, 0.2, 0.9),
         ("d", 60, 7, 0.2, 0.9),  # vehicle d comes after the alert
     )
-    ice = compare.NewIce(10 * S, np.array([7, 8]))
+    ice = NewIce(10 * S, np.array([7, 8]))
     assert compare.delay_passes(road, ice, [(50 * S, make_alert(7))]) == 3.0
 
 
 def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     road = make_visits(("a", 11, 7, 0.2, 0.9))
-    ice = compare.NewIce(10 * S, np.array([7]))
+    ice = NewIce(10 * S, np.array([7]))
     assert compare.delay_passes(road, ice, [(50 * S, make_alert(99))]) == float("inf")
     assert compare.delay_passes(road, ice, []) == float("inf")
 
@@ -116,7 +117,7 @@ def test_visits_to_new_ice_begin_when_it_appears() -> None:
         ("b", 13, 8, 0.5, 0.9),  # beside the ice, in the same cell
         ("b", 14, 10, 0.2, 0.9),  # elsewhere
     )
-    new = compare.NewIce(10 * S, np.array([8])).find_visits(road)
+    new = NewIce(10 * S, np.array([8])).find_visits(road)
     assert new.tolist() == [False, False, True, False, False]
 
 
@@ -133,7 +134,7 @@ def test_new_ice_is_where_a_dry_or_wet_road_becomes_slippery() -> None:
             Patch("ice on snow", 100.0, 0.0, 20.0, 10.0, 0.15, start=30.0),
         ),
     )
-    ice = compare.new_ice(road, 5 * S)
+    ice = new_ice(road, 5 * S)
 
     def cell_at(x: float, y: float) -> int:
         return int(grid.cell_of(*road.to_latlon(np.array([x]), np.array([y])))[0])
@@ -201,7 +202,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         ("sim-004", 40.0, 7, 0.2, 0.7),
     )
     alerts = [(20 * S, Alert(7, 0, True, 20 * S, 0.2, 0.1, 0.3, 0.95, 2, 0.0, 0.0, "ice"))]
-    ice = compare.NewIce(10 * S, np.array([7]))
+    ice = NewIce(10 * S, np.array([7]))
     grip = compare.lost_grip(driven, alerts, ice, 0.5)
     assert sorted(zip(grip.warned.tolist(), grip.lost.tolist(), strict=True)) == [
         (False, True),
@@ -214,14 +215,14 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         "unwarned "
         "drivers."
     )
-    nobody = compare.lost_grip(driven, [], ice, 0.5)
-    assert not len(nobody.lost), "nobody knew of it"
-    assert {one.name: one.value for one in nobody.figures()} == {
+    unheard = compare.lost_grip(driven, [], ice, 0.5)
+    assert not len(unheard.lost), "nobody knew of it"
+    assert {one.name: one.value for one in unheard.figures()} == {
         "demo.passes.warned": 0,
         "demo.passes.unwarned": 0,
     }
-    assert not any(one.holds for one in nobody.figures())
-    assert compare.demo_works(nobody.figures()), "few passes are no failure of the demo"
+    assert not any(one.holds for one in unheard.figures())
+    assert compare.demo_works(unheard.figures()), "few passes are no failure of the demo"
     found = compare.MapComparison(make_tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
     told = report_figures(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
     assert grip.line() in capsys.readouterr().out
