@@ -273,7 +273,7 @@ def correct_forces(
     if features.locked_pull != 0.0:
         turning -= held * locked_axle_force(row, features.loads)
     for axle in range(2):
-        beside = held if axle == 1 else 0.0 * held
+        beside = held * held if axle == 1 else 0.0 * held
         left = 2 * axle
         right = 2 * axle + 1
         side = (
@@ -296,14 +296,15 @@ def correct_forces(
             put_lanes(
                 out.slip_at_force,
                 wheel,
-                _slip_at_force(curve, mu, per_mu, force, size_of(across, beside)),
+                _slip_at_force(curve, mu, per_mu, force, across * across + beside),
             )
         if known:
             force = side - shape * lanes_at(node.shape_force, 4 + axle)
             per_mu = lanes_at(node.per_axle_mu, axle)
             mu = lanes_at(node.axle_mu, axle)
             put_lanes(out.force, 4 + axle, force)
-            found = _slip_at_force(curve, mu, per_mu, force, size_of(mean_along, beside))
+            other_square = mean_along * mean_along + beside
+            found = _slip_at_force(curve, mu, per_mu, force, other_square)
             put_lanes(out.slip_at_force, 4 + axle, found)
 
 
@@ -352,22 +353,17 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
 
 
 @inlined
-def size_of(along: float, across: float) -> float:
-    """Return the size of a vector [1] with two components at right angles."""
-    square = along * along + across * across
-    return square * inverse_root_of(square)
-
-
-@inlined
-def _slip_at_force(curve: TyreCurve, mu: float, per_mu: float, force: float, other: float) -> float:
+def _slip_at_force(
+    curve: TyreCurve, mu: float, per_mu: float, force: float, other_square: float
+) -> float:
     """Return the slip in one direction at which a tyre of friction `mu` has two given forces over
-    load [1]: `force` in this direction, and `other` at right angles.
+    load [1]: `force` in this direction, and at right angles a force with the square `other_square`.
 
     The returned slip is multiplied by the stiffness at small slip [1], so that slip and force of a
     linear tyre are equal. It is infinite if the total force reaches or exceeds the grip. `per_mu`
     is 1/mu.
     """
-    square = force * force + other * other
+    square = force * force + other_square
     per_size = inverse_root_of(square)
     theta = theta_at(curve, square * per_size * per_mu)
     slip = mu * theta * (force * per_size)
