@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from schemas import grid
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import MU_RANGE, SLIPPERY_MU
 
 # Types of columns. Types that NumPy has are called by their NumPy names.
 TIME: Final = "time"  # a column of this type is int64 [ns] in a message
@@ -39,16 +39,15 @@ _MU_STEP = 2.0**-10
 _DEGREE_STEP = 2.0**-23
 _RADIAN_STEP = 2.0**-9
 _SPEED_STEP = 2.0**-6
-_MU_RANGE: Final = (0.0, 2.0)  # no road tyre has a friction coefficient above 2
 _SPEED_RANGE: Final = (-100.0, 100.0)
 _MAX_I32: Final = 2**31 - 1
 
 _MU = (
     MessageColumn(
-        "mu", F32, "-", "peak adhesion coefficient, median; NaN if unknown", _MU_STEP, _MU_RANGE
+        "mu", F32, "-", "peak adhesion coefficient, median; NaN if unknown", _MU_STEP, MU_RANGE
     ),
-    MessageColumn("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, _MU_RANGE),
-    MessageColumn("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, _MU_RANGE),
+    MessageColumn("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, MU_RANGE),
+    MessageColumn("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, MU_RANGE),
 )
 _POSE = (
     MessageColumn(
@@ -90,7 +89,7 @@ OBSERVATION: Final = (
         "-",
         "largest grip that any wheel used in the visit; mu is at least this",
         _MU_STEP,
-        _MU_RANGE,
+        MU_RANGE,
     ),
     MessageColumn(
         "log_likelihood",

@@ -36,7 +36,6 @@ class Field(NamedTuple):
 NS = pa.timestamp("ns", tz="UTC")
 # Resolution of archived times: Spark cannot read nanoseconds from Parquet.
 US = pa.timestamp("us", tz="UTC")
-US_STEP: Final = 1_000  # [ns] one microsecond
 LIKELIHOOD = pa.binary(mugrid.BINS)
 F32 = pa.float32()
 F64 = pa.float64()

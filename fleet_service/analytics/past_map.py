@@ -13,6 +13,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import past_fusion
 from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
+from schemas.thresholds import US_STEP
 
 LATENESS_S = 120.0  # [s] default of ServiceConfig.lateness_s
 
@@ -44,7 +45,7 @@ def snapshot_table(table: pa.Table, at: int) -> pa.Table:
     """Return the table of cells with their beliefs (probability of each friction value) in the
     GeoParquet form of a map snapshot; `at` [ns] is the time of the beliefs.
     """
-    time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
+    time = pa.array(np.full(table.num_rows, at // US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(
         [("cell", "ascending"), ("sector", "ascending")]
     )

@@ -22,6 +22,7 @@ of a belief are significant, so this is exact enough.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any, Final
 
 import numpy as np
@@ -36,9 +37,14 @@ from schemas.thresholds import SLIPPERY_MU
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
 
-# kinds of report, see `kind_of`
-BOUND = 0
-VALUE = 1
+
+class ReportKind(IntEnum):
+    """Kind of a report, see `kind_of`: only a lower bound of friction, or a friction value."""
+
+    BOUND = 0
+    VALUE = 1
+
+
 _BINS: Final = mugrid.BINS
 # [bins²/s] Diffusion coefficient of the slow change of μ: half the variance gained per second.
 _DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
@@ -241,7 +247,7 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
 
 
 @refcount_free_inlined
-def kind_of(evidence: ByteArray) -> int:
+def kind_of(evidence: ByteArray) -> ReportKind:
     """Return the kind of a visit's likelihood of friction (32,), VALUE or BOUND. It is VALUE (a
     measurement) if the likelihood falls by at least VALUE_DROP_STEPS from its maximum to the
     highest friction, because it then limits μ from above. Otherwise it is BOUND, only a lower bound
@@ -250,7 +256,8 @@ def kind_of(evidence: ByteArray) -> int:
     least = np.uint8(255)
     for i in range(_BINS):
         least = min(least, evidence[i])
-    return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
+    is_value = evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS
+    return ReportKind.VALUE if is_value else ReportKind.BOUND
 
 
 @refcount_free_inlined
@@ -270,7 +277,7 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
     A fall of a BOUND above its maximum is noise, so it is removed. Smoothed bounds would be wrong,
     because many of them together could exceed the grip that any vehicle used.
     """
-    if kind == VALUE:
+    if kind == ReportKind.VALUE:
         for j in range(_BINS):
             padded[REACH + j] = _LIKELIHOOD[evidence[j]]
         for i in range(_BINS):

@@ -124,8 +124,9 @@ FORGET_S: Final = 10.0
 # --- Repeated reports of one vehicle in one cell ---
 
 # [s] Time constant with which a vehicle's vote counts again, at the rate at which the map forgets
-# the first vote by slow and sudden change. So no vehicle controls a cell by passing it all day.
-VOTE_RENEWAL_S: Final = 3600.0
+# the first vote by slow and sudden change. So no vehicle controls a cell by passing it all day. The
+# vote counts again by 95 % (1 - e⁻³) in the mean time between changes.
+VOTE_RENEWAL_S: Final = CHANGE_S / 3.0
 
 # Two values this many standard deviations apart come from two different roads, or one is wrong.
 PEERS_DISAGREE: Final = 4.0
@@ -146,10 +147,12 @@ REVISIT_S: Final = 20.0
 # votes of all others would weigh almost nothing.
 WAITING_MOST: Final = 32
 # [s] Time for which a vehicle's values in a cell are remembered. By then 95 % of its vote counts
-# again (1 - e⁻³). Bounds are remembered for VOTE_RENEWAL_S only, when 63 % counts again. Most
-# visits give bounds, so the memory holds the visits of one hour and the values of three.
-FORGOTTEN_S: Final = 3.0 * VOTE_RENEWAL_S
-FORGOTTEN_EVERY_S: Final = 900  # [s] time between two deletions of reports too old to remember
+# again. Bounds are remembered for VOTE_RENEWAL_S only, when 63 % counts again. Most visits give
+# bounds, so the memory holds the visits of one hour and the values of three.
+FORGOTTEN_S: Final = CHANGE_S
+# [s] Time between two deletions of reports too old to remember, so that at most a quarter more than
+# needed is stored (`table.places_for`).
+FORGOTTEN_EVERY_S: Final = int(VOTE_RENEWAL_S) // 4
 
 # --- Visits without a value ---
 
@@ -240,6 +243,8 @@ SOURCE_SHARE: Final = 0.6
 # instead of one, alerts in three drives found .13 of the snow instead of .17, and as much ice
 # (.80).
 WITNESS_NATS: Final = 1.0
+# [ns] Time for which a source counts. Older reports of ice are about an earlier state of the road.
+SOURCE_NS: Final = 3600 * NS
 # [ns] Trust is computed once per epoch and used from the next epoch on. So it depends on the order
 # of the times of reports, and not on their order of arrival.
 EPOCH_NS: Final = 60 * NS

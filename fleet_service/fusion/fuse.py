@@ -37,7 +37,7 @@ from schemas import grid
 from schemas.numeric import BoolArray, Float32Array, IntArray
 from schemas.thresholds import NS
 
-_ANY: Final = 1 << 62
+_ANY: Final = np.iinfo(np.int64).max  # no limit on the number of visits
 
 
 class Updated(NamedTuple):

@@ -29,7 +29,7 @@ from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import ByteArray, IntArray
 from schemas.runtime.jit import compiled
-from schemas.thresholds import NS
+from schemas.thresholds import NS, US_STEP
 
 # [ns] A late visit is fused only if it is at most this much older than the checkpoint. After this
 # time, the road has probably changed.
@@ -47,7 +47,7 @@ def fused_at(time: IntArray, checkpoint: int) -> IntArray:
     checkpoint are whole microseconds, the resolution of times in the archive.
     """
     age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
-    return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
+    return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // US_STEP * US_STEP)
 
 
 def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:

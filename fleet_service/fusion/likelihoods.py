@@ -28,8 +28,9 @@ from schemas.thresholds import EXCITED_SHARE, Z_95
 
 # Half a standard deviation of the grip used. A bound is flat from the grip used minus this.
 _LESS: Final = 0.5 * c.UTILISED_STD
-# Step of the grip used in the table of bounds; the grip used is rounded down. A seventh of a bin.
-_USED_STEP: Final = 0.005
+# Step of the grip used in the table of bounds; the grip used is rounded down. A tenth of its
+# standard deviation.
+_USED_STEP: Final = c.UTILISED_STD / 10.0
 
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:

@@ -18,16 +18,13 @@ from fleet_service.fusion.space import other_cells
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 from schemas.signals import FLAGS
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import MU_RANGE, SLIPPERY_MU, US_STEP
+from schemas.wire import MAX_ROWS
 
 SmallArray = NDArray[np.int8]
-# Factor that joins the numbers of batch and row to one number. No batch has as many rows.
-ROWS_PER_SEQ: Final = 64
 # Share of its value that a vehicle is assumed to have used if it does not report the grip used. It
 # is below EXCITED_SHARE, so the assumption is cautious.
 UNTOLD_SHARE: Final = 0.5
-USED_MOST: Final = 2.0  # largest grip used that the contract allows
-_US: Final = 1000  # [ns] one microsecond, the resolution of times in the archive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,16 +90,16 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     other, share = other_cells(
         columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
     )
-    used = np.clip(np.nan_to_num(used), 0.0, USED_MOST).astype(np.float32)
+    used = np.clip(np.nan_to_num(used), *MU_RANGE).astype(np.float32)
     return Observations(
-        time=columns["leave_time"] // _US * _US,
+        time=columns["leave_time"] // US_STEP * US_STEP,
         cell=columns["cell"],
         sector=first,
         second=np.where(np.isnan(columns["yaw"]) | (second == first), -1, second).astype(np.int8),
         vehicle=vehicle,
         boot=columns["boot"],
         region=columns["region"],
-        sequence=columns["seq"] * ROWS_PER_SEQ + columns["row"],
+        sequence=columns["seq"] * MAX_ROWS + columns["row"],
         evidence=steps,
         reported=reported,
         used=used,

@@ -42,16 +42,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.store.records import MANOEUVRES, SHARED, USED, WEIGHT
+from fleet_service.fusion.store.records import (
+    MANOEUVRES,
+    NONE,
+    SHARED,
+    USED,
+    WEIGHT,
+    ManoeuvreKind,
+)
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, Z_95
 
-DRIVING, BRAKING, LEFT, RIGHT = range(MANOEUVRES)
-# kind of manoeuvre if the sender does not report it; counted as the cell's most frequent kind
-UNKNOWN: Final = -1
 # Axes of the table of kernels: mean grip used (USED_ROWS steps of USED_STEP), shared error σ_s (the
 # nearest entry of STATED), n_eff (the next smaller entry of KINDS).
 USED_STEP: Final = 0.08
@@ -61,20 +65,21 @@ _BORDERS: Final = tuple(0.5 * (a + b) for a, b in pairwise(STATED))
 KINDS: Final = (1.0, 1.5, 2.2, 3.0)
 TENTH_NS: Final = 360 * NS  # [ns] the weights of a cell fade in steps of this length
 _FADES: Final = np.exp(-np.arange(64) * TENTH_NS / NS / c.VOTE_RENEWAL_S).astype(np.float32)
-_MOST: Final = 255.0  # largest number that a byte holds
+_MOST: Final = np.iinfo(np.uint8).max
 
 
 def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
-    """Return the kind of manoeuvre of visits (n,), DRIVING, BRAKING, LEFT or RIGHT, from the
-    longitudinal and lateral grip used; UNKNOWN where either is NaN.
+    """Return the kind of manoeuvre (`ManoeuvreKind`) of visits (n,), from the longitudinal and
+    lateral grip used. Where either is NaN, return NONE, which counts as the cell's most frequent
+    kind.
     """
     along = np.abs(longitudinal) >= np.abs(lateral)
     kind = np.where(
         along,
-        np.where(longitudinal >= 0.0, DRIVING, BRAKING),
-        np.where(lateral >= 0.0, LEFT, RIGHT),
+        np.where(longitudinal >= 0.0, ManoeuvreKind.DRIVING, ManoeuvreKind.BRAKING),
+        np.where(lateral >= 0.0, ManoeuvreKind.LEFT, ManoeuvreKind.RIGHT),
     )
-    return np.where(np.isfinite(longitudinal) & np.isfinite(lateral), kind, UNKNOWN).astype(np.int8)
+    return np.where(np.isfinite(longitudinal) & np.isfinite(lateral), kind, NONE).astype(np.int8)
 
 
 def shared_parts(reported: Float32Array) -> ByteArray:

@@ -12,12 +12,11 @@ import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import (
-    BOUND,
     PADDED,
     REACH,
     SLIPPERY_SHARE,
-    VALUE,
     Bins,
+    ReportKind,
     apply_vote,
     convolve_bias,
     describe_likelihood,
@@ -82,7 +81,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     evidence = entries[entry].evidence
     likelihood = scratch[ScratchRow.LIKELIHOOD]
     known = not math.isnan(reported[0])
-    kind = VALUE if known else kind_of(evidence)
+    kind = ReportKind.VALUE if known else kind_of(evidence)
     entries[entry].kind = kind
     load_likelihood(entries, entry, scratch)
     if known:
@@ -93,7 +92,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     mean = mean_of(likelihood)
     entries[entry].mean = mean
     entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NEITHER
-    if kind == VALUE:
+    if kind == ReportKind.VALUE:
         std, slippery = describe_likelihood(likelihood, mean)
         entries[entry].std = std
         entries[entry].slippery = slippery
@@ -148,8 +147,10 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     else:
         seen = (
             seen
-            or pairs[pair].time[BOUND] >= max(oldest_remembered(now, BOUND), 1)
-            or pairs[pair].time[VALUE] >= max(oldest_remembered(now, VALUE), 1)
+            or pairs[pair].time[ReportKind.BOUND]
+            >= max(oldest_remembered(now, ReportKind.BOUND), 1)
+            or pairs[pair].time[ReportKind.VALUE]
+            >= max(oldest_remembered(now, ReportKind.VALUE), 1)
         )
         time = int(pairs[pair].time[kind])
         mean = _from_parts(pairs[pair].mean[kind])
@@ -197,7 +198,7 @@ def _from_parts(parts: int) -> np.float32:
 @refcount_free_inlined
 def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
     # If the bound u rises, the mean of "at least u" under the uniform prior rises by half as much.
-    if kind == BOUND:
+    if kind == ReportKind.BOUND:
         # It is new in full from two standard deviations of the grip used on.
         share = (new_mean - mean) / c.UTILISED_STD
     else:
@@ -258,9 +259,9 @@ def update(
     if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0:
         weight = _untrusted_weight(cells, row, kind, float(entries[entry].power), weight)
     strength = weight * entries[entry].power * entries[entry].share
-    if kind == VALUE and not new:
+    if kind == ReportKind.VALUE and not new:
         ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
-    if kind == VALUE:
+    if kind == ReportKind.VALUE:
         apply_vote(
             p,
             scratch[ScratchRow.LIKELIHOOD],
@@ -276,7 +277,7 @@ def update(
     pack_belief(p, belief, row)
     cells[row].time = time
     _count_visit(cells, row, entries, entry)
-    if kind == VALUE:
+    if kind == ReportKind.VALUE:
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
@@ -383,7 +384,7 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
     controller intervened.
     """
     return bool(
-        entries[entry].kind == VALUE
+        entries[entry].kind == ReportKind.VALUE
         or entries[entry].limited > 0
         or entries[entry].slippery <= 1.0 - c.SOURCE_SHARE
     )

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion.belief import PADDED, VALUE, Bins
+from fleet_service.fusion.belief import PADDED, Bins, ReportKind
 from fleet_service.fusion.store.cells import copy_row, copy_sources
 from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pair, pair_of
 from fleet_service.fusion.store.records import (
@@ -376,7 +376,7 @@ def _commit_windows(
                 update(state.base, place, entries, entry, weather, scratch)
             if entries[entry].limited > 0:
                 judge_flag(live.reporters, live.cells[slot].reporters, peers, entries, entry)
-            if entries[entry].kind == VALUE:
+            if entries[entry].kind == ReportKind.VALUE:
                 windows[window].values -= 1
                 compare_reports(
                     live.reporters, live.cells[slot].reporters, peers, names, entries, entry
@@ -417,7 +417,7 @@ def _link_entry(windows: RecordArray, entries: RecordArray, window: int, entry: 
     following = windows[window].head if after == NONE else entries[after].following
     entries[entry].previous = after
     entries[entry].following = following
-    windows[window].values += entries[entry].kind == VALUE
+    windows[window].values += entries[entry].kind == ReportKind.VALUE
     if after == NONE:
         windows[window].head = entry
         windows[window].first = entries[entry].time

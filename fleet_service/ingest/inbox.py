@@ -36,8 +36,7 @@ from schemas.errors import InputError
 from schemas.grid import cell_of
 from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
-from schemas.tables import US_STEP
-from schemas.thresholds import NS
+from schemas.thresholds import NS, US_STEP
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 

@@ -31,7 +31,7 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.process import trim_memory
 from schemas.signals import FLAGS
-from schemas.tables import US_STEP
+from schemas.thresholds import US_STEP
 from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]

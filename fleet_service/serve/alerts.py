@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion
+from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import NONE, SOURCES, Side
 from fleet_service.fusion.witnesses import stretch_slots, stretch_sources, witnesses_of
@@ -45,8 +46,6 @@ LEAST_SOURCES: Final = 2
 # raised an alert in two of six tuning towns.
 FRESH_NS: Final = 600 * NS
 MOST_SOURCES: Final = 2 * LEAST_SOURCES
-# [ns] Time for which a source counts. Older reports of ice are about an earlier state of the road.
-SOURCE_NS: Final = 3600 * NS
 TIME_STEP_NS: Final = 60 * NS  # [ns] alert times are rounded to this if persons are kept private
 QUIET_NS: Final = 1800 * NS  # [ns] an alert may fade if no vehicle has confirmed ice for this time
 
@@ -133,7 +132,7 @@ class Alerts:
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
             return True
-        witnesses = witnesses_of(self._fusion, slot, time - SOURCE_NS)
+        witnesses = witnesses_of(self._fusion, slot, time - c.SOURCE_NS)
         return self._idle_roads.admit(
             int(live.key[slot]) // grid.SECTORS, witnesses, time, LEAST_SOURCES
         )
@@ -163,7 +162,7 @@ class Alerts:
         opposed = against[:, 0] > own[:, 1] - FRESH_NS
         needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
         enough = (own > 0).sum(axis=1) >= needed
-        along = stretch_sources(fusion, near, fusion.live.time[near] - SOURCE_NS)
+        along = stretch_sources(fusion, near, fusion.live.time[near] - c.SOURCE_NS)
         second = along.when[:, 1]
         enough |= (second > 0) & (against[:, 0] <= second - FRESH_NS)
         accused = (own[:, 0] > 0) & (fusion.slippery(near) > LIKELY)
@@ -174,7 +173,7 @@ class Alerts:
         each slot (cell and heading sector), (k, SOURCES); 0 means no vehicle. Only reports within
         the hour before the slot's last report count.
         """
-        return self._fusion.sources(slots, side, self._fusion.live.time[slots] - SOURCE_NS)
+        return self._fusion.sources(slots, side, self._fusion.live.time[slots] - c.SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
         """Return a mask of slots (one per cell and heading sector), (k,): True if the alert may be

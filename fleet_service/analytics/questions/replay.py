@@ -18,7 +18,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, fusion_with_weather, replay
 from schemas import tables
 from schemas.errors import InputError
-from schemas.thresholds import NS
+from schemas.thresholds import NS, US_STEP
 from schemas.wire import Kind
 
 MOST_FRAMES: Final = 1500  # largest number in an answer: one day with one frame per minute
@@ -96,5 +96,5 @@ def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
 
 def _map_frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
     table = visited_cells(fusion, at, engine.part.bbox)
-    frame = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
+    frame = pa.array(np.full(table.num_rows, at // US_STEP)).cast(tables.US)
     return table.append_column("frame", frame)

@@ -26,6 +26,7 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
+from schemas.thresholds import US_STEP
 from schemas.wire import Kind
 
 # columns of the roll-up that describe measured friction
@@ -140,9 +141,7 @@ def _time_filter(column: str, part: Extract) -> ValueRange:
     """Return a filter that a row passes if its time lies within the selected time range: start
     included, end excluded.
     """
-    return ValueRange(
-        column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1
-    )
+    return ValueRange(column, -(-part.since // US_STEP), -(-part.until // US_STEP) - 1)
 
 
 def _cells_in_box(table: pa.Table, bbox: Box | None) -> pa.Table:

@@ -22,7 +22,7 @@ from fleet_service.archive.format.files import SEGMENT, write_table
 from schemas import mugrid, tables
 from schemas.numeric import BoolArray, Float32Array, IntArray
 from schemas.runtime.durable import ENDING, sync_directory
-from schemas.thresholds import EXCITED_SHARE
+from schemas.thresholds import EXCITED_SHARE, US_STEP
 from schemas.wire import Kind
 from schemas.wire.batches import ABSENT
 
@@ -131,9 +131,7 @@ def round_to_steps(rows: Rows) -> Rows:
         name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c
         for name, c in rows.items()
     }
-    return out | {
-        name: out[name] // tables.US_STEP * tables.US_STEP for name in _TIMES if name in out
-    }
+    return out | {name: out[name] // US_STEP * US_STEP for name in _TIMES if name in out}
 
 
 def to_nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
@@ -160,7 +158,7 @@ def _make_column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
             f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())]
         )
     if f.type == tables.US:
-        values = values // tables.US_STEP
+        values = values // US_STEP
     column: pa.Array[Any] = pa.array(values).cast(f.type)
     return column
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 from fleet_service.archive.format import geo, layout
 from fleet_service.archive.format.files import MAP, put_in_place
 from schemas import tables
-from schemas.thresholds import NS
+from schemas.thresholds import NS, US_STEP
 
 TABLE: Final = "map"
 _NAME: Final = "%Y%m%dT%H%M%SZ"
@@ -30,7 +30,7 @@ def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
         OSError: the file could not be written; no draft (unfinished file) is left.
     """
     path = path_of(root, now)
-    time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
+    time = pa.array(np.full(table.num_rows, now // US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(
         [("cell", "ascending"), ("sector", "ascending")]
     )

@@ -27,7 +27,7 @@ from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.durable import sync_directory
-from schemas.tables import US_STEP
+from schemas.thresholds import US_STEP
 
 _NAME: Final = re.compile(r"(\d{4}-\d{2})\.(?:([0-9a-f]{16})\.)?(\d{1,19})\.erased")
 _EPOCH: Final = date(1970, 1, 1)

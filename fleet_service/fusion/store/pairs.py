@@ -8,7 +8,7 @@ still be inserted. One record (`PairRecord`) summarises the older reports.
 
 from __future__ import annotations
 
-from fleet_service.fusion.belief import VALUE
+from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import NONE, PAIRS, State
 from fleet_service.fusion.store.settled import activate_reports
 from fleet_service.fusion.store.table import AHEAD, pair_place
@@ -84,7 +84,7 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     pairs[pair].time[kind] = entries[entry].time // NS
     pairs[pair].mean[kind] = entries[entry].last_mean
     pairs[pair].spent[kind] = entries[entry].spent
-    if kind == VALUE:
+    if kind == ReportKind.VALUE:
         pairs[pair].std = entries[entry].last_std
     pairs[pair].waiting -= 1
     if entries[entry].after == NONE:

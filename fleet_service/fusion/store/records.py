@@ -33,7 +33,7 @@ from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.records import RecordArray, record_type
 
-NONE: Final = -1  # no row, or no vehicle
+NONE: Final = -1  # no row, no vehicle, or no known kind of manoeuvre
 
 
 class Side(IntEnum):
@@ -43,6 +43,16 @@ class Side(IntEnum):
     ICE = 1
 
 
+class ManoeuvreKind(IntEnum):
+    """Kind of manoeuvre of a visit, see `shared.manoeuvre_of`."""
+
+    DRIVING = 0
+    BRAKING = 1
+    LEFT = 2
+    RIGHT = 3
+
+
+MANOEUVRES: Final = len(ManoeuvreKind)
 # Number of vehicles remembered per slot that reported grip, and per slot that reported ice. An
 # alert never needs more.
 SOURCES: Final = 5
@@ -55,7 +65,6 @@ USED: Final = 100.0
 SHARED: Final = 400.0
 WEIGHT: Final = 16.0
 UNTRUSTED: Final = 64.0
-MANOEUVRES: Final = 4
 # Intervention of a slip controller: none; reported by a vehicle whose interventions often disagree
 # with values of others; reported by a vehicle whose interventions usually agree.
 _NO_FLAG, CLAIMED, HEEDED = range(3)

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import BOUND, VALUE
+from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import NONE, SETTLED_SINCE, SETTLED_VEHICLES, State
 from fleet_service.fusion.store.table import AHEAD
 from schemas.numeric import IntArray
@@ -35,7 +35,9 @@ def oldest_remembered(now: int, kind: int) -> int:
     """Return the time [s] of the oldest report of a kind (BOUND or VALUE) that is still remembered
     at `now` [s]. Older reports have no effect, whether or not their record is already deleted.
     """
-    return int(now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == VALUE else _BOUNDS_S))
+    return int(
+        now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == ReportKind.VALUE else _BOUNDS_S)
+    )
 
 
 @refcount_free_inlined
@@ -86,7 +88,7 @@ def _find_first(state: State, slot: int, vehicle: int) -> int:
     keys = state.settled_keys
     begin = _to_int(state.settled_begin[slot, 0])
     end = _to_int(state.settled_begin[slot + 1, 0])
-    key = _make_key(vehicle, BOUND)
+    key = _make_key(vehicle, ReportKind.BOUND)
     low = begin
     high = end
     step = 4
@@ -131,7 +133,7 @@ def activate_reports(state: State, pair: int) -> None:
         this.time[kind] = _full_time(state.settled[row].time, state.used[SETTLED_SINCE])
         this.mean[kind] = state.settled[row].mean
         this.spent[kind] = state.settled[row].spent
-        if kind == VALUE:
+        if kind == ReportKind.VALUE:
             value = _to_int(state.settled_begin[slot, 1])
             for other in range(_to_int(state.settled_begin[slot, 0]), row):
                 value += _to_int(keys[other] >> 1) & 1
@@ -222,8 +224,8 @@ def count_settling(
     for k in range(len(resting)):
         prefetch(state.pairs, resting[min(k + AHEAD, len(resting) - 1)], 0)
         this = state.pairs[resting[k]]
-        has_bound = this.time[BOUND] >= oldest_remembered(now, BOUND)
-        has_value = this.time[VALUE] >= oldest_remembered(now, VALUE)
+        has_bound = this.time[ReportKind.BOUND] >= oldest_remembered(now, ReportKind.BOUND)
+        has_value = this.time[ReportKind.VALUE] >= oldest_remembered(now, ReportKind.VALUE)
         bounds += has_bound
         values += has_value
         if not has_bound and not has_value:
@@ -258,7 +260,7 @@ def insert_reports(
             prefetch(state.pairs, resting[max(k - AHEAD, 0)], 0)
             this = state.pairs[resting[k]]
             k -= 1
-            for kind in (VALUE, BOUND):
+            for kind in (ReportKind.VALUE, ReportKind.BOUND):
                 if this.time[kind] < oldest_remembered(now, kind):
                     continue
                 key = _make_key(this.vehicle, kind)
@@ -273,7 +275,7 @@ def insert_reports(
                 state.settled[to].time = this.time[kind] & 0xFFFF
                 state.settled[to].mean = this.mean[kind]
                 state.settled[to].spent = this.spent[kind]
-                if kind == VALUE:
+                if kind == ReportKind.VALUE:
                     to_value -= 1
                     state.settled_std[to_value] = this.std
         if to == end:  # all reports before this one are already at their places
@@ -284,7 +286,7 @@ def insert_reports(
             is_value = _move_report(state, end, to, value - 1, to_value - 1)
             value -= is_value
             to_value -= is_value
-    state.used[SETTLED_SINCE] = oldest_remembered(now, VALUE)
+    state.used[SETTLED_SINCE] = oldest_remembered(now, ReportKind.VALUE)
     state.used[SETTLED_VEHICLES] = vehicles
 
 

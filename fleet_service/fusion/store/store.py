@@ -4,6 +4,8 @@ tables and pools that grow. Compiled code receives all arrays as one `State`.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from fleet_service.fusion import constants as c
@@ -47,12 +49,12 @@ from fleet_service.fusion.store.table import (
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
 
 _NOTHING = np.zeros(0, np.int32)
-_HOUR = 3600  # [s]
 # [s] Time by which the checkpoint may be ahead of the clock: with little lateness, the rest of an
-# epoch.
-_AHEAD = 120
+# epoch. One more epoch is allowed for the clock's error.
+_AHEAD: Final = 2 * c.EPOCH_NS // NS
 
 
 class Store:
@@ -224,7 +226,7 @@ class Store:
 
         When this time enters a new quarter of an hour, two kinds of data are deleted: reports that
         no longer have an effect (`settled.oldest_remembered`), and lists of a cell's recent
-        reporters that are more than an hour old. The records of vehicles in cells where all their
+        reporters that are older than SOURCE_NS. The records of vehicles in cells where all their
         observations are final are moved then (`settle_pairs`), and also whenever many such records
         exist.
         """
@@ -238,7 +240,7 @@ class Store:
             self.state = settle_pairs(state, self.names[: self.vehicles], self.size, now)
         if now != self.forgotten_at:
             self.forgotten_at = now
-            self.state = rebuild_reporters(self.state, self.size, now - _HOUR - _AHEAD)
+            self.state = rebuild_reporters(self.state, self.size, now - c.SOURCE_NS // NS - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit

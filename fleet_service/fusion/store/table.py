@@ -33,8 +33,9 @@ LEAST: Final = 1024  # number of places of a new table
 ROWS_MOST: Final = 0.8
 # The same for the table of pairs. Two places fit into a line, and a search reads two or three.
 PAIRS_MOST: Final = 0.7
-_LOWER: Final = 0xFFFFFFFF
-_TAG: Final = 0x7FFFFFFF
+# Bits of a place: the lower half, and the non-negative numbers that fit into the upper half.
+_LOWER: Final = np.iinfo(np.uint32).max
+_TAG: Final = np.iinfo(np.int32).max
 # Number of rows for which memory is prefetched before the work on them, so that the memory accesses
 # overlap.
 AHEAD: Final = 128

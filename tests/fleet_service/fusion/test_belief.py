@@ -77,8 +77,8 @@ def test_time_keeps_a_rising_belief_rising(p: np.ndarray, seconds: float) -> Non
 def test_no_number_of_bounds_lowers_the_upper_end(evidence: np.ndarray, votes: int) -> None:
     p = mugrid.PRIOR.copy()
     vote = np.empty(32)
-    assert b.kind_of(evidence) == b.BOUND
-    convolve_bias(evidence, b.BOUND, vote)
+    assert b.kind_of(evidence) == b.ReportKind.BOUND
+    convolve_bias(evidence, b.ReportKind.BOUND, vote)
     for _ in range(votes):
         vote_for(p, vote, 1.0 - c.CONTAMINATION)
         forget(p, 60.0)
@@ -113,7 +113,7 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
     evidence[4] = 0
     vote = np.empty(32)
     p = mugrid.PRIOR.copy()
-    convolve_bias(evidence, b.VALUE, vote)
+    convolve_bias(evidence, b.ReportKind.VALUE, vote)
     vote_for(p, vote, 1.0 - c.CONTAMINATION)
     assert p.max() / p.min() < 32 / c.CONTAMINATION
 
@@ -121,7 +121,7 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
 def test_a_vote_of_no_weight_or_no_power_changes_nothing() -> None:
     evidence = np.arange(32, dtype=np.uint8) * 8
     vote = np.empty(32)
-    convolve_bias(evidence, b.VALUE, vote)
+    convolve_bias(evidence, b.ReportKind.VALUE, vote)
     for contamination, power in ((1.0, 1.0), (c.CONTAMINATION, 0.0)):
         p = np.linspace(1.0, 2.0, 32)
         p /= p.sum()

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion, shared
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.store.records import NONE, ManoeuvreKind
 from schemas import mugrid
 from tests.fleet_service.examples import belief, interval, observations, value
 
@@ -56,7 +57,7 @@ def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
 
 
 def test_certainty_grows_with_manoeuvres_not_with_equal_vehicles() -> None:
-    same = np.full(30, shared.BRAKING)
+    same = np.full(30, ManoeuvreKind.BRAKING)
     mixed = np.arange(30) % 4
     spread = np.hypot(c.COMMON_ALWAYS, c.COMMON_MANOEUVRE) * 0.6
     assert width(0.6, same) > 3.0 * spread
@@ -65,13 +66,19 @@ def test_certainty_grows_with_manoeuvres_not_with_equal_vehicles() -> None:
 
 
 def test_who_does_not_tell_what_it_did_did_the_same_as_all_others() -> None:
-    same = np.full(30, shared.BRAKING)
-    unknown = np.where(np.arange(30) % 2, shared.UNKNOWN, shared.BRAKING)
+    same = np.full(30, ManoeuvreKind.BRAKING)
+    unknown = np.where(np.arange(30) % 2, NONE, ManoeuvreKind.BRAKING)
     assert width(0.6, unknown) == pytest.approx(width(0.6, same), abs=1e-3)
 
 
 def test_a_manoeuvre_is_told_by_the_larger_part_of_the_grip_used() -> None:
     along = np.array([0.5, -0.5, 0.1, 0.1, np.nan])
     across = np.array([0.1, 0.1, 0.5, -0.5, 0.5])
-    expected = [shared.DRIVING, shared.BRAKING, shared.LEFT, shared.RIGHT, shared.UNKNOWN]
+    expected = [
+        ManoeuvreKind.DRIVING,
+        ManoeuvreKind.BRAKING,
+        ManoeuvreKind.LEFT,
+        ManoeuvreKind.RIGHT,
+        NONE,
+    ]
     assert shared.manoeuvre_of(along, across).tolist() == expected
