@@ -51,9 +51,9 @@ _DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
 # Largest share of a bin that moves to each neighbouring bin in one diffusion step. A larger share
 # makes the scheme unstable or adds ripples.
 _STEP: Final = 0.25
-# Largest number of diffusion steps. They cover one day; after a day, sudden changes have replaced
-# the belief by the prior.
-_STEPS: Final = 64
+# Largest number of diffusion steps: those of one day. After a day, sudden changes have replaced the
+# belief by the prior.
+_STEPS: Final = math.ceil(_DIFFUSION * 24 * 3600 / _STEP)
 # likelihood for each number of steps below the maximum
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
@@ -66,9 +66,6 @@ FULL: Final = np.uint16(65535)
 # Number of bins on each side at which the bias kernel is cut off: 3.6 of its largest standard
 # deviation.
 REACH: Final = 6
-# Smaller weights of the kernel become zero. They would lead to single-precision numbers below
-# 1e-38, whose multiplication takes a hundred times as long.
-_LEAST_TAP: Final = 1e-9
 PADDED: Final = _BINS + 2 * REACH
 
 
@@ -94,7 +91,9 @@ def _kernel_diagonals() -> Float32Array:
     for i in range(_BINS):
         for j in range(max(i - REACH, 0), min(i + REACH + 1, _BINS)):
             taps[j - i + REACH, i] = kernel[i, j]
-    taps[taps < _LEAST_TAP] = 0.0
+    # Weights without an effect in single precision become zero. They would lead to numbers below
+    # 1e-38, whose multiplication takes a hundred times as long.
+    taps[taps < np.finfo(np.float32).eps] = 0.0
     return taps
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import mugrid
-from schemas.thresholds import NS
+from schemas.thresholds import NS, SURFACES
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS  # [μ] width of a friction bin
 
@@ -43,8 +43,6 @@ CONTAMINATION_LEAST: Final = 0.04
 # --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
 # More vehicles do not average this error out; see `shared`.
 
-# Relative standard deviation in cells where vehicles reported only bounds.
-COMMON_RELATIVE: Final = 0.04
 # [μ] Standard deviation of the part that does not grow with the grip, for readings that are too
 # low. It stands for crossfall (2.5 % on roads), slopes that no filter knows, and drag mistaken for
 # a tyre force. In cells on ice (μ ≤ .2) of five tuning drives, the intervals contained the true μ
@@ -57,7 +55,8 @@ COMMON_ABSOLUTE: Final = 0.02
 COMMON_HIGH: Final = 0.025
 # Relative standard deviation of the part that all kinds of manoeuvre share, in cells with values.
 COMMON_ALWAYS: Final = 0.02
-# Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share.
+# Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share;
+# in cells where vehicles reported only bounds, of the whole error.
 COMMON_MANOEUVRE: Final = 0.05
 
 # If a vehicle uses less than this share of a road's grip, its value may be too low, because it
@@ -134,8 +133,6 @@ PEERS_DISAGREE: Final = 4.0
 # A value that differs from the vehicle's own last value in the cell counts again at once; the
 # vehicle's bias cancels in the difference. Up to PEERS_AGREE standard deviations the difference is
 # noise. From PEERS_DISAGREE on the vote counts in full.
-# [μ] Smallest standard deviation that is believed in such a comparison.
-NOVELTY_STD: Final = 0.05
 # Number of whole votes that a vehicle has in a cell per VOTE_RENEWAL_S, however often its values
 # change: one vote and one change. With 1.5, ice is found after four passes instead of three.
 VOTES: Final = 2.0
@@ -157,23 +154,27 @@ FORGOTTEN_EVERY_S: Final = int(VOTE_RENEWAL_S) // 4
 # --- Visits without a value ---
 
 # A visit without a value is evidence against slippery road if other visits to the cell gave values.
-# The evidence is the cell's share of visits with a value, times this factor; the factor is below 1
-# because a warned driver uses less grip. In four tuning towns with 20 vehicles an hour, the share
-# of correct alerts was .883 without this evidence and .914 with it. The share of ice that alerts
-# found was .906 in both cases.
+# The evidence is the share of the cell's visits, this one included, that gave a value, times this
+# factor. The factor is below 1 because a warned driver uses less grip. In four tuning towns with 20
+# vehicles an hour, the share of correct alerts was .883 without this evidence and .914 with it. The
+# share of ice that alerts found was .906 in both cases.
 SILENCE: Final = 0.4
-# Added to the number of visits in that share: after so few visits the share is not known well.
-FIRST_VISITS: Final = 4.0
 # Visits without a value lower P(slippery) at most to this: no longer probable, but not improbable.
+# Also P(slippery) of a bound that does not show grip.
 UNSURE: Final = 0.45
 
 # --- From a report to a likelihood ---
 
-# [nat] A likelihood that falls by less than this towards the highest μ is taken as flat there, so
-# it is a bound. The contract allows senders half a nat of slope above the grip used; this is twice
-# that.
-VALUE_DROP_NATS: Final = 1.0
-VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
+# [nat] Smallest difference of log-likelihoods that counts as evidence.
+# A likelihood that falls by less than this towards the highest μ is taken as flat there, so it is a
+# bound. The contract allows senders half a nat of slope above the grip used; this is twice that.
+# A source of ice must give this evidence for ice against grip, after allowing for the error of the
+# assumed tyre curve. In two tuning drives, 1.5 nats were reached by 20 % of visits to ice (μ <
+# .25), .6 % to wet road and .08 % to dry road; 3 nats by 12 %, .2 % and .04 %. With two nats
+# instead of one, alerts in three drives found .13 of the snow instead of .17, and as much ice
+# (.80).
+EVIDENCE_NATS: Final = 1.0
+VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
 
 # Smallest probability that a vehicle was in another cell for which that cell gets a part of its
 # vote; smaller parts stay in the reported cell. Receivers with an error of 1.5 m have 6 % on each
@@ -190,13 +191,17 @@ HERE_SHARE: Final = 0.5
 UTILISED_STD: Final = 0.05
 # Relative part of the same error, as large as a value's: mass over the wheels, roll, sensor gain.
 UTILISED_RELATIVE: Final = BIAS_RELATIVE
+# [μ] Smallest standard deviation of a value that is believed when two values are compared. A value
+# is computed from the grip used, so it is not more accurate.
+NOVELTY_STD: Final = UTILISED_STD
 # Largest grip used that is believed. Of the reports above it, 29 % were too high by more than .05.
 UTILISED_MOST: Final = 0.9
 # Share of bounds that belong to another road or are no bounds. On two rough tuning drives, 2 to 6 %
 # of the bounds were too high by more than .1, and all were where the surface changes inside a cell.
 BOUND_CONTAMINATION: Final = 0.3
-# [μ] Standard deviation of a posterior sent without an interval: the distance from wet to dry road.
-POSTERIOR_STD: Final = 0.15
+# [μ] Standard deviation of a posterior sent without an interval: half of the range of wet roads, as
+# if only the kind of road were known.
+POSTERIOR_STD: Final = 0.5 * (SURFACES["wet"][1] - SURFACES["wet"][0])
 
 # --- Trust: comparison of values of different vehicles in the same cell ---
 
@@ -220,8 +225,9 @@ PEERS: Final = 48
 # with the share of values that contain information about the road, 1 - CONTAMINATION.
 TRUST_PRIOR_PEERS: Final = 8.0
 # Share of agreement at or below which a vehicle has no weight: it disagrees with 30 % of the
-# trusted vehicles. If less than a third of a fleet colludes, only the colluders fall below it.
-TRUST_NONE: Final = 0.7
+# trusted vehicles, twice the assumed share. If less than a third of a fleet colludes, only the
+# colluders fall below it.
+TRUST_NONE: Final = 1.0 - 2.0 * CONTAMINATION
 TRUST_FULL: Final = 0.9  # share of agreement from which trust is 1
 # Smallest weight of another vehicle in this mean, so that comparisons count even if no vehicle is
 # trusted.
@@ -235,14 +241,9 @@ ESTABLISHED_VEHICLES: Final = 10
 NEWCOMER: Final = 0.4
 # Smallest weight with which a vehicle is trusted. A less trusted one votes but supports no alert.
 SOURCE_TRUST: Final = 0.5
-# P(slippery) of a single report, under the uniform prior, from which it may be a source of ice.
+# P(slippery) of a single report, under the uniform prior, from which it may be a source of ice. The
+# report must also give EVIDENCE_NATS.
 SOURCE_SHARE: Final = 0.6
-# [nat] Evidence for ice against grip that a source of ice also needs, after allowing for the error
-# of the assumed tyre curve. In two tuning drives, 1.5 nats were reached by 20 % of visits to ice
-# (μ < .25), .6 % to wet road and .08 % to dry road; 3 nats by 12 %, .2 % and .04 %. With two nats
-# instead of one, alerts in three drives found .13 of the snow instead of .17, and as much ice
-# (.80).
-WITNESS_NATS: Final = 1.0
 # [ns] Time for which a source counts. Older reports of ice are about an earlier state of the road.
 SOURCE_NS: Final = 3600 * NS
 # [ns] Trust is computed once per epoch and used from the next epoch on. So it depends on the order

@@ -68,9 +68,6 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
-# A neighbour whose stored P(slippery) is below this is skipped. Ageing moves it towards the prior's
-# .30 and the kernel K adds little, so its message would have little or no weight.
-_ASKED: Final = 0.2
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell number
 _X: Final = 0x5555555555555555 & _WHOLE  # bits of the column number; `_Y`: of the row number
 _Y: Final = _WHOLE - _X
@@ -250,10 +247,10 @@ def _choose_message(
         if row == NONE or cells[row].vehicles == 0:
             continue
         kept = _stored_slippery(live, row)
-        if side != _ACROSS and kept < c.NEIGHBOUR_GRIP:
+        if kept < c.NEIGHBOUR_GRIP:
+            if side == _ACROSS:
+                continue
             break
-        if kept < _ASKED:
-            continue
         _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
         read_road(parts.rule.kernels, cells, row, buffers.scratch[ScratchRow.BELIEF], buffers.road)
         slippery = _slippery_probability(buffers.road)
@@ -305,7 +302,7 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
                 row = find_row(table, live.cells, there * grid.SECTORS + sector)
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
-                if _stored_slippery(live, row) < _ASKED:
+                if _stored_slippery(live, row) < c.NEIGHBOUR_GRIP:
                     break
                 out[k, 1 + side * c.NEIGHBOURS + step] = row
         cell = key // grid.SECTORS
@@ -315,7 +312,7 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
             row = find_row(table, live.cells, there * grid.SECTORS + towards)
             if row == NONE or live.cells[row].vehicles == 0:
                 continue
-            if _stored_slippery(live, row) >= _ASKED:
+            if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
                 out[k, 1 + 2 * c.NEIGHBOURS + step] = row
     return out
 

@@ -55,7 +55,8 @@ from schemas.thresholds import NS, SLIPPERY_MU
 # operator vouches for it, so it starts like a vehicle that agreed with all others.
 _ENROLLED_AGREEMENT: Final = 1.0 - c.CONTAMINATION_LEAST
 _AGREEMENT: Final = 1.0 - c.CONTAMINATION
-_LEAST_VARIANCE: Final = 1e-4  # relative; no vehicle measures μ more exactly than to 1 %
+# Relative; no vehicle measures μ more exactly than the rounding to bins allows, 1 % on dry road.
+_LEAST_VARIANCE: Final = c.BIAS_ABSOLUTE**2
 
 
 @refcount_free

@@ -64,7 +64,6 @@ class ScratchRow(IntEnum):
 # are cut off at the end of the grid and become bounds, so bounds must count.
 _GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first bin above SLIPPERY_MU
-_NEITHER: Final = 0.5  # P(slippery) of a report that shows neither ice nor grip
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
 
 
@@ -91,7 +90,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
         return
     mean = mean_of(likelihood)
     entries[entry].mean = mean
-    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NEITHER
+    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else c.UNSURE
     if kind == ReportKind.VALUE:
         std, slippery = describe_likelihood(likelihood, mean)
         entries[entry].std = std
@@ -272,7 +271,8 @@ def update(
             p, scratch[ScratchRow.LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
         )
         if entries[entry].limited == 0:
-            noticed = float(cells[row].values) / (float(cells[row].visits) + c.FIRST_VISITS)
+            visits = float(cells[row].visits) + 1.0  # this one included
+            noticed = float(cells[row].values) / visits
             note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
     pack_belief(p, belief, row)
     cells[row].time = time
@@ -335,7 +335,7 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
     the same sliding wheel, so this evidence would count twice.
     """
     slippery = entries[entry].slippery
-    if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:
+    if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.EVIDENCE_NATS:
         return True
     return bool(entries[entry].limited == HEEDED and slippery > 1.0 - c.SOURCE_SHARE)
 

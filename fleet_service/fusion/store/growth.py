@@ -32,7 +32,7 @@ from fleet_service.fusion.store.settled import (
     find_resting,
     insert_reports,
 )
-from fleet_service.fusion.store.table import PAIRS_MOST, places_for
+from fleet_service.fusion.store.table import places_for
 from schemas.numeric import IntArray
 from schemas.runtime.records import RecordArray
 
@@ -99,7 +99,7 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
 
 
 def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
-    new = no_pairs(places_for(most, PAIRS_MOST))
+    new = no_pairs(places_for(most))
     state.used[PAIRS] = move_pairs(state.entries, state.pairs, new, int(only_waiting))
     return state._replace(pairs=new)
 

@@ -38,8 +38,6 @@ from fleet_service.fusion.store.records import (
 )
 from fleet_service.fusion.store.table import (
     LEAST,
-    PAIRS_MOST,
-    ROWS_MOST,
     assign_rows,
     is_full,
     rows_of,
@@ -164,7 +162,7 @@ class Store:
         if not len(new):
             return slots
         most = self.size + len(distinct_values(keys[new]))
-        if is_full(most, len(self._slots), ROWS_MOST):
+        if is_full(most, len(self._slots)):
             self._slots = table_of(self.state.live.cells, self.size, most)
         if most > len(self.state.live.cells):
             live = self.state.live
@@ -190,7 +188,7 @@ class Store:
         if not len(index) or index.min() != NONE:
             return index
         most = self.vehicles + len(distinct_values(vehicle[index == NONE]))
-        if is_full(most, len(self._known), ROWS_MOST):
+        if is_full(most, len(self._known)):
             self._known = table_of(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
@@ -217,7 +215,7 @@ class Store:
             self.state = self.state._replace(
                 live=live._replace(reporters=grow_rows(live.reporters, most))
             )
-        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
+        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs)):
             self.state = grow_pairs(self.state, int(used[PAIRS]) + rows)
 
     def forget(self, checkpoint_s: int) -> None:

@@ -28,11 +28,8 @@ from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
 LEAST: Final = 1024  # number of places of a new table
-# Largest share of a table's places that may be in use. Eight places of the table of rows fit into
-# one cache line, so a longer search costs little.
-ROWS_MOST: Final = 0.8
-# The same for the table of pairs. Two places fit into a line, and a search reads two or three.
-PAIRS_MOST: Final = 0.7
+# Largest share of a table's places that may be in use, so that a search reads two or three places.
+PLACES_MOST: Final = 0.7
 # Bits of a place: the lower half, and the non-negative numbers that fit into the upper half.
 _LOWER: Final = np.iinfo(np.uint32).max
 _TAG: Final = np.iinfo(np.int32).max
@@ -188,21 +185,21 @@ def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
     """Return a hash table (one array of row numbers) that has room for `entries` row numbers and
     contains the first `used` rows.
     """
-    table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
+    table = np.full(places_for(entries), NONE, np.int64)
     fill_table(table, rows, used)
     return table
 
 
-def places_for(entries: int, most: float) -> int:
+def places_for(entries: int) -> int:
     """Return the length (number of places) of a hash table for `entries` entries. Even with 25 %
-    more entries, at most the share `most` of the places is in use. Reason: most entries are kept
-    for an hour, but old ones are deleted only every quarter of an hour.
+    more entries, at most the share PLACES_MOST of the places is in use. Reason: most entries are
+    kept for an hour, but old ones are deleted only every quarter of an hour.
     """
-    return max(LEAST, int(1.25 * entries / most))
+    return max(LEAST, int(1.25 * entries / PLACES_MOST))
 
 
-def is_full(entries: int, places: int, most: float) -> bool:
-    """Return True if the number of row numbers in a hash table exceeds the share `most` of its
-    places.
+def is_full(entries: int, places: int) -> bool:
+    """Return True if the number of row numbers in a hash table exceeds the share PLACES_MOST of
+    its places.
     """
-    return entries > most * places
+    return entries > PLACES_MOST * places

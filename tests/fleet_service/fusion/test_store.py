@@ -13,7 +13,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.store import store
 from fleet_service.fusion.store.growth import settle_pairs
 from fleet_service.fusion.store.records import NONE, PAIRS, REPORTERS_USED, VEHICLE, Side
-from fleet_service.fusion.store.table import PAIRS_MOST, fill_table, rows_of
+from fleet_service.fusion.store.table import PLACES_MOST, fill_table, rows_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
@@ -47,7 +47,7 @@ def test_pairs_keep_their_share_and_are_found_after_every_growth() -> None:
             )
         )
     state = fusion.store.state
-    assert state.used[PAIRS] == vehicles <= PAIRS_MOST * len(state.pairs)
+    assert state.used[PAIRS] == vehicles <= PLACES_MOST * len(state.pairs)
     assert fusion.live.vehicles[0] == vehicles
     assert fusion.live.visits[0] == 3 * vehicles
 
