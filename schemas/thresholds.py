@@ -18,6 +18,7 @@ METRES_PER_DEGREE   length of a degree of latitude on this sphere [m/°], rounde
 REACTION_S          reaction time of a warned driver [s] (Green, Transportation Human Factors 2,
                     2000: 1.2 to 1.5 s)
 NS                  nanoseconds per second
+UNKNOWN             integer in place of a cell, sector or flag that is unknown
 US_STEP             nanoseconds per microsecond, the resolution of times in the archive
 MU_RANGE            range of μ and of the grip used that a message may contain; no road tyre has a μ
                     above 2 (contract)
@@ -39,5 +40,6 @@ EARTH_RADIUS_M: Final = 6_378_137.0
 METRES_PER_DEGREE: Final = 111_320.0
 REACTION_S: Final = 1.5
 NS: Final = 1_000_000_000
+UNKNOWN: Final = -1
 US_STEP: Final = 1_000
 MU_RANGE: Final = (0.0, 2.0)

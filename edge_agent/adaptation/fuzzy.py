@@ -16,13 +16,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from edge_agent.adaptation.memberships import LARGEST_SCALE
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 # [1] limits of the factor on R. It hardly decreases, because R also covers model errors, which may
 # return after a stretch with small innovations.
 LEAST_FACTOR = 0.8
-LARGEST_FACTOR = 10.0
+LARGEST_FACTOR = math.exp(LARGEST_SCALE)
 
 
 @compiled

@@ -27,13 +27,11 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import SETS
+from edge_agent.adaptation.memberships import CLOSEST, MISMATCH_PEAKS, SETS, STEP_PEAKS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
 FEET: Final = 2 * (SETS - 1)
-# [1] smallest overlap of neighbouring sets over the distance of their peaks
-LEAST_OVERLAP: Final = 0.02
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ class LowerVertices:
 
     feet: tuple[float, ...] = (1.0,) * FEET
     out_feet: tuple[float, ...] = (1.0,) * FEET
-    peaks: tuple[float, ...] = (-0.8, -0.4, 0.0, 1.0, 4.0)
-    out_peaks: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
+    peaks: tuple[float, ...] = MISMATCH_PEAKS
+    out_peaks: tuple[float, ...] = STEP_PEAKS
 
     def __post_init__(self) -> None:
         for name in ("feet", "out_feet"):
@@ -77,7 +75,7 @@ class LowerVertices:
                     f"give {SETS} numbers in order",
                 )
         pairs = np.asarray(self.feet).reshape(-1, 2)
-        if (pairs.sum(axis=1) < 1.0 + LEAST_OVERLAP).any():
+        if (pairs.sum(axis=1) < 1.0 + CLOSEST).any():
             raise InputError(
                 "lower_vertices.feet",
                 "two neighbouring sets leave a gap",
@@ -127,7 +125,7 @@ class LowerVertices:
         """
         shares = np.asarray(vector, float).copy()
         pairs = shares[:FEET].reshape(-1, 2)
-        lack = np.maximum(1.0 + LEAST_OVERLAP - pairs.sum(axis=1), 0.0)
+        lack = np.maximum(1.0 + CLOSEST - pairs.sum(axis=1), 0.0)
         pairs += 0.5 * lack[:, None]
         return cls(tuple(map(float, shares[:FEET])), tuple(map(float, shares[FEET:])))
 

@@ -31,6 +31,7 @@ the change of forces (unchanged, changed). The last input varies fastest in the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,11 +39,14 @@ import numpy as np
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
-SETS = 5  # number of fuzzy sets
+MISMATCH_PEAKS = (-0.8, -0.4, 0.0, 1.0, 4.0)  # [1] upper vertices of the fuzzy sets of the mismatch
+STEP_PEAKS = (-0.10, -0.04, 0.0, 0.06, 0.20)  # [nat] upper vertices of the fuzzy sets of the step
+SETS = len(MISMATCH_PEAKS)
 CHANNELS = 2  # groups of measurements: wheels (longitudinal), axles (lateral)
 LARGEST_MISMATCH = 20.0  # [1] limit of `inputs`
-LARGEST_STEP = 0.7  # [nat] limit of `outputs`: one adaptation at most doubles R
-LARGEST_SCALE = 2.5  # [nat] limit of `ln_scales` and of `consequents`
+LARGEST_STEP = math.log(2.0)  # [nat] limit of `outputs`: one adaptation at most doubles R
+# [nat] limit of `ln_scales` and of `consequents`, and of an increase of ln R by adaptation
+LARGEST_SCALE = 2.5
 NOISE = 2 * SETS + CHANNELS  # number of parameters that concern R alone
 LENGTHS = {
     "inputs": SETS,
@@ -58,7 +62,7 @@ RETIRED = ("stretched", "lately")
 RAMPS = ("far",)  # fields with a foot and a peak
 LEAST_SHARE = -8.0  # [nat] smallest ln of a share of evidence
 SHARE_REACH = 1.5  # [nat] largest change of `shares` and `strained` by an optimiser
-CLOSEST = 0.01  # [1] smallest distance of neighbouring peaks
+CLOSEST = 0.01  # [1] smallest distance of neighbouring peaks, and smallest overlap of two sets
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,8 @@ class Memberships:
         InputError: a vertex is not finite, out of order or out of range; the error names the field.
     """
 
-    inputs: tuple[float, ...] = (-0.8, -0.4, 0.0, 1.0, 4.0)
-    outputs: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
+    inputs: tuple[float, ...] = MISMATCH_PEAKS
+    outputs: tuple[float, ...] = STEP_PEAKS
     ln_scales: tuple[float, ...] = (0.0, 0.0)
     far: tuple[float, ...] = (1.5, 4.0)
     # Without the two rules of `consequents`, contradictions in town were three times as frequent.

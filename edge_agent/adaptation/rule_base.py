@@ -35,13 +35,9 @@ from edge_agent.adaptation.memberships import LEAST_SHARE, Memberships
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-# [1] peaks of the sets of demand (force over load)
-LOW = 0.06
-MIDDLE = 0.13
-HIGH = 0.3
-# [1] peaks of the sets of strain (chi-square over degrees of freedom)
-CALM = 1.0
-STRAINED = 2.5
+DEMAND_PEAKS = (0.06, 0.13, 0.3)  # [1] peaks of the sets low, middle and high of force over load
+# [1] foot and peak of the set of strained cars, in chi-square over degrees of freedom
+STRAINED = (1.0, 2.5)
 # [rad] foot and peak of the set WIDE: between these angles the gain of real steering changes
 WIDE = (0.1, 0.35)
 
@@ -51,7 +47,7 @@ class RuleBase(NamedTuple):
     (outputs) of the rules.
 
     Rules also determine the share of the evidence on friction that the filter uses. If `by_sets` is
-    False, the formula of `plain_share`, with the parameters `plain`, replaces these rules.
+    False, the formula of `plain_share` replaces these rules.
     """
 
     far: Annotated[FloatArray, 2]
@@ -61,7 +57,7 @@ class RuleBase(NamedTuple):
     shares: Annotated[FloatArray, 12]
     strained: Annotated[FloatArray, 2]
     by_sets: bool  # True if the fuzzy rules give the share of evidence, False for `plain_share`
-    plain: Annotated[FloatArray, 3]  # half, power and steady of `plain_share`
+    steady: float  # [1] factor of `plain_share` while the forces equal their recent averages
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
@@ -78,11 +74,11 @@ def rule_base(memberships: Memberships) -> RuleBase:
         np.array(m.shares),
         np.array(m.strained),
         by_sets=True,
-        plain=np.zeros(3),
+        steady=0.0,
     )
 
 
-def plain_rules(half: float, power: float, steady: float) -> RuleBase:
+def plain_rules(steady: float) -> RuleBase:
     """Return a rule base without fuzzy sets, as a baseline. The formula of `plain_share` then gives
     the share of the evidence on friction that the filter uses.
 
@@ -90,16 +86,14 @@ def plain_rules(half: float, power: float, steady: float) -> RuleBase:
     return to their prior at the usual rate, even if innovations are larger than expected.
 
     Args:
-        half: demand (force over load of an axle) at which half of the evidence is used [1].
-        power: exponent of demand, which determines how steeply the share rises around `half` [1].
         steady: factor on the share while the forces equal their recent averages [1].
     """
     idle = Memberships(consequents=(0.0, 0.0))
-    return rule_base(idle)._replace(by_sets=False, plain=np.array([half, power, steady]))
+    return rule_base(idle)._replace(by_sets=False, steady=steady)
 
 
 @compiled
-def is_high(value: float, ramp: FloatArray) -> float:
+def is_high(value: float, ramp: FloatArray | tuple[float, float]) -> float:
     """Return the membership (degree, 0 to 1) of `value` in a fuzzy set that rises from 0 at ramp[0]
     to 1 at ramp[1]."""
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
@@ -125,17 +119,23 @@ def wide_noise(rules: RuleBase, angle: float) -> float:
 
 
 @compiled
-def plain_share(plain: FloatArray, demand: float, new: float) -> float:
+def demand_weight(demand: float) -> float:
+    """Return the weight, 0 to 1, of evidence that grows with the fourth power of force over load,
+    `demand` [1]. It is one half at the peak of the middle set of demand.
+    """
+    used = demand**4
+    return float(used / (used + DEMAND_PEAKS[1] ** 4))
+
+
+@compiled
+def plain_share(steady: float, demand: float, new: float) -> float:
     """Return ln of the share of the evidence on friction from a block (0.05 s) that is used if
     there are no fuzzy rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1)
     to which the forces differ from their recent averages.
 
-    The share is (steady + (1 - steady)*new)/(1 + (half/demand)^power), with `plain` = (half, power,
-    steady).
+    The share is (steady + (1 - steady)*new)*demand_weight(demand).
     """
-    used = demand ** plain[1]
-    taken = used / (used + plain[0] ** plain[1])
-    share = (plain[2] + (1.0 - plain[2]) * new) * taken
+    share = (steady + (1.0 - steady) * new) * demand_weight(demand)
     return math.log(max(share, math.exp(LEAST_SHARE)))
 
 
@@ -157,12 +157,12 @@ def evidence_share(
             over degrees of freedom [1].
     """
     if not rules.by_sets:
-        return plain_share(rules.plain, demand, new)
-    rise = min(max((demand - LOW) / (MIDDLE - LOW), 0.0), 1.0)
-    top = min(max((demand - MIDDLE) / (HIGH - MIDDLE), 0.0), 1.0)
+        return plain_share(rules.steady, demand, new)
+    rise = is_high(demand, DEMAND_PEAKS[:2])
+    top = is_high(demand, DEMAND_PEAKS[1:])
     low = 1.0 - rise
     middle = rise - top
-    tense = min(max((strain - CALM) / (STRAINED - CALM), 0.0), 1.0)
+    tense = is_high(strain, STRAINED)
     total = 0.0
     for sliding in range(2):
         of_slide = slides if sliding == 1 else 1.0 - slides

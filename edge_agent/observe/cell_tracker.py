@@ -21,7 +21,7 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import S
-from schemas.thresholds import METRES_PER_DEGREE
+from schemas.thresholds import METRES_PER_DEGREE, UNKNOWN
 
 # [s] time for which a fix is used. A 10 Hz receiver that has missed ten fixes has no reception, and
 # at 15 m/s the vehicle has reached the next cell by then.
@@ -31,7 +31,7 @@ CELL_MARGIN: Final = 0.1
 SECTOR_KEEP: Final = np.radians(5.0)  # [rad] margin beyond the edges of a heading sector
 # [m] distance of the fixes from which a course is computed; the course noise is about 8 degrees
 COURSE_BASE_M: Final = 3.0
-NOWHERE: Final = -1  # cell of a vehicle without position
+NOWHERE: Final = UNKNOWN  # cell of a vehicle without position
 
 
 class CellTrack:

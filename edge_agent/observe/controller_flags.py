@@ -21,6 +21,7 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.estimators.common.readings import GAP_S
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
@@ -38,7 +39,6 @@ MOST_ACTIVE: Final = 0.3
 # on ice of friction .1 takes this long.
 LEAST_ACTIVE_S: Final = 30.0
 MEMORY_S: Final = 600.0  # [s] time constant of forgetting in the share of active time
-MOST_STEP_S: Final = 0.5  # [s] a longer step between two samples counts as this
 STANDING_RATE: Final = 1.0  # [rad/s] the vehicle stands if no wheel is faster (about .3 m/s)
 
 
@@ -140,9 +140,7 @@ def _check_flags(
                     continue
                 record = flags[n, i]
                 dt = (
-                    min(max(t[k, n] - record.time, 0.0), MOST_STEP_S)
-                    if np.isfinite(record.time)
-                    else 0.0
+                    min(max(t[k, n] - record.time, 0.0), GAP_S) if np.isfinite(record.time) else 0.0
                 )
                 record.time = t[k, n]
                 _count_sample(record, dt, value > 0.5, standing[k, n] > 0.5)

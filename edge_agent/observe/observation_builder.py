@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_agent.estimators.friction_mixture.report.visit_parts import EXCLUDED_NATS
 from edge_agent.observe.cell_tracker import NOWHERE, Located
 from schemas import mugrid
 from schemas.config import AgentConfig
@@ -24,13 +25,12 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import CONTEXT, FLAGS, C, S
-from schemas.thresholds import EXCITED_SHARE, GRAVITY, NS, UTILISED_WINDOW_S
+from schemas.thresholds import EXCITED_SHARE, GRAVITY, NS, UNKNOWN, UTILISED_WINDOW_S
 from schemas.wire import Columns, Kind, column_types
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
-FLAG_UNKNOWN: Final = -1
 # [1] share of a visit's samples in which a flag must be known to be reported as not active
 KNOWN_SHARE: Final = 0.5
 WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
@@ -46,8 +46,6 @@ FELT_S: Final = 0.06
 # has driven at least the position error in it. Without these two conditions, a sixth of the visits
 # to ice next to dry road reported grip that was used on the dry road.
 NEAR_FIX_M: Final = 3.0
-# [nat] log-likelihood below which a friction is excluded for a part of a visit that has ended
-EXCLUDED_NATS: Final = -3.0
 
 
 class RecordBlock(NamedTuple):
@@ -457,7 +455,7 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     known = ended["known"]
     told = ended["told"]
     enough = known[:, : len(FLAGS)] >= KNOWN_SHARE * np.maximum(ended["samples"], 1)[:, None]
-    flags = np.where(told[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, FLAG_UNKNOWN))
+    flags = np.where(told[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, UNKNOWN))
     mean = np.where(known > 0.0, told / np.maximum(known, 1.0), np.nan)
     return {
         **{name: flags[:, index] for index, name in enumerate(FLAGS)},

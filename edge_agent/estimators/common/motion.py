@@ -8,6 +8,7 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, along_wheel
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.inputs import InputTrack
+from edge_agent.estimators.common.readings import LIMITS
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -16,9 +17,7 @@ from schemas.signals import S
 FIRST_V_STD = 0.3
 UNKNOWN_V_STD = 15.0  # [m/s] error of v_x without any wheel speed
 SLIDING_THETA = 3.0  # [1] normalised slip that is beyond the peak of every passenger car tyre
-# An estimate beyond these limits has diverged.
-FASTEST_M_S = 150.0
-FASTEST_TURN = 20.0  # [rad/s]
+FASTEST_M_S = 150.0  # [m/s] An estimate beyond this limit has diverged.
 
 
 @compiled
@@ -30,7 +29,7 @@ def has_diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
     index of the yaw rate. `root` (n, n) is the root of its covariance.
     """
     bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
-    bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
+    bad = bad or not abs(mean[yaw_rate]) < LIMITS[S.YAW_RATE]
     for i in range(mean.shape[0]):
         bad = bad or not math.isfinite(mean[i] + root[i, i])
     return bad

@@ -15,18 +15,12 @@ from schemas.signals import S
 # Number of channels before the position: ax, ay, yaw rate, steering, wheel speeds, torques
 INPUTS = int(S.LATITUDE)
 # Limits of readings: a larger one is a sensor error, because no car moves like that.
-LARGEST_ACCELERATION = 40.0  # [m/s^2]
-LARGEST_YAW_RATE = 6.0  # [rad/s]
-LARGEST_STEER = 1.3  # [rad]
-LARGEST_OMEGA = 500.0  # [rad/s]
-LARGEST_TORQUE = 50_000.0  # [N m]
-# Largest plausible absolute reading of each channel before the position
 LIMITS = np.array(
-    [LARGEST_ACCELERATION] * 2
-    + [LARGEST_YAW_RATE]
-    + [LARGEST_STEER] * 4
-    + [LARGEST_OMEGA] * 4
-    + [LARGEST_TORQUE] * 4
+    [40.0] * 2  # acceleration [m/s^2]
+    + [6.0]  # yaw rate [rad/s]
+    + [1.3] * 4  # steering angle [rad]
+    + [500.0] * 4  # wheel speed [rad/s]
+    + [50_000.0] * 4  # wheel torque [N m]
 )
 # Health flag of each channel if its reading is missing; steering of the rear wheels is optional.
 MISSING = np.array(

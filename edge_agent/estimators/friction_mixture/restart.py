@@ -13,7 +13,7 @@ from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import read_plausible, rolling_speed
 from edge_agent.estimators.friction_mixture.block.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.block.wheel_readings import refuse_jumps
-from edge_agent.estimators.friction_mixture.node.rolling_motion import STANDING_STD
+from edge_agent.estimators.friction_mixture.node.rolling_motion import SMALLEST_STD
 from edge_agent.estimators.friction_mixture.report.reported_interval import find_interval
 from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
@@ -30,9 +30,9 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-# The motion is reset if it differs from the wheels by more than `diverged_x` plus two terms:
-FAR_SHARE = 0.04  # [1] share of the wheels' speed
-FAR_SPREADS = 2.0  # [1] number of standard deviations of the wheels' speed
+# [1] The motion is reset if it differs by more than this number of standard deviations from the
+# velocity that follows from the wheels.
+FAR = 10.0
 
 
 @compiled
@@ -44,7 +44,6 @@ def start_vehicle(
     """
     if not math.isfinite(time):
         return flags.TIME_GAP
-    constants = design.constants
     last = memory.last
     now = memory.last.now
     block = memory.block
@@ -65,7 +64,7 @@ def start_vehicle(
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
     forget_vehicle(memory)
     covariance = memory.overall_covariance
-    first = STANDING_STD if speed < constants.agreeing_floor else FIRST_V_STD
+    first = SMALLEST_STD if speed < SMALLEST_STD else FIRST_V_STD
     covariance[NodeState.VX, NodeState.VX] = (first if known else UNKNOWN_V_STD) ** 2
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
@@ -117,13 +116,11 @@ def reset_to_wheel_speed(memory: MixtureMemory, design: MixtureDesign) -> int:
     rolling = memory.rolling
     if math.isnan(rolling.ahead):
         return 0
-    near = design.constants.diverged_x + FAR_SHARE * abs(rolling.ahead)
-    far = near + FAR_SPREADS * rolling.ahead_std
-    astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
+    astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > FAR * rolling.ahead_std
     own_std = math.sqrt(memory.overall_covariance[NodeState.VY, NodeState.VY])
-    if not math.isnan(rolling.left) and own_std > FAR_SPREADS * rolling.left_std:
-        far = near + FAR_SPREADS * rolling.left_std
-        astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
+    if not math.isnan(rolling.left) and own_std > rolling.left_std:
+        sideways = abs(memory.overall_mean[NodeState.VY] - rolling.left)
+        astray = astray or sideways > FAR * rolling.left_std
     return _begin_anew(memory, design, rolling.ahead) if astray else 0
 
 

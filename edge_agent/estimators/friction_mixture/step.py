@@ -26,10 +26,7 @@ from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
-from edge_agent.estimators.friction_mixture.block.block_features import (
-    SLOWEST_COMPARED_M_S,
-    block_features,
-)
+from edge_agent.estimators.friction_mixture.block.block_features import block_features
 from edge_agent.estimators.friction_mixture.block.drive_split import learn_drive
 from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.block.intake import begin_block, take_sample
@@ -57,6 +54,7 @@ from edge_agent.estimators.friction_mixture.report.reported_interval import find
 from edge_agent.estimators.friction_mixture.restart import reset_to_wheel_speed, start_vehicle
 from edge_agent.estimators.friction_mixture.state.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.state.gap import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.state.memory import (
     MixtureMemory,
     Quantiles,
@@ -99,7 +97,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     features.speed = abs(memory.overall_mean[NodeState.VX])
     health = block_features(memory, design, features)
     learn_drive(memory, design.constants, features)
-    update_slip(memory, features)
+    update_slip(memory, design.constants, features)
     vx, vy = turned_velocity(memory, features.gain, features.cos, features.sin)
     update_novelty(memory, design, features, vx, vy)
     watch_wheels(memory, design.constants, features)
@@ -154,14 +152,18 @@ def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
     exceeds SLIDING_THETA.
     """
     _find_friction(memory, design, scratch)
-    note_excitation(memory.excitation, memory.last.time, used_grip(memory, scratch.features))
+    used = used_grip(memory, design.constants, scratch.features)
+    note_excitation(memory.excitation, memory.last.time, used)
     if not memory.split:
         for friction in (memory.friction, memory.friction_left, memory.friction_right):
             friction.lower = lower_while_sliding(
-                memory.slip.held, memory.excitation.largest, friction.lower
+                memory.slip.held,
+                memory.excitation.largest,
+                friction.lower,
+                design.constants.force_share,
             )
     vx = memory.overall_mean[NodeState.VX]
-    speed = max(abs(vx), SLOWEST_COMPARED_M_S)
+    speed = max(abs(vx), SLOWEST_M_S)
     for wheel in range(4):
         along = scratch.features.rolling[wheel] - vx
         if (

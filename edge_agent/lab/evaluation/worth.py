@@ -133,8 +133,7 @@ def without_sets() -> MixtureDesign:
     measurements that contradict the vehicle model.
     """
     design = design_of(Memberships(), adaptive=True)
-    c = design.constants
-    rules = plain_rules(c.demand_half, c.demand_power, c.steady_share)
+    rules = plain_rules(design.constants.steady_share)
     return design._replace(fuzzy_outputs=np.zeros(SETS), rules=rules)
 
 

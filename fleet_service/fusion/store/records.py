@@ -32,8 +32,9 @@ from fleet_service.fusion.belief import PackedArray
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.records import RecordArray, record_type
+from schemas.thresholds import UNKNOWN
 
-NONE: Final = -1  # no row, no vehicle, or no known kind of manoeuvre
+NONE: Final = UNKNOWN  # no row, no vehicle, or no known kind of manoeuvre
 
 
 class Side(IntEnum):

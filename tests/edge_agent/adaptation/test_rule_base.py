@@ -47,7 +47,7 @@ def test_noise_grows_with_the_angle_of_steering_either_way() -> None:
 
 
 def test_plain_rules_give_the_product_of_ramps_whatever_slides_or_strains() -> None:
-    plain = plain_rules(half=0.13, power=4.0, steady=0.15)
+    plain = plain_rules(steady=0.15)
     share = (0.15 + 0.85 * 0.5) / (1.0 + (0.13 / 0.2) ** 4)
     for slides, strain in ((0.0, 1.0), (1.0, 9.0)):
         asked = evidence_share(plain, slides, 0.2, 0.5, strain)

@@ -69,31 +69,24 @@ MOVES = {
     "patch_length": Move("lower", "slalom", 1.015),
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
-    "split_hazard": Move("one friction's probability", "split-braking", 1.5),
     # The split nodes wake later.
     "split_asymmetry": Move("split probability", "split-braking", 0.997),
     # Group: evidence of a block.
-    "demand_half": Move("least probabilities", "braking", 0.3),  # weak evidence becomes a penalty
-    # With a steep threshold, all above it is evidence and nothing becomes a penalty.
-    "demand_power": Move("penalty", "acceleration", 0.5),
     "plausible_loss": Move("least probabilities", "constant-radius", 1.03),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
-    "steady_time": Move("width", "constant-radius", 0.92),  # force and slip count as new for longer
     "abrupt_share": Move("upper", "joints", 0.95, LESS),  # more of a bump is read as slip
     "abrupt_time": Move("upper", "joints", 0.992, LESS),  # a bump is read as slip sooner
     "steady_half": Move("width", "constant-radius", 1.05),
     "steady_share": Move("least probabilities", "constant-radius", 0.95),
     # More nodes of low friction pay the penalty for sliding.
     "sliding_slope": Move("upper", "constant-radius", 1.08),
-    "sliding_penalty": Move("lower", "constant-radius", 1.025),
     # Saturated nodes, which have low friction, gain.
-    "axle_penalty": Move("upper", "constant-radius", 0.85),
+    "freedom_penalty": Move("upper", "constant-radius", 0.85),
     # Group: limits. Tighter limits keep the nodes away from states that cost a penalty.
     "farthest": Move("penalty", "braking", 0.5, LESS),
     # With a smaller limit, R adapts less to large innovations.
     "huber": Move("nis", "stopping", 3.0, LESS),
-    "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
-    "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
+    "diverged": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
     # Group: tyre and vehicle. A sharper nominal curve leaves less sharpness to be explained by the
     # state SHAPE.
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
@@ -109,53 +102,38 @@ MOVES = {
     "compliance_std": Move("std COMPLIANCE", "stopping", 2.5),
     # Learned values are forgotten sooner.
     "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),
-    "spin_share": Move("nis", "braking", 0.9),
     # Group: sliding wheels.
     # After the start of a slide, other friction values become possible sooner.
     "slip_change": Move("least probabilities", "acceleration", 1.1),
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    # With a smaller factor on R, the rear axle determines the force gain better.
-    "rear_unlike": Move("std GAIN", "split-braking", 0.92, LESS),
-    "gain_std": Move("width", "acceleration", 1.1),
+    # With a smaller factor on R, the rear axle moves the nodes of wrong friction further.
+    "rear_unlike": Move("nodes apart in v_x", "split-braking", 1.3, LESS),
     # Group: sensors.
-    "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
-    "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
-    "leak_x": Move("vx_std", "braking without torque", 1.02),
+    "leak": Move("mean LEAK_Y", "acceleration", 2.0),
     "return_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
-    "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
-    "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
-    "slope_std": Move("std SLOPE", "braking", 1.6),
+    "offset_std": Move("std SLOPE", "braking", 1.6),
     # The slope is forgotten after a shorter distance.
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.0),
-    "radius_std": Move("vx_std", "turn and straight", 2.5),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.15),
     # Group: noise. Larger assumed noise makes the normalised innovations (nis) smaller.
-    "omega_noise": Move("nis", "constant-radius", 0.94),
-    "step_noise": Move("nis", "gaining-slalom", 0.6),
-    "angle_std": Move("nis", "side force without turning", 0.985),
+    "omega_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_share": Move("vy_std", "constant-radius", 1.25),
+    "spin_share": Move("nis", "braking", 0.9),
     "floor_x": Move("nis", "acceleration", 0.92),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "constant-radius", 0.95),
     "lag": Move("nis", "pulses", 0.85),
-    "no_torque_floor": Move("nis", "pulses", 0.91),
     # Group: wheels that show the velocity without a tyre model.
-    "standing_time": Move("stands", "stopping", 0.5),
-    "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
-    "agreeing_std": Move("std of wheels' v_x", "turn and straight", 1.6),
-    "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
-    # Group: guard against a friction below the grip in use.
-    "guard_std": Move("least probabilities", "acceleration", 1.25),
     # Group: contradiction between the car and the vehicle model.
     "strain_prior": Move("strain", "turn and straight", 1.1),  # the strain is learned more slowly
     "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are trusted more

@@ -47,7 +47,7 @@ def test_prior_falls_above_the_common_friction() -> None:
 
 def test_road_change_leaves_the_prior_as_it_is() -> None:
     out = np.empty(NODES)
-    change_road(PRIOR, PRIOR, NODES, RoadChange(0.1, 0.0, 0.3), out)
+    change_road(PRIOR, PRIOR, NODES, RoadChange(0.1, 0.3), out)
     assert out == pytest.approx(PRIOR, abs=1e-12)
 
 
@@ -56,7 +56,7 @@ def test_road_change_keeps_the_mass_and_converges_to_the_prior() -> None:
     w[3] = 1.0
     out = np.empty(NODES)
     for _ in range(400):
-        change_road(w, PRIOR, NODES, RoadChange(0.02, 0.0, 0.05), out)
+        change_road(w, PRIOR, NODES, RoadChange(0.02, 0.05), out)
         w[:] = out
         assert w.sum() == pytest.approx(1.0)
     assert w == pytest.approx(PRIOR, abs=1e-3)

@@ -146,7 +146,7 @@ def test_a_patch_lowers_the_lower_end_alone() -> None:
 
 @nogil
 def _lower_while_sliding(slides: float, used: float, lower: float) -> float:
-    return lower_while_sliding(slides, used, lower)
+    return lower_while_sliding(slides, used, lower, 0.05)
 
 
 @pytest.mark.parametrize(

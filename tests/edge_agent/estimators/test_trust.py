@@ -67,6 +67,18 @@ def test_axles_are_more_certain_with_a_correct_vehicle_file() -> None:
     assert (noise[0], noise[-1]) == (CONSTANTS.strain_least, CONSTANTS.strain_most)
 
 
+def test_axles_of_a_strained_car_are_trusted_less() -> None:
+    t, signals, vehicle = drive("slalom", 0.85, seconds=6.0)
+    spread = []
+    for strain in (0.3, 1.0, 3.0):
+        bank = mixture_bank(parameter_table([vehicle]), design_of(Memberships(), adaptive=True))
+        bank.advance(t[:500, None], signals[:500, None])
+        bank._filters[0]["trust"]["strain"] = strain
+        found = bank.advance(t[500:506, None], signals[500:506, None])
+        spread.append(float(found.vy_std[-1, 0]))
+    assert spread[0] < spread[1] < spread[2]
+
+
 def test_innovations_as_stated_support_the_model_threefold_ones_do_not() -> None:
     assert axles_ratio(1.0) < 0.0 < axles_ratio(FACTOR)
 

@@ -19,7 +19,8 @@ from edge_agent.adaptation.rule_base import wide_noise
 from edge_agent.dynamics.body import axle_lateral_forces, locked_axle_force
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body_of
-from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
+from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
+from edge_agent.dynamics.slip import wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.block.drive_split import (
@@ -30,7 +31,7 @@ from edge_agent.estimators.friction_mixture.block.drive_split import (
 )
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.state.gap import YAW_STD
+from edge_agent.estimators.friction_mixture.state.gap import SLOWEST_M_S, YAW_STD
 from edge_agent.estimators.friction_mixture.state.memory import BlockSums, MixtureMemory, Trust
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.numeric import FloatArray
@@ -38,14 +39,11 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# [m/s] smallest speed by which wheel-speed differences are divided, because they are mostly noise
-# at lower speeds
-SLOWEST_COMPARED_M_S = 1.0
 NO_FORCE_SHARE = 0.3  # [1] standard deviation of force over load without torque and a_x
 ROUNDING = 1 / math.sqrt(12.0)  # [1] standard deviation of rounding, over the step
-# A difference of slip between the sides must exceed these numbers of standard deviations:
-CERTAIN = 4.0  # of the wheel-speed noise
-LIKELY = 2.0  # of the estimated difference of the wheel radii
+# [1] A difference of slip between the sides must exceed this number of standard deviations of the
+# wheel-speed noise and of the estimated difference of the wheel radii.
+LIKELY = 2.0
 
 
 @compiled
@@ -72,7 +70,9 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     constants = design.constants
     _average_kinematics(block, features)
     features.yaw_rate = mean_or(block, S.YAW_RATE, last.yaw_rate)
-    slip = 0.5 * row[Parameter.TRACK_REAR] * features.yaw_rate / max(features.speed, SLOWEST_M_S)
+    slip = (
+        0.5 * row[Parameter.TRACK_REAR] * features.yaw_rate / max(features.speed, SLOWEST_SLIP_M_S)
+    )
     features.locked_pull = row[Parameter.REAR_LOCKED] * row[Parameter.SLOPE_X] * slip
     ax = mean_or(block, S.AX, 0.0)
     ay = mean_or(block, S.AY, 0.0)
@@ -172,7 +172,7 @@ def _compute_wheel_forces(
             unit = 0.5 * (front if wheel < 2 else 1.0 - front) * row[Parameter.MASS]
             force = unit * features.change
             apart = math.hypot(constants.force_share * force, 0.5 * front_std * known)
-            spread = math.hypot(apart, 0.25 * row[Parameter.MASS] * constants.no_torque_floor)
+            spread = math.hypot(apart, constants.floor_x * loads[wheel])
             if math.isnan(ax):
                 unit = 0.0
                 spread = NO_FORCE_SHARE * loads[wheel]
@@ -302,17 +302,12 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     row = memory.row
     constants = design.constants
     before = memory.last_side
-    speed = max(features.speed, SLOWEST_M_S)
+    speed = max(features.speed, SLOWEST_SLIP_M_S)
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
-        samples = max(memory.block.counts[S.OMEGA + wheel], 1)
-        noise = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS]
-        step = (
-            max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel])
-            * row[Parameter.RADIUS]
-        )
+        noise = max(constants.omega_noise, ROUNDING * memory.last.omega_step[wheel])
         linear = row[Parameter.SLOPE_X] / speed
-        slip_variance = linear**2 * (noise**2 + step**2)
+        slip_variance = (linear * noise * row[Parameter.RADIUS]) ** 2
         features.abrupt_noise[wheel] = (
             linear * constants.abrupt_share * wheel_speed_jump(memory, constants, features, wheel)
         ) ** 2
@@ -333,9 +328,7 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
             YAW_STD * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
         )
         pointing = constants.angle_share * features.steer_sin[2 * axle]
-        angle = row[Parameter.SLOPE_Y] * math.sqrt(
-            constants.angle_std**2 + turning**2 + pointing**2
-        )
+        angle = row[Parameter.SLOPE_Y] * math.hypot(turning, pointing)
         share = constants.axle_share * side
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
@@ -418,7 +411,7 @@ def unexplained_slip_difference(
     radius = memory.overall_mean
     first = NodeState.RADIUS
     most = 0.0
-    speed = max(features.speed, SLOWEST_COMPARED_M_S)
+    speed = max(features.speed, SLOWEST_M_S)
     covariance = memory.overall_covariance
     for axle in range(2):
         left = 2 * axle
@@ -436,7 +429,7 @@ def unexplained_slip_difference(
         noise = constants.omega_noise * row[Parameter.RADIUS] / speed * math.sqrt(2.0 / samples)
         apart = abs(row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left])
         if not math.isnan(apart):
-            most = max(most, apart - row[Parameter.SLOPE_X] * (CERTAIN * noise + LIKELY * unknown))
+            most = max(most, apart - row[Parameter.SLOPE_X] * LIKELY * (noise + unknown))
     return most
 
 

@@ -29,8 +29,8 @@ BRAKES_STD = 0.06  # [1] standard deviation of BRAKES_FRONT between cars
 # [m/s^2] scale of engine braking, which acts on the driven axle only: from twice this deceleration
 # all force counts as brake force
 ENGINE_BRAKE = 1.5
-PULLS = 0.05  # [1] a_x over g from which the slip shows the driven axle
-TURNS_M_S2 = 3.0  # [m/s^2] lateral acceleration below which the slip shows the driven axle
+# [1] a_x over g from which the slip shows the driven axle, if the lateral acceleration is smaller
+PULLS = 0.05
 UNLIKE = 0.3  # [1] relative error of the predicted slip, from stiffness and load
 LEAST_ODDS = 1e-4  # smallest probability of a kind, so that an error is corrected within seconds
 
@@ -87,7 +87,8 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
     rolling = features.rolling
     pull = features.change / GRAVITY
     speed = 0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3])
-    if not (pull > PULLS and speed > SLOW_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
+    turns = abs(features.yaw_rate) * speed > features.change
+    if not (pull > PULLS and speed > SLOW_M_S) or turns:
         return
     apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
     rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])

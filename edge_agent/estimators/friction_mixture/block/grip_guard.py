@@ -13,15 +13,10 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
-# [s] time constant that smooths the noise of the accelerometers, for the upper end of the interval
-FAST_S = 0.06
 # [1/s] rate at which the recent maximum of grip in use decreases after UTILISED_WINDOW_S, because
 # the road may have changed
 FORGOTTEN = 0.5
 ABOVE = 0.02  # [1] part of the grip in use that smoothing removes in a hard stop
-# [1] largest lower end of the interval over the grip that a sliding axle uses. It is below 1,
-# because mass, torque and load are known only within a few per cent.
-AT_PEAK = 0.95
 
 
 @compiled
@@ -29,11 +24,12 @@ def note_grip(grip: GripInUse, constants: Constants, ax: float, ay: float, dt: f
     """Update the smoothed grip in use (horizontal acceleration over g) with the accelerations
     [m/s^2] measured over the last dt [s].
 
-    For the penalty of nodes it is smoothed over `abrupt_time`, because a bump shakes the body.
+    The penalty of nodes uses the acceleration smoothed over `abrupt_time`, because a bump shakes
+    the body. The upper end of the interval uses the one smoothed over a block.
     """
     size = math.hypot(ax, ay) / GRAVITY
     grip.slow += (1.0 - math.exp(-dt / constants.abrupt_time)) * (size - grip.slow)
-    grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
+    grip.fast += (1.0 - math.exp(-dt / constants.block_time)) * (size - grip.fast)
     grip.age += dt
     if grip.fast >= grip.held:
         grip.held = grip.fast
@@ -48,7 +44,7 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
     (2,) is the hypothetical friction on the left and right side; their mean counts. The penalty is
     0 if this mean is not below the grip in use.
     """
-    lack = (grip.slow - 0.5 * (side_mu[0] + side_mu[1])) / constants.guard_std - 1.0
+    lack = (grip.slow - 0.5 * (side_mu[0] + side_mu[1])) / constants.force_share - 1.0
     return float(min(0.5 * max(lack, 0.0) ** 2, constants.largest_loss))
 
 
@@ -64,17 +60,18 @@ def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
 
 
 @compiled
-def lower_while_sliding(slides: float, used: float, lower: float) -> float:
+def lower_while_sliding(slides: float, used: float, lower: float, error: float) -> float:
     """Return the lower end of the friction interval while wheels slide.
 
     A sliding tyre may be at its peak: its force lies between the peak and the smaller force of full
     sliding. Only slip distinguishes these two cases, and slip is uncertain because in a slide no
     wheel rolls freely and shows the speed. Therefore, if `slides` is 1, the lower end is at most
-    AT_PEAK times the grip in use.
+    1 - `error` times the grip in use.
 
     Args:
         slides: fuzzy degree to which a wheel slides, 0 to 1.
         used: grip (force over load) used within the last second, of the axle that uses more [1].
         lower: lower end according to the probabilities of the assumed friction values [1].
+        error: relative error of the grip in use, from mass, torque and load [1].
     """
-    return lower - slides * max(lower - AT_PEAK * used, 0.0)
+    return lower - slides * max(lower - (1.0 - error) * used, 0.0)

@@ -25,7 +25,12 @@ from edge_agent.estimators.friction_mixture.block.grip_guard import note_grip
 from edge_agent.estimators.friction_mixture.block.wheel_readings import note_step, refuse_jumps
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.state.gap import UNKNOWN_YAW_VAR, YAW_STD, bridge_gap
+from edge_agent.estimators.friction_mixture.state.gap import (
+    LOST_WALK,
+    UNKNOWN_YAW_VAR,
+    YAW_STD,
+    bridge_gap,
+)
 from edge_agent.estimators.friction_mixture.state.memory import (
     MixtureMemory,
     PlanarVector,
@@ -41,8 +46,6 @@ JUMP_M_S2 = 3.0
 EARLY_S = 1e-6  # [s] tolerance of the block length for rounding of the sample times
 YAW_WALK = 3.0  # [rad/s/s^.5] random walk of the yaw rate: yaw acceleration of a lively car
 REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and slip difference
-LOST_AX = 2.0  # [m/s/s^.5] random walk of v_x without a_x
-LOST_AY = 0.7  # [m/s/s^.5] random walk of v_y without a_y or yaw rate
 
 
 @compiled
@@ -163,9 +166,9 @@ def _integrate_motion(
     leak_y = ay
     if math.isnan(ax):
         ax = 0.0
-        block.missing_x = LOST_AX**2
+        block.missing_x = LOST_WALK**2
     if math.isnan(ay) or not turning:
-        block.missing_y = LOST_AY**2
+        block.missing_y = LOST_WALK**2
     if math.isnan(ay):
         ay = rate * memory.overall_mean[NodeState.VX]
         leak_y = 0.0
@@ -174,7 +177,7 @@ def _integrate_motion(
     note_grip(memory.grip, constants, ax, ay, dt)
     gain = block.gain
     total = block.gain_sum
-    _advance_gain(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)
+    _advance_gain(gain.measured, ax, ay, rate, dt)
     _advance_gain(gain.leak_y, 0.0, leak_y, rate, dt)
     _advance_gain(gain.unit, 1.0, 0.0, rate, dt)
     block.angle += rate * dt

@@ -1,4 +1,4 @@
-"""Reported grip in use: the larger force over load of the two axles, smoothed over SMOOTH_S.
+"""Reported grip in use: the larger force over load of the two axles, smoothed over `abrupt_time`.
 
 The reported value is the largest one of the last second. The force is smoothed first, because the
 largest of twenty noisy values would show the sensor noise more than the tyre forces. The filter
@@ -14,24 +14,23 @@ from __future__ import annotations
 
 import math
 
+from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
-# [s] smoothing time of forces: two blocks, about the time in which a tyre builds up its force
-SMOOTH_S = 0.1
 # [1] largest reported grip. Tyres of road cars cannot use more; a larger value comes from a bump or
 # from a wrong load.
 MOST_USED = 1.5
 
 
 @compiled
-def used_grip(memory: MixtureMemory, features: BlockFeatures) -> float:
+def used_grip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> float:
     """Return the grip in use [1]: the larger force over load of the two axles, smoothed over time.
     The smoothed forces in `memory` are updated with the block (the samples within 0.05 s).
     """
-    share = 1.0 - math.exp(-features.duration / SMOOTH_S)
+    share = 1.0 - math.exp(-features.duration / constants.abrupt_time)
     most = 0.0
     for axle in range(2):
         left = 2 * axle

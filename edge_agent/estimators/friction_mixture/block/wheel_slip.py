@@ -13,8 +13,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
-from edge_agent.estimators.friction_mixture.block.used_grip import SMOOTH_S
-from edge_agent.estimators.friction_mixture.state.constants import NodeState
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
@@ -28,7 +27,7 @@ SEEN = 0.3  # [1] increase of the membership from which a new slide counts as be
 
 
 @compiled
-def update_slip(memory: MixtureMemory, features: BlockFeatures) -> None:
+def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Update the evidence that wheels slide, memory.slip, with the wheel speeds of the block (the
     samples within 0.05 s).
     """
@@ -39,9 +38,9 @@ def update_slip(memory: MixtureMemory, features: BlockFeatures) -> None:
     slip.ended = slip.held - seen
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
-        # The rear tyres need SMOOTH_S to build up their force at the place of the front axle.
+        # The rear tyres need `abrupt_time` to build up their force at the place of the front axle.
         slip.rear_unlike_until = (
-            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + SMOOTH_S
+            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + constants.abrupt_time
         )
 
 

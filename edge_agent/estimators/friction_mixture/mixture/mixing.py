@@ -118,12 +118,11 @@ def apply_road_change(
     hazard = max(hazard, slid, constants.slip_change * memory.slip.begins)
     # While the model is distrusted, friction returns to its prior.
     hazard = max(hazard, memory.trust.distrust)
-    leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
     predicted = scratch.predicted[:count]
     weight = memory.weight[:count]
     visit = memory.visit_weight[:count]
-    change = RoadChange(hazard, leaving, drift)
+    change = RoadChange(hazard, drift)
     change_road(visit, prior, NODES, change, predicted)
     copy_vector(visit, predicted)
     change_road(weight, prior, NODES, change, predicted)
@@ -226,10 +225,10 @@ def reset_diverged(
     for j in range(weight.shape[0]):
         own = velocity[j // LANES]
         astray = max(
-            abs(own[0, j % LANES] - velocity[group, 0, lane]) / constants.diverged_x,
-            abs(own[1, j % LANES] - velocity[group, 1, lane]) / constants.diverged_y,
+            abs(own[0, j % LANES] - velocity[group, 0, lane]),
+            abs(own[1, j % LANES] - velocity[group, 1, lane]),
         )
-        if astray > 1.0:
+        if astray > constants.diverged:
             _copy_node(memory, j, best)
             weight[j] = SMALLEST
 

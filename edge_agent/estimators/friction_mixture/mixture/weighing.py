@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.adaptation.fuzzy import adapted_factor
-from edge_agent.adaptation.rule_base import evidence_share
+from edge_agent.adaptation.rule_base import demand_weight, evidence_share
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.dynamics.tyres import TINY
@@ -146,14 +146,12 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     best = -math.inf
     for j in range(count):
         best = max(best, scratch.log_likelihood[j])
-    need = (constants.demand_half / max(features.demand, TINY)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
     slid = memory.slip.held
-    share = features.novelty / (1.0 + need)
-    if design.adaptive:
-        share = math.exp(
-            evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
-        )
+    share = math.exp(
+        evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
+    )
+    price = 1.0 - demand_weight(features.demand)
     believed = used_evidence_share(memory.trust, constants)
     believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
     moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
@@ -163,7 +161,7 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
         loss = max(loss, -constants.plausible_loss)
         loss = max(moving * (share * loss + beyond), -constants.largest_loss)
         loss -= moving * guard_penalty(memory.grip, constants, design.sides.mu[j])
-        charged = charge_penalty(memory, j, moving * need / (1.0 + need) * scratch.moved[j])
+        charged = charge_penalty(memory, j, moving * price * scratch.moved[j])
         scratch.log_likelihood[j] = 0.0 if blind else loss - charged
 
 
@@ -212,7 +210,7 @@ def update_novelty(
     mean velocity in the block (0.05 s).
     """
     constants = design.constants
-    keep = math.exp(-features.duration / constants.steady_time)
+    keep = math.exp(-features.duration / constants.window)
     force = slip = slides = 0.0
     for r in range(6):
         now = features.force[r] if r < 4 else features.side[r - 4]

@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import math
 
+from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.state.constants import CURVED, NodeState
 from edge_agent.estimators.friction_mixture.state.memory import VelocityGain
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 from schemas.runtime.lanes import lanes_at, put_lanes
-
-LEAST_VARIANCE = 1e-18  # smallest variance of a state, given the states before it
 
 
 @inlined
@@ -42,7 +41,7 @@ def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
     with n states and LANES nodes.
 
     The measurements are nonlinear only in the first CURVED states. A pivot (squared diagonal
-    element) is at least LEAST_VARIANCE.
+    element) is at least TINY.
     """
     for j in range(CURVED):
         total = lanes_at(covariance, (j, j))
@@ -50,7 +49,7 @@ def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
             part = lanes_at(root, (j, k))
             total -= part * part
             put_lanes(root, (k, j), 0.0)
-        pivot = math.sqrt(max(total, LEAST_VARIANCE))
+        pivot = math.sqrt(max(total, TINY))
         put_lanes(root, (j, j), pivot)
         per = 1.0 / pivot
         for i in range(j + 1, root.shape[0]):

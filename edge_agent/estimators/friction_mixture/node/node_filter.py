@@ -102,10 +102,10 @@ def update_nodes(
     find_covariances(covariance, node)
     plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
     before = belief_cost(mean, memory.nominal)
-    loss = take_rows(features, mean, covariance, node, design.constants.axle_penalty)
+    loss = take_rows(features, mean, covariance, node, design.constants.freedom_penalty)
     keep_within(mean, design.constants, memory.nominal)
     moved = belief_cost(mean, memory.nominal) - before
-    price *= design.constants.sliding_penalty / inflation
+    price *= design.constants.freedom_penalty / inflation
     return NodeUpdate(-loss - price, moved, plain)
 
 
@@ -310,14 +310,14 @@ def take_rows(
     mean: FloatArray,
     covariance: FloatArray,
     node: NodeWorkspace,
-    axle_penalty: float,
+    penalty: float,
 ) -> float:
     """Update the filters of a group of nodes (friction hypotheses) with the innovations
     node.residual, one scalar measurement at a time. node.spread is the covariance of the
     innovations.
 
     Return the negative log-likelihood [nat] without constants: half of the normalised squared
-    innovations, plus half of `axle_penalty`·ln(innovation variance) for each measurement of an
+    innovations, plus half of `penalty`·ln(innovation variance) for each measurement of an
     axle.
     """
     squares = 0.0 * lanes_at(node.residual, 0)
@@ -338,7 +338,7 @@ def take_rows(
             put_lanes(mean, i, lanes_at(mean, i) + lanes_at(node.cross, (i, r)) * step)
         _condition_rows(node, r, per)
     _subtract_rows(covariance, node)
-    return 0.5 * (squares + axle_penalty * log_lanes(product))
+    return 0.5 * (squares + penalty * log_lanes(product))
 
 
 @inlined

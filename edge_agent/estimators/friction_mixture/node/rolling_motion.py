@@ -34,27 +34,18 @@ from schemas.runtime.lanes import lanes_at, put_lanes
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
 
-# [m/s] error of velocity zero at standstill, because wheel sensors do not detect creeping wheels
-STANDING_STD = 0.05
-# [m/s^2] deviation of a_x from its average at standstill beyond which the car may start to move
-STARTS = 0.25
+# [m/s] smallest error of a velocity that follows from the wheels: their sensors do not detect
+# creeping wheels. At its first sample, a car slower than this counts as standing.
+SMALLEST_STD = 0.05
+# [1] limit of v*r over the limit of a_y: both must be small, so that the rear axle cannot slide
+TURNING = 1.5
 # [m/s^2] smallest deceleration of a car with locked wheels, except on the most slippery ice. With
 # less deceleration, wheels that stand at an estimated speed above SLOW_M_S mean a wrong estimate.
 SLIDES_M_S2 = 1.0
 # [1] Wheels slower than this share of the speed count as locked while the car decelerates.
 LOCKED_SHARE = 0.1
-# [s] time after which standing wheels mean that the car stands, if it decelerates by less than
-# SLIDES_M_S2
-LOST_S = 2.0
 # [s] longest slide with locked wheels: after it, standing wheels mean that the car stands
 LONGEST_SLIDE_S = 10.0
-# [1] relative error of the speed difference of both sides in a turn, from track and yaw rate
-TURN_SHARE = 0.05
-LEFT_FLOOR = 0.03  # [m/s] smallest error of the lateral velocity
-# [1] limit of v*r over the limit of a_y: both must be small, so that the rear axle cannot slide
-TURNING = 1.5
-# [1] a_y over g up to which the rear axle is assumed not to slide while the model is distrusted
-FARTHEST_FOLLOWED = 0.8
 
 
 @compiled
@@ -95,15 +86,13 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         rolling.disagreed_time = time
         return
     middle = total / seen
-    turning = TURN_SHARE * abs(features.yaw_rate) * row[Parameter.TRACK_FRONT]
-    error = constants.agreeing_std * abs(middle) + constants.agreeing_floor + step
-    allowed = 2.0 * error + turning
-    if not most - least <= allowed:
+    error = constants.wheel_std * abs(middle) + SMALLEST_STD + step
+    if not most - least <= 2.0 * error:
         rolling.disagreed_time = time
     unsure = memory.trust.distrust > 0.0
     if unsure and seen == 4:
         middle = 0.5 * (total - least - most)
-    if unsure or time - rolling.disagreed_time >= constants.agreeing_time:
+    if unsure or time - rolling.disagreed_time >= constants.window:
         pull = features.change / GRAVITY if free < 0 else 0.0
         _compute_velocities(memory, constants, features, (middle, step, pull))
 
@@ -120,10 +109,11 @@ def _update_standstill(
         rolling.moved_time = time
     keep = math.exp(-features.duration / constants.window)
     rolling.resting_ax = keep * rolling.resting_ax + (1.0 - keep) * features.change
-    wait = constants.standing_time
+    wait = constants.window
     if features.speed >= SLOW_M_S:
-        wait = LOST_S if abs(features.change) < SLIDES_M_S2 else LONGEST_SLIDE_S
-    quiet = abs(features.change - rolling.resting_ax) < STARTS
+        wait = 2.0 * constants.window if abs(features.change) < SLIDES_M_S2 else LONGEST_SLIDE_S
+    # A larger change of a_x than the usual offset means that the car may start to move.
+    quiet = abs(features.change - rolling.resting_ax) < constants.offset_std
     rolling.stands = still and quiet and time - rolling.moved_time >= wait
 
 
@@ -144,18 +134,18 @@ def _compute_velocities(
     row = memory.row
     middle, step, pull = seen
     slip = pull / row[Parameter.SLOPE_X]
-    share = constants.agreeing_std + constants.agreeing_slip * abs(slip)
+    share = constants.wheel_std + constants.agreeing_slip * abs(slip)
     rolling.ahead = (1.0 - slip) * middle
-    rolling.ahead_std = math.sqrt((share * middle) ** 2 + constants.agreeing_floor**2 + step * step)
+    rolling.ahead_std = math.sqrt((share * middle) ** 2 + SMALLEST_STD**2 + step * step)
     side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
-    most = FARTHEST_FOLLOWED if memory.trust.distrust > 0.0 else constants.following_most
+    most = constants.following_most
     if abs(side) < most and abs(features.yaw_rate * middle) < TURNING * most * GRAVITY:
         rolling.left = (
             row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
         )
         needed = abs(side) / row[Parameter.SLOPE_Y]
         share = constants.steer_std + constants.agreeing_slip * needed
-        rolling.left_std = share * abs(middle) + LEFT_FLOOR
+        rolling.left_std = share * abs(middle) + SMALLEST_STD
 
 
 @compiled
@@ -173,7 +163,7 @@ def take_rolling(
     covariance = memory.covariance[group]
     row = scratch.node.velocity
     if rolling.stands:
-        reading = (STANDING_STD**2, math.inf)
+        reading = (SMALLEST_STD**2, math.inf)
         for axis in range(2):
             direction = (1.0 - axis, float(axis))
             _take_velocity(mean, covariance, row, direction, -lanes_at(mean, axis), reading)

@@ -27,11 +27,12 @@ from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-# [1] The kept belief excludes a friction whose likelihood is below this share of the largest one.
-EXCLUDED = math.exp(-3.0)
-ALMOST_WHOLE = 0.9  # [1] part of the current belief at excluded frictions that means a jump
-# [1] part at excluded frictions up to which the current belief may replace the kept one
-COMPATIBLE = 0.5
+# [nat] A friction is excluded if its log-likelihood minus the largest one is below this.
+EXCLUDED_NATS = -3.0
+EXCLUDED = math.exp(EXCLUDED_NATS)
+# [1] part of the current belief at excluded frictions that means a jump. If as large a part is at
+# the other frictions, the current belief may replace the kept one.
+ALMOST_WHOLE = 0.9
 # [nat] least information of a belief that can show a jump: half of the range is excluded
 KNOWING = math.log(2.0)
 
@@ -74,6 +75,6 @@ def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray)
     jumped = known >= KNOWING and excluded > ALMOST_WHOLE
     if jumped:
         visit_evidence(design.mu, p, s, CENTRES, evidence)
-    if jumped or (known > memory.information and excluded < COMPATIBLE):
+    if jumped or (known > memory.information and 1.0 - excluded > ALMOST_WHOLE):
         copy_vector(s, w)
         memory.information = known

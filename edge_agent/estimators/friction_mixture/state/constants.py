@@ -89,7 +89,9 @@ class Constants(NamedTuple):
     # [s] time within which tyre and wheel-speed errors are correlated (errata). R of a block is
     # multiplied by this time over the block's length.
     correlation_time: float = 0.28
-    # [s] averaging time of the innovation variances, and of a_x at standstill
+    # [s] averaging time of the innovation variances, of a_x at standstill, and of forces and slips
+    # (only a change from their averages is new evidence); time for which the wheels must agree
+    # before the speed is computed from them, and stand before the car counts as standing
     window: float = 1.0
 
     # --- Road changes ---
@@ -109,27 +111,17 @@ class Constants(NamedTuple):
     # [1] probability of a split road at its first sign (see `split_asymmetry`). With .05 split
     # roads were recognised late.
     split_prior: float = 0.2
-    # [1/m] rate at which a split road ends: once per 60 m
-    split_hazard: float = 1 / 60
     # [1] sign of a split road: difference between left and right slip that the forces do not
     # explain, as force over load of a linear tyre
     split_asymmetry: float = 0.12
 
     # --- Weight of the evidence on friction ---
-    # [1] force over load at which evidence counts by half (without fuzzy rules), and at which half
-    # of the cost in `charge_penalty` is charged. With .12 a gentle slalom was taken for ice.
-    demand_half: float = 0.13
-    # [1] exponent of `demand_half` over force over load in these two weights: a larger one makes
-    # the change near `demand_half` steeper
-    demand_power: float = 4.0
     # [nat] loss of log-likelihood in a block that is plausible at a wrong friction. The part beyond
     # it counts in full at any force, because the node's velocity must be wrong.
     plausible_loss: float = 1.7
     # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
     # compensate for a spike
     largest_loss: float = 3.0
-    # [s] averaging time of forces and slips. Only a change from these averages is new evidence.
-    steady_time: float = 2.0
     # [1] change of force over load from its average at which the evidence counts as new by half
     steady_half: float = 0.03
     # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
@@ -137,24 +129,20 @@ class Constants(NamedTuple):
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.38
-    # [1] weight of the penalty for sliding wheels, whose slip may have any value. It is below 1
-    # because a braking car seldom slides on all wheels.
-    sliding_penalty: float = 0.22
-    # [1] weight of ln det S of the axles in the likelihood. Weight 0 favours nodes with a large S,
-    # weight 1 nodes with saturated tyres. With .28 dry road was reported as ice, and with .24 less
-    # of the snow was found.
-    axle_penalty: float = 0.2
+    # [1] weight of the penalties for what a node leaves open: the slip of sliding wheels, which may
+    # have any value, and ln det S of the axles. Weight 0 favours nodes with a large S, weight 1
+    # nodes with saturated tyres. For the axles with .28 dry road was reported as ice, and with .24
+    # less of the snow was found.
+    freedom_penalty: float = 0.2
 
     # --- Limits of states and innovations ---
     # [1] limit of vehicle and sensor states: standard deviations from their prior
     farthest: float = 3.6
     # [1] innovation, in standard deviations, beyond which R of a measurement is increased
     huber: float = 1.95
-    # [m/s] difference of v_x from the most probable node beyond which a node has diverged. The
-    # accelerometers exclude such a difference.
-    diverged_x: float = 0.7
-    # [m/s] difference of v_y from the most probable node beyond which a node has diverged
-    diverged_y: float = 1.0
+    # [m/s] difference of v_x or v_y from the most probable node beyond which a node has diverged.
+    # The accelerometers exclude such a difference.
+    diverged: float = 1.0
 
     # --- Tyre ---
     # [1] shape factor C of the Magic Formula, between 1.3 (lateral) and 1.65 (longitudinal) of
@@ -175,29 +163,19 @@ class Constants(NamedTuple):
     # [1] force over load at which a wheel or axle has half of its largest effect on the stiffness
     # states. At smaller forces slip is mostly noise.
     informing: float = 0.06
-    # [1] standard deviation of the force gain: torque 3 %, mass 3 %, load and radius (vehicle)
-    gain_std: float = 0.045
     # [s] time in which vehicle, sensor and road states return to their prior, because the errors
     # they describe change with load, bend and road. With 300 s the stated deviations were half of
     # the actual errors.
     return_time: float = 60.0
 
     # --- Accelerometers and slope of the road ---
-    # [1] mean share of measured a_y that is gravity, due to body roll (errata: .07 of the true a_y)
-    leak_y_mean: float = 0.06
-    # [1] standard deviation of the gravity share of a_y (errata)
-    leak_y_std: float = 0.05
-    # [1] share of measured a_x that is gravity, due to pitch. It is smaller because a body is
-    # stiffer in pitch than in roll.
-    leak_x: float = 0.02
-    # [m/s^2] standard deviation of the offset of a_x from tilted mount and sensor: .22 to .96 on
-    # logs of real cars
-    bias_x_std: float = 0.25
-    # [m/s^2] standard deviation of the offset of a_y: .07 to .54 on logs of real cars. A crossfall
-    # against which the driver does not steer has the same effect.
-    bias_y_std: float = 0.2
-    # [m/s^2] standard deviation of slope and bank: a grade of 3 %, a crossfall of 1 to 3 %
-    slope_std: float = 0.3
+    # [1] share of measured a_y that is gravity, due to body roll: mean and standard deviation
+    # (errata: .07 and .05 of the true a_y). With .06, late steering looked like body roll.
+    leak: float = 0.05
+    # [m/s^2] standard deviation of the offsets of a_x and a_y from tilted mount and sensor (.07 to
+    # .96 on logs of real cars), and of the gravity due to slope and bank of the road (a grade of
+    # 3 %, a crossfall of 1 to 3 %)
+    offset_std: float = 0.25
     # [m] distance over which slope and bank change: road waves are 100 to 400 m long
     slope_length: float = 120.0
 
@@ -219,11 +197,10 @@ class Constants(NamedTuple):
 
     # --- Wheel radii and delays ---
     # [1] standard deviation of one wheel's radius relative to the others: pressure, wear, and
-    # different tyres on the axles (1 % on BMW M8 and AV-21)
+    # different tyres on the axles (1 % on BMW M8 and AV-21). The common radius error, which no
+    # sensor here measures, and the speed computed from agreeing wheels have the same relative
+    # error. Wheels agree if their speeds differ by less than twice as much.
     wheel_std: float = 0.011
-    # [1] standard deviation of the common radius error: nominal radii of real cars are up to
-    # 1.5 % off. No sensor here measures it.
-    radius_std: float = 0.0125
     # [s] delay that all sensors share: 60 ms are common, .2 s occur. No sensor measures it, so it
     # only increases the stated deviation of v_x.
     common_lag: float = 0.05
@@ -234,19 +211,15 @@ class Constants(NamedTuple):
     # --- Noise of accelerometers, wheel speeds and steering ---
     # [m/s/s^.5] white noise of a_x and a_y, and random walk of their offsets (vehicle)
     drift: float = 0.02
-    # [rad/s] white noise of a wheel speed sample (vehicle)
-    omega_noise: float = 0.03
-    # [rad/s] error of wheel speeds besides white noise: undetected resolution steps, sensor teeth,
-    # wobbling tyres
-    step_noise: float = 0.06
+    # [rad/s] error of wheel speeds: noise, undetected resolution steps, teeth, wobbling tyres
+    omega_noise: float = 0.06
     # [1] share of a sudden change of slip that counts as noise. A tyre builds up force over .3 m,
     # and a bump changes the rolling radius.
     abrupt_share: float = 0.5
     # [s] time in which a change of wheel speed stops being sudden. A bump lasts .05 s; a wheel
-    # locks or spins up in .1 to .3 s.
+    # locks or spins up in .1 to .3 s. The forces are smoothed over the same time before they count
+    # as grip in use.
     abrupt_time: float = 0.15
-    # [rad] white noise of the steering angle in a block (vehicle)
-    angle_std: float = 0.0003
     # [1] relative error of the direction of an axle's wheels. Their common gain is the state
     # STEER_GAIN.
     angle_share: float = 0.01
@@ -258,19 +231,22 @@ class Constants(NamedTuple):
     # steering and a_y
     floor_y: float = 0.014
     # [1] relative error of the longitudinal force: torque gain, mass and load 3 % each (vehicle).
-    # Without torque: relative difference between the forces of an axle's wheels.
-    force_share: float = 0.04
+    # The state GAIN, which is the constant part of this error, and the grip in use near 1 have the
+    # same standard deviation. Without torque: relative difference between the forces of an axle's
+    # wheels.
+    force_share: float = 0.045
     # [1] relative error of an axle's lateral force: load transfer and inertia (vehicle)
     axle_share: float = 0.02
-    # [1] error of the tyre curve's shape, per squared lateral force over load
+    # [1] error of the tyre curve's shape, per squared lateral force over load. Without it a racing
+    # car that uses all its grip contradicts the model for a third of a drive.
     shape_share: float = 0.05
     # [s] delay of lateral force behind slip (relaxation, roll). The error is this time multiplied
     # by the rate of the force.
     lag: float = 0.015
-    # [m/s^2] without torque: part of a_x that is neither force nor offset
-    no_torque_floor: float = 0.1
+
     # [1] relative error of the force that accelerates a wheel's rotation. Torque and wheel speed
-    # are sampled at different times, and ABS acts at 8 Hz.
+    # are sampled at different times, and ABS acts at 8 Hz. Without it, snow was reported as wet
+    # road between pulses of the brake.
     spin_share: float = 0.3
 
     # --- Road changes where wheels slide ---
@@ -286,26 +262,11 @@ class Constants(NamedTuple):
     rear_unlike: float = 10.0
 
     # --- Motion according to standing or rolling wheels (`rolling_motion.py`) ---
-    # [s] time for which the wheels must stand before the car counts as standing
-    standing_time: float = 0.5
-    # [s] time for which the wheels must agree before the speed is computed from them
-    agreeing_time: float = 1.0
-    # [1] relative error of the speed computed from agreeing wheels, from radii and slip. Wheels
-    # agree if their speeds differ by less than twice as much.
-    agreeing_std: float = 0.01
-    # [m/s] smallest error of the speed computed from agreeing wheels. At its first sample, a car
-    # slower than this counts as standing.
-    agreeing_floor: float = 0.1
     # [1] relative error of slip computed from force over load with the nominal stiffness
     agreeing_slip: float = 0.6
     # [1] a_y over g up to which the rear axle is assumed not to slide. Beyond it, a sliding axle
     # cannot be distinguished from one that follows.
     following_most: float = 0.15
-
-    # --- Grip in use as a lower limit of friction (`grip_guard.py`) ---
-    # [1] standard deviation of the grip in use: accelerometer offset, slope, smoothing. A node gets
-    # no penalty if its friction lies less than this below the grip in use.
-    guard_std: float = 0.045
 
     # --- Strain (`trust.py`) ---
     # [1] weight, in degrees of freedom, of the initial strain of 1, because a few measurements do
@@ -315,13 +276,14 @@ class Constants(NamedTuple):
     # rough ones
     strain_usual: float = 0.95
     # [1] exponent of strain over `strain_usual` in the factor on R of the axles: how much known
-    # errors say about unknown ones
+    # errors say about unknown ones. With 1, a car with late steering was not contradicted, and
+    # called ice.
     strain_power: float = 2.0
     # [1] smallest factor of strain on R of the axles. A search for the best R of the axles found
-    # .24 on level drives.
+    # .24 on level drives. Without it, the snowy side of a split road had too high an upper end.
     strain_least: float = 0.25
-    # [1] largest factor of strain on R of the axles. Without it the car AV-21, whose strain is 4,
-    # was distrusted for .8 of a drive instead of .26.
+    # [1] largest factor of strain on R of the axles. Without it, late steering was contradicted
+    # twice as late.
     strain_most: float = 3.0
 
     # --- Contradiction of the model (`trust.py`) ---

@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.adaptation.rule_base import RuleBase, rule_base
+from edge_agent.adaptation.rule_base import RuleBase, plain_rules, rule_base
 from edge_agent.estimators.friction_mixture.state.constants import (
     NODES,
     STATES,
@@ -71,25 +71,25 @@ def nominal_states(constants: Constants) -> Nominal:
     for state, spread in (
         (x.LN_KX, c.stiffness_std),
         (x.LN_KY, c.stiffness_std),
-        (x.LEAK_Y, c.leak_y_std),
+        (x.LEAK_Y, c.leak),
         (x.STEER, c.steer_std),
         (x.SHAPE, c.shape_std),
-        (x.GAIN, c.gain_std),
-        (x.BIAS_X, c.bias_x_std),
-        (x.BIAS_Y, c.bias_y_std),
+        (x.GAIN, c.force_share),
+        (x.BIAS_X, c.offset_std),
+        (x.BIAS_Y, c.offset_std),
         *((x.RADIUS + wheel, c.wheel_std) for wheel in range(4)),
         (x.LAG_WHEEL, c.lag_std),
         (x.LAG_STEER, c.lag_std),
         (x.COMPLIANCE, c.compliance_std),
         (x.STEER_GAIN, c.steer_gain_std),
-        (x.SLOPE, c.slope_std),
-        (x.BANK, c.slope_std),
+        (x.SLOPE, c.offset_std),
+        (x.BANK, c.offset_std),
     ):
         std[state] = spread
         time[state] = c.return_time
     time[x.COMPLIANCE] = c.steer_time
     time[x.STEER_GAIN] = c.steer_time
-    mean[x.LEAK_Y] = c.leak_y_mean
+    mean[x.LEAK_Y] = c.leak
     mean[x.COMPLIANCE] = c.compliance_mean
     return Nominal(mean, std, time)
 
@@ -117,7 +117,7 @@ def design_of(
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),
-        rules=rule_base(memberships),
+        rules=rule_base(memberships) if adaptive else plain_rules(constants.steady_share),
         scales=np.exp(np.array(memberships.ln_scales)),
         adaptive=adaptive,
     )

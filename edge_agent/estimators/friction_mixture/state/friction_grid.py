@@ -52,14 +52,11 @@ class RoadChange(NamedTuple):
 
     Attributes:
         hazard: change from any node (friction hypothesis) to a friction drawn from the prior.
-        leaving: additional probability of such a change for nodes of split roads (different
-            friction left and right).
         drift: approximate probability of a change to the node with the next lower or higher
             friction. Only nodes with one friction for both sides have such neighbours.
     """
 
     hazard: float
-    leaving: float
     drift: float
 
 
@@ -81,19 +78,12 @@ def change_road(
       They exchange probability with their neighbours (`change.drift`). The exchange does not change
       probabilities that equal the prior.
     - The other nodes assume a split road (different friction left and right), so they have no order
-      and no neighbours. They lose the additional share `change.leaving`, which also goes to all
-      nodes.
+      and no neighbours.
     """
-    hazard, leaving, drift = change
+    hazard, drift = change
     count = w.shape[0]
-    left = 0.0
     for j in range(count):
         out[j] = w[j]
-        if j >= chain:
-            left += leaving * w[j]
-            out[j] -= leaving * w[j]
-    for j in range(count):
-        out[j] += left * prior[j]
     for j in range(chain - 1):
         least = min(prior[j], prior[j + 1])
         flow = 0.5 * drift * least * (w[j] / prior[j] - w[j + 1] / prior[j + 1])

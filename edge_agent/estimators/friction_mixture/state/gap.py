@@ -24,9 +24,10 @@ from schemas.signals import S
 
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] variance of the yaw rate without a gyroscope
 YAW_STD = 0.002  # [rad/s] white noise and offset of a gyroscope sample
-GAP_ACCELERATION = 2.0  # [m/s^2] acceleration that may have acted during a gap without samples
+# [m/s/s^.5] random walk of the velocity where the accelerometers are missing
+LOST_WALK = 2.0
 # [m/s] speed of vehicle and wheels below which slip is not used as evidence, because it is a
-# quotient of small numbers
+# quotient of small numbers. Wheel-speed differences are divided by at least this speed.
 SLOWEST_M_S = 1.5
 SLOW_M_S = 2.0 * SLOWEST_M_S  # [m/s] speed from which slip counts in full
 
@@ -95,7 +96,7 @@ def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
         memory.weight[j] += hazard * (prior[j] - memory.weight[j])
         memory.visit_weight[j] += hazard * (prior[j] - memory.visit_weight[j])
     restart_motion(
-        memory, rolling_speed(memory.row, now), min(GAP_ACCELERATION * dt, UNKNOWN_V_STD)
+        memory, rolling_speed(memory.row, now), min(LOST_WALK * math.sqrt(dt), UNKNOWN_V_STD)
     )
     rate = now[S.YAW_RATE]
     if not math.isnan(rate):

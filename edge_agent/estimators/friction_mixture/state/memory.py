@@ -89,7 +89,7 @@ class GripInUse:
     """
 
     slow: float  # smoothed over `abrupt_time`, for the penalty of nodes
-    fast: float  # smoothed over FAST_S
+    fast: float  # smoothed over a block
     held: float  # recent maximum of `fast`: the reported upper end is not below it
     age: float  # [s] time since `held` was last reached
 

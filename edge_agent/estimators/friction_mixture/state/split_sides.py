@@ -27,7 +27,6 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import LANES, LaneArray
 
-LEAST_RATIO = 1.45  # [1] smallest ratio of the two frictions of a split road
 LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # [1] cell edges of the side with less friction
 # [1] cell edges of the side with more friction. They are coarse, because often only a lower limit
 # of this friction is known.
@@ -56,7 +55,8 @@ class Triangle(NamedTuple):
     left: float
     middle: float
     right: float
-    width: float  # width of its cell, proportional to the uniform prior probability
+    low: float  # borders of its cell
+    high: float
 
 
 def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
@@ -69,8 +69,9 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
     middles = [0.5 * (a + b) for a, b in pairwise(edges)]
     lefts = [edges[0], *middles[:-1]]
     rights = [*middles[1:], edges[-1]]
-    widths = [b - a for a, b in pairwise(edges)]
-    return [Triangle(*row) for row in zip(lefts, middles, rights, widths, strict=True)]
+    return [
+        Triangle(*row) for row in zip(lefts, middles, rights, edges[:-1], edges[1:], strict=True)
+    ]
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
@@ -88,15 +89,12 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
     mass = []
     share = []
     for low, high in (
-        (a, b)
-        for a in triangular_cells(LOW)
-        for b in triangular_cells(HIGH)
-        if b.middle > LEAST_RATIO * a.middle
+        (a, b) for a in triangular_cells(LOW) for b in triangular_cells(HIGH) if b.low >= a.high
     ):
         mean = Triangle._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
         for left, right in ((low, high), (high, low)):
             pairs.append((left.middle, right.middle))
-            mass.append(low.width * high.width)
+            mass.append((low.high - low.low) * (high.high - high.low))
             share.append([_in_cells(edges, one) for one in (left, right, mean)])
     side_mu = np.vstack([np.column_stack([mu, mu]), pairs])
     spare = np.ones((PLACES - ALL_NODES, 2))
@@ -112,7 +110,7 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
     """Return the probability of each cell (range of friction) under a triangular density, (cells,);
     `edges` (cells + 1,) are the borders of the cells.
     """
-    left, middle, right, _ = triangle
+    left, middle, right, *_ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)
     falling = np.clip(right - edges, 0.0, right - middle)
     whole = right - left
