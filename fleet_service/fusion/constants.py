@@ -1,5 +1,6 @@
 """Constants of the fusion (the map's computation from the reports of all vehicles), each with the
-reason for its value. `fleet_service/fusion/README.md` explains the mathematics.
+reason for its value, in three parts: physical, chosen, and guards. `fleet_service/fusion/README.md`
+explains the mathematics.
 
 Terms
     visit          one passage of a vehicle through a cell
@@ -19,13 +20,14 @@ from schemas.thresholds import NS, SURFACES
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS  # [μ] width of a friction bin
 
+# ====== Physical: roads, vehicles, and the errors of their reports ======
+
 # --- Error of one vehicle ---
 
 # Share of values that contain no information about the road: faulty sensor, wrong cell, wrong tyre
 # model. At the border of a surface, 12 % of the position fixes alone are in the wrong cell. Because
 # of this share, one vote changes the ratio of two probabilities by a factor of at most about 60.
 CONTAMINATION: Final = 0.15
-
 # Standard deviation of a vehicle's constant error, relative to μ. Tyres, mass and stiffness that
 # are wrong by a few per cent shift all its values in the same direction. The vehicle's own visits
 # do not average this error out, so each vote is widened by it. The error is not learned per
@@ -34,11 +36,6 @@ CONTAMINATION: Final = 0.15
 BIAS_RELATIVE: Final = 0.05
 # [μ] Additive part of the same error. A vehicle has .015; rounding to bins adds the rest.
 BIAS_ABSOLUTE: Final = 0.01
-
-# Smallest contamination of a vehicle that agreed with many others. Its contamination is then the
-# share of comparisons in which it disagreed, but not less than this. The rest stands for positions
-# in the wrong cell and for the first failure of a sensor that never failed before.
-CONTAMINATION_LEAST: Final = 0.04
 
 # --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
 # More vehicles do not average this error out; see `shared`.
@@ -58,14 +55,6 @@ COMMON_ALWAYS: Final = 0.02
 # Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share;
 # in cells where vehicles reported only bounds, of the whole error.
 COMMON_MANOEUVRE: Final = 0.05
-
-# If a vehicle uses less than this share of a road's grip, its value may be too low, because it
-# depends on the assumed tyre curve. This error widens intervals upwards and corrects no value.
-SHARED_SHARE: Final = 0.8
-# Largest relative standard deviation of the tyre-curve error. Of 60 tuning fleets on winter tyres
-# that drove gently through a wet curve, 8 raised a false alert with .25, 3 with .275, 2 with .3.
-# The limit takes effect only for tyres whose curve is unknown or round.
-SHARED_MOST: Final = 0.275
 # The tyre-curve error is a slope times the unused share of grip. `trust.shape_of` learns the slope
 # from differences between visits of the same vehicle. This amount is added to the learned slope,
 # because other tyres and surfaces may have other curves.
@@ -73,14 +62,6 @@ SHAPE_DOUBT: Final = 0.1
 # Prior mean of the slope, and its standard deviation. The prior weighs as much as about 20
 # comparisons.
 SHAPE_PRIOR: Final = 0.15
-# A comparison weighs as much as its squared difference in grip used, divided by its variance. When
-# a vehicle's weights exceed this sum, all its comparisons so far count half. The sum is almost
-# seven times the weight of the prior.
-SHAPE_MEMORY: Final = 300.0
-# A value from gentle driving gets at least the square of this as its weight in the cell's means.
-SHARED_LEAST: Final = 0.25
-# Relative shared error σ_s at which a value has half the weight of a value without such an error.
-SHARED_WIDE: Final = 0.1
 # Share of a vehicle's stated variance that is an error common to all vehicles in a place.
 SHARED_PART: Final = 0.1
 # Share of the variance σ_s² that other manoeuvres do not average out. On three rough tuning drives,
@@ -92,33 +73,57 @@ SHARED_ALWAYS: Final = 0.5
 # P(the next cell has the same surface). In three tuning drives the Brier score of P(slippery) was
 # .0526 with .8 and .0471 with .9.
 SAME_SURFACE: Final = 0.9
-# Number of cells before, and number of cells behind, that may send a message to a cell.
-NEIGHBOURS: Final = 4
-# A neighbour with a smaller P(slippery) ends the slippery stretch: cells beyond it send no message.
-NEIGHBOUR_GRIP: Final = 0.1
-# A cell whose P(slippery) is this close to 0 or 1 gets no messages. The reports of its own visitors
-# decide, and reading the map takes less time.
-DECIDED: Final = 0.001
 
 # --- Change of a road with time ---
 
 # Standard deviation of μ after one hour of slow change (drying, polishing), a random walk.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
-
 # [s] Mean time between sudden changes (ice, snow, gritting) after which older reports mean nothing.
 # With three hours, a single measurement fades within a day.
 CHANGE_S: Final = 10800.0
-# Smallest probability of a sudden change that is assumed before each new value. Visits may follow
-# each other within a second, and the road may still change between them; with this, two passes
-# reverse a firm belief. In a tuning fleet in which every pass used all the grip, ice was found
-# after 6 passes (95 % quantile 8) with .003, and after 5 (6) with .01. False ice of three fleets
-# and the figures of attacks, drives and value did not change. Bounds do not assume such a change,
-# so that no number of bounds erases a belief.
-CHANGE_LEAST: Final = 0.01
 
-# [s] Beliefs are aged in steps of at least this length. A shorter step would be lost in rounding to
-# 16 bits. One step moves an interval by less than a tenth of a bin.
-FORGET_S: Final = 10.0
+# --- From a report to a likelihood ---
+
+# Standard deviation of the grip used: accelerometer and load transfer, about 5 % of g.
+UTILISED_STD: Final = 0.05
+# Relative part of the same error, as large as a value's: mass over the wheels, roll, sensor gain.
+UTILISED_RELATIVE: Final = BIAS_RELATIVE
+# [μ] Smallest standard deviation of a value that is believed when two values are compared. A value
+# is computed from the grip used, so it is not more accurate.
+NOVELTY_STD: Final = UTILISED_STD
+# Share of bounds that belong to another road or are no bounds. On two rough tuning drives, 2 to 6 %
+# of the bounds were too high by more than .1, and all were where the surface changes inside a cell.
+BOUND_CONTAMINATION: Final = 0.3
+# [μ] Standard deviation of a posterior sent without an interval: half of the range of wet roads, as
+# if only the kind of road were known.
+POSTERIOR_STD: Final = 0.5 * (SURFACES["wet"][1] - SURFACES["wet"][0])
+
+# --- Trust: comparison of values of different vehicles in the same cell ---
+
+# [μ] Two values are not compared if their difference has a larger standard deviation, because then
+# they would agree with everything.
+PEER_STD: Final = 0.25
+
+# ====== Chosen: weights and thresholds of the method ======
+
+# --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
+
+# If a vehicle uses less than this share of a road's grip, its value may be too low, because it
+# depends on the assumed tyre curve. This error widens intervals upwards and corrects no value.
+SHARED_SHARE: Final = 0.8
+# A comparison weighs as much as its squared difference in grip used, divided by its variance. When
+# a vehicle's weights exceed this sum, all its comparisons so far count half. The sum is almost
+# seven times the weight of the prior.
+SHAPE_MEMORY: Final = 300.0
+# Relative shared error σ_s at which a value has half the weight of a value without such an error.
+SHARED_WIDE: Final = 0.1
+
+# --- Evidence from slippery neighbouring cells, see `neighbours` ---
+
+# Number of cells before, and number of cells behind, that may send a message to a cell.
+NEIGHBOURS: Final = 4
+# A neighbour with a smaller P(slippery) ends the slippery stretch: cells beyond it send no message.
+NEIGHBOUR_GRIP: Final = 0.1
 
 # --- Repeated reports of one vehicle in one cell ---
 
@@ -126,10 +131,8 @@ FORGET_S: Final = 10.0
 # the first vote by slow and sudden change. So no vehicle controls a cell by passing it all day. The
 # vote counts again by 95 % (1 - e⁻³) in the mean time between changes.
 VOTE_RENEWAL_S: Final = CHANGE_S / 3.0
-
 # Two values this many standard deviations apart come from two different roads, or one is wrong.
 PEERS_DISAGREE: Final = 4.0
-
 # A value that differs from the vehicle's own last value in the cell counts again at once; the
 # vehicle's bias cancels in the difference. Up to PEERS_AGREE standard deviations the difference is
 # noise. From PEERS_DISAGREE on the vote counts in full.
@@ -139,17 +142,10 @@ VOTES: Final = 2.0
 # [s] Shortest time between two visits that count as separate, because driving round a block takes
 # longer. So a flood of reports counts as one report.
 REVISIT_S: Final = 20.0
-# Number of visits of one vehicle to one cell that the lateness window holds. Further visits are
-# archived and not fused. Only six visits REVISIT_S apart fit into a window of two minutes, and the
-# votes of all others would weigh almost nothing.
-WAITING_MOST: Final = 32
 # [s] Time for which a vehicle's values in a cell are remembered. By then 95 % of its vote counts
 # again. Bounds are remembered for VOTE_RENEWAL_S only, when 63 % counts again. Most visits give
 # bounds, so the memory holds the visits of one hour and the values of three.
 FORGOTTEN_S: Final = CHANGE_S
-# [s] Time between two deletions of reports too old to remember, so that at most a quarter more than
-# needed is stored (`table.places_for`).
-FORGOTTEN_EVERY_S: Final = int(VOTE_RENEWAL_S) // 4
 
 # --- Visits without a value ---
 
@@ -175,33 +171,11 @@ UNSURE: Final = 0.45
 # (.80).
 EVIDENCE_NATS: Final = 1.0
 VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
-
-# Smallest probability that a vehicle was in another cell for which that cell gets a part of its
-# vote; smaller parts stay in the reported cell. Receivers with an error of 1.5 m have 6 % on each
-# side, which CONTAMINATION covers. Spreading these too would cost three times as many votes and add
-# nothing.
-SPREAD_LEAST: Final = 0.08
 # Number of cells on each side that may get a part. A position that is less accurate has no use.
 SPREAD_CELLS: Final = 2
 # A vote counts as a visit to a cell, and is compared with other vehicles there, only if the vehicle
 # was in this cell with at least this probability.
 HERE_SHARE: Final = 0.5
-
-# Standard deviation of the grip used: accelerometer and load transfer, about 5 % of g.
-UTILISED_STD: Final = 0.05
-# Relative part of the same error, as large as a value's: mass over the wheels, roll, sensor gain.
-UTILISED_RELATIVE: Final = BIAS_RELATIVE
-# [μ] Smallest standard deviation of a value that is believed when two values are compared. A value
-# is computed from the grip used, so it is not more accurate.
-NOVELTY_STD: Final = UTILISED_STD
-# Largest grip used that is believed. Of the reports above it, 29 % were too high by more than .05.
-UTILISED_MOST: Final = 0.9
-# Share of bounds that belong to another road or are no bounds. On two rough tuning drives, 2 to 6 %
-# of the bounds were too high by more than .1, and all were where the surface changes inside a cell.
-BOUND_CONTAMINATION: Final = 0.3
-# [μ] Standard deviation of a posterior sent without an interval: half of the range of wet roads, as
-# if only the kind of road were known.
-POSTERIOR_STD: Final = 0.5 * (SURFACES["wet"][1] - SURFACES["wet"][0])
 
 # --- Trust: comparison of values of different vehicles in the same cell ---
 
@@ -210,9 +184,6 @@ POSTERIOR_STD: Final = 0.5 * (SURFACES["wet"][1] - SURFACES["wet"][0])
 # every kind of road; wrong cells and changing roads cause the rest.
 PEERS_AGREE: Final = 2.5
 PEER_S: Final = 900  # [s] values further apart in time are not compared: both may be right
-# [μ] Two values are not compared if their difference has a larger standard deviation, because then
-# they would agree with everything.
-PEER_STD: Final = 0.25
 # Number of comparisons with one other vehicle above which the earlier ones count half. A vehicle
 # that begins to lie, or whose sensor was repaired, is noticed within minutes. Noise stays small
 # because trust is a mean over many other vehicles.
@@ -229,9 +200,6 @@ TRUST_PRIOR_PEERS: Final = 8.0
 # colluders fall below it.
 TRUST_NONE: Final = 1.0 - 2.0 * CONTAMINATION
 TRUST_FULL: Final = 0.9  # share of agreement from which trust is 1
-# Smallest weight of another vehicle in this mean, so that comparisons count even if no vehicle is
-# trusted.
-TRUST_HEARD_LEAST: Final = 0.2
 # A vehicle is known once it has been compared with this many others, weighted by their trust.
 ESTABLISHED_PEERS: Final = 4.0
 # Number of known and trusted vehicles from which every vehicle that is not known is a newcomer.
@@ -249,3 +217,66 @@ SOURCE_NS: Final = 3600 * NS
 # [ns] Trust is computed once per epoch and used from the next epoch on. So it depends on the order
 # of the times of reports, and not on their order of arrival.
 EPOCH_NS: Final = 60 * NS
+
+# ====== Guards: limits that keep single errors and rounding from spreading ======
+
+# --- Error of one vehicle ---
+
+# Smallest contamination of a vehicle that agreed with many others. Its contamination is then the
+# share of comparisons in which it disagreed, but not less than this. The rest stands for positions
+# in the wrong cell and for the first failure of a sensor that never failed before.
+CONTAMINATION_LEAST: Final = 0.04
+
+# --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
+
+# Largest relative standard deviation of the tyre-curve error. Of 60 tuning fleets on winter tyres
+# that drove gently through a wet curve, 8 raised a false alert with .25, 3 with .275, 2 with .3.
+# The limit takes effect only for tyres whose curve is unknown or round.
+SHARED_MOST: Final = 0.275
+# A value from gentle driving gets at least the square of this as its weight in the cell's means.
+SHARED_LEAST: Final = 0.25
+
+# --- Evidence from slippery neighbouring cells, see `neighbours` ---
+
+# A cell whose P(slippery) is this close to 0 or 1 gets no messages. The reports of its own visitors
+# decide, and reading the map takes less time.
+DECIDED: Final = 0.001
+
+# --- Change of a road with time ---
+
+# Smallest probability of a sudden change that is assumed before each new value. Visits may follow
+# each other within a second, and the road may still change between them; with this, two passes
+# reverse a firm belief. In a tuning fleet in which every pass used all the grip, ice was found
+# after 6 passes (95 % quantile 8) with .003, and after 5 (6) with .01. False ice of three fleets
+# and the figures of attacks, drives and value did not change. Bounds do not assume such a change,
+# so that no number of bounds erases a belief.
+CHANGE_LEAST: Final = 0.01
+# [s] Beliefs are aged in steps of at least this length. A shorter step would be lost in rounding to
+# 16 bits. One step moves an interval by less than a tenth of a bin.
+FORGET_S: Final = 10.0
+
+# --- Repeated reports of one vehicle in one cell ---
+
+# Number of visits of one vehicle to one cell that the lateness window holds. Further visits are
+# archived and not fused. Only six visits REVISIT_S apart fit into a window of two minutes, and the
+# votes of all others would weigh almost nothing.
+WAITING_MOST: Final = 32
+# [s] Time between two deletions of reports too old to remember, so that at most a quarter more than
+# needed is stored (`table.places_for`).
+FORGOTTEN_EVERY_S: Final = int(VOTE_RENEWAL_S) // 4
+
+# --- From a report to a likelihood ---
+
+# Smallest probability that a vehicle was in another cell for which that cell gets a part of its
+# vote; smaller parts stay in the reported cell. Receivers with an error of 1.5 m have 6 % on each
+# side, which CONTAMINATION covers. Spreading these too would cost three times as many votes and add
+# nothing.
+SPREAD_LEAST: Final = 0.08
+# Largest grip used that is believed. Of the reports above it, 29 % were too high by more than .05.
+UTILISED_MOST: Final = 0.9
+
+# --- Trust: comparison of values of different vehicles in the same cell ---
+
+# Smallest weight of another vehicle in this mean, so that comparisons count even if no vehicle is
+# trusted.
+TRUST_HEARD_LEAST: Final = 0.2
