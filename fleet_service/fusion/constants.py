@@ -52,8 +52,9 @@ COMMON_ABSOLUTE: Final = 0.02
 COMMON_HIGH: Final = 0.025
 # Relative standard deviation of the part that all kinds of manoeuvre share, in cells with values.
 COMMON_ALWAYS: Final = 0.02
-# Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share;
-# in cells where vehicles reported only bounds, of the whole error.
+# Relative standard deviation in cells where vehicles reported only bounds.
+COMMON_RELATIVE: Final = 0.04
+# Relative standard deviation of the part that only vehicles with the same kind of manoeuvre share.
 COMMON_MANOEUVRE: Final = 0.05
 # The tyre-curve error is a slope times the unused share of grip. `trust.shape_of` learns the slope
 # from differences between visits of the same vehicle. This amount is added to the learned slope,

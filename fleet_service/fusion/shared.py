@@ -156,7 +156,7 @@ def base_kernel() -> FloatArray:
     friction and no values. K maps a belief about the friction that the fleet measures to a belief
     about the road.
     """
-    relative = c.COMMON_MANOEUVRE * mugrid.CENTRES
+    relative = c.COMMON_RELATIVE * mugrid.CENTRES
     return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
 
 

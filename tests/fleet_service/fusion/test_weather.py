@@ -118,7 +118,7 @@ def test_unknown_road_fades_to_its_regions_prior_which_is_half_uniform() -> None
     fusion = Fusion(120.0)
     fusion.update_weather(told)
     fusion.update(observations([60.0], [1], value([0.5], std=30.0)))
-    assert slippery(belief(fusion)) == pytest.approx(0.5 + 0.5 * 0.3, abs=0.03)
+    assert slippery(belief(fusion)) == pytest.approx(0.5 + 0.5 * 0.3, abs=0.02)
     assert belief(fusion).min() > 0.4 / mugrid.BINS
 
 
