@@ -88,7 +88,7 @@ def count_operations(interval: float) -> float:
     of samples, and the output. The share of the peak that is computed from this count is therefore
     a lower limit.
     """
-    samples = round(Constants().block_time / interval)
+    samples = round(Constants().chosen.block_time / interval)
     return NODES * (_count_rows() + _count_covariances()) / samples
 
 

@@ -124,7 +124,9 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
     constants = design.constants
     var_x = memory.overall_covariance[NodeState.VX, NodeState.VX]
     # No sensor measures the common radius error and the common delay.
-    var_x += (constants.wheel_std * vx) ** 2 + (constants.common_lag * last.ax) ** 2
+    var_x += (constants.physical.wheel_std * vx) ** 2 + (
+        constants.physical.common_lag * last.ax
+    ) ** 2
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_STD**2
     write_motion(output, (vx, vy, last.yaw_rate), (var_x, var_y, var_rate))

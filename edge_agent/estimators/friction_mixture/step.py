@@ -130,15 +130,15 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
     duration = scratch.features.duration
     process = scratch.process
     keep = scratch.keep
-    process[NodeState.VX] = (constants.drift**2 + block.missing_x) * duration
-    unsure = constants.distrust_drift * memory.trust.distrust
-    process[NodeState.VY] = (constants.drift**2 + unsure**2 + block.missing_y) * duration
-    forgets = memory.trust.distrust / constants.distrust_forget
+    process[NodeState.VX] = (constants.physical.drift**2 + block.missing_x) * duration
+    unsure = constants.chosen.distrust_drift * memory.trust.distrust
+    process[NodeState.VY] = (constants.physical.drift**2 + unsure**2 + block.missing_y) * duration
+    forgets = memory.trust.distrust / constants.chosen.distrust_forget
     speed = scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         pace = 1.0 / nominal.time[i] + forgets
         if i in (NodeState.SLOPE, NodeState.BANK):
-            pace += speed / constants.slope_length
+            pace += speed / constants.physical.slope_length
         if i in (NodeState.BIAS_X, NodeState.BIAS_Y, NodeState.SLOPE, NodeState.BANK):
             pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)
@@ -160,7 +160,7 @@ def conclude_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scr
                 memory.slip.held,
                 memory.excitation.largest,
                 friction.lower,
-                design.constants.force_share,
+                design.constants.physical.force_share,
             )
     vx = memory.overall_mean[NodeState.VX]
     speed = max(abs(vx), SLOWEST_M_S)

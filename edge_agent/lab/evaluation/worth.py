@@ -133,7 +133,7 @@ def without_sets() -> MixtureDesign:
     measurements that contradict the vehicle model.
     """
     design = design_of(Memberships(), adaptive=True)
-    rules = plain_rules(design.constants.steady_share)
+    rules = plain_rules(design.constants.chosen.steady_share)
     return design._replace(fuzzy_outputs=np.zeros(SETS), rules=rules)
 
 

@@ -139,9 +139,9 @@ def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, Mixture
     values that would make the fuzzy sets invalid, are left out.
     """
     usual = Constants()
-    for name, value in usual._asdict().items():
+    for name, value in usual.by_name().items():
         for factor in FACTORS:
-            changed = usual._replace(**{name: value * factor})
+            changed = usual.replace_values(**{name: value * factor})
             yield name, factor, design_of(memberships, adaptive=True, constants=changed)
     for field in LENGTHS:
         values = getattr(memberships, field)

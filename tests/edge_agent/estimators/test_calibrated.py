@@ -41,6 +41,6 @@ def test_each_filter_of_a_bank_has_the_prior_of_its_own_vehicle() -> None:
     )
     spreads = filters["nominal"]["std"]
     assert spreads.shape == (2, STATES)
-    assert spreads[0, NodeState.BIAS_X] == Constants().offset_std
+    assert spreads[0, NodeState.BIAS_X] == Constants().physical.offset_std
     assert spreads[1, NodeState.BIAS_X] < 0.6 * spreads[0, NodeState.BIAS_X]
     assert np.array_equal(filters["nominal"]["time"], np.stack([NOMINAL.time] * 2))

@@ -220,7 +220,7 @@ def figures(place: str, name: str | None, times: float) -> dict[str, float]:
     t, signals, vehicle = make_drive(place)
     constants = Constants()
     if name is not None:
-        constants = constants._replace(**{name: times * getattr(constants, name)})
+        constants = constants.replace_values(**{name: times * constants.by_name()[name]})
     bank = mixture_bank(
         parameter_table([vehicle]), design_of(Memberships(), adaptive=True, constants=constants)
     )
@@ -307,7 +307,7 @@ def geometric(values: FloatArray) -> float:
 
 
 def test_every_constant_has_its_move() -> None:
-    assert set(MOVES) == set(Constants._fields)
+    assert set(MOVES) == set(Constants().by_name())
 
 
 @pytest.mark.parametrize("name", MOVES)

@@ -28,7 +28,7 @@ def test_carried_degree_rises_with_force_over_friction(demand: float, degree: fl
     memory["friction_left"]["median"] = 0.8
     memory["friction_right"]["median"] = 0.2  # the slippery side counts
     found = carried_degree(
-        cast(MixtureMemory, memory[0]), Constants(carried_share=0.4), 0.2 * demand
+        cast(MixtureMemory, memory[0]), Constants().replace_values(carried_share=0.4), 0.2 * demand
     )
     assert found == pytest.approx(degree)
 

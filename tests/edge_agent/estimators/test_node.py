@@ -190,7 +190,7 @@ def mix_all(
 
 
 def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
-    c = Constants().curve_c
+    c = Constants().physical.curve_c
     e = 0.0
     curve = curve_tables(partial(magic_formulas, c=c, e=e))
     for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):

@@ -26,7 +26,7 @@ from edge_agent.estimators.friction_mixture.state.friction_grid import (
 from schemas.mugrid import CENTRES
 
 MU, WIDTH = node_table(NODES)
-PRIOR = friction_prior(MU, WIDTH, Constants().common_mu)
+PRIOR = friction_prior(MU, WIDTH, Constants().physical.common_mu)
 
 
 def test_widths_of_nodes_are_uniform_in_mu() -> None:
@@ -37,7 +37,7 @@ def test_widths_of_nodes_are_uniform_in_mu() -> None:
 
 def test_prior_falls_above_the_common_friction() -> None:
     prior_density = PRIOR / WIDTH
-    is_common = Constants().common_mu > MU
+    is_common = Constants().physical.common_mu > MU
     assert PRIOR.sum() == pytest.approx(1.0)
     assert prior_density[is_common] == pytest.approx(prior_density[0])
     assert (np.diff(prior_density[~is_common]) < 0.0).all()
@@ -76,9 +76,21 @@ def test_evidence_is_the_likelihood_that_was_put_in() -> None:
 
 def test_every_constant_has_its_unit_and_its_reason_above_it() -> None:
     # Join comments of several lines.
-    source = re.sub(r"\n +# (?!\[)", " ", inspect.getsource(Constants))
+    groups = "".join(inspect.getsource(type(group)) for group in Constants())
+    source = re.sub(r"\n +# (?!\[)", " ", groups)
     lines = [line.strip() for line in source.splitlines()]
     found = {line.split(":")[0]: above for above, line in pairwise(lines) if ": float = " in line}
-    assert tuple(found) == Constants._fields
+    assert list(found) == list(Constants().by_name())
     for name, above in found.items():
         assert re.fullmatch(r"# \[[^]]+\] \S.{5,}", above), name
+
+
+def test_replaced_constants_keep_the_others_and_refuse_unknown_names() -> None:
+    usual = Constants()
+    changed = usual.replace_values(hazard=0.5, window=2.0)
+    assert {n for n, v in changed.by_name().items() if v != usual.by_name()[n]} == {
+        "hazard",
+        "window",
+    }
+    with pytest.raises(KeyError, match="hazards"):
+        usual.replace_values(hazards=0.5)

@@ -82,7 +82,7 @@ def prior_quantile(level: float) -> float:
     """Return the quantile of the prior: uniform from .05 to `common_mu`, then falling linearly to 0
     at 1.2.
     """
-    common_mu = DESIGN.constants.common_mu
+    common_mu = DESIGN.constants.physical.common_mu
     tail_mass = 0.5 * (UPPER - common_mu)
     mass_above = (1.0 - level) * (common_mu - LOWER + tail_mass)
     if mass_above <= tail_mass:

@@ -57,14 +57,14 @@ def test_strain_goes_from_one_to_chi_square_over_degrees_of_freedom() -> None:
 
 
 def test_axles_are_more_certain_with_a_correct_vehicle_file() -> None:
-    usual = CONSTANTS.strain_usual
+    usual = CONSTANTS.chosen.strain_usual
     assert strained_noise(believing(strained=usual), CONSTANTS) == pytest.approx(1.0)
     noise = [
         strained_noise(believing(strained=share * usual), CONSTANTS)
         for share in (0.01, 0.8, 1.2, 100.0)
     ]
     assert noise == sorted(noise)
-    assert (noise[0], noise[-1]) == (CONSTANTS.strain_least, CONSTANTS.strain_most)
+    assert (noise[0], noise[-1]) == (CONSTANTS.guards.strain_least, CONSTANTS.guards.strain_most)
 
 
 def test_axles_of_a_strained_car_are_trusted_less() -> None:
@@ -85,7 +85,7 @@ def test_innovations_as_stated_support_the_model_threefold_ones_do_not() -> None
 
 def test_weight_of_evidence_falls_to_zero_at_the_limit() -> None:
     shares = [
-        used_evidence_share(believing(odd=share * CONSTANTS.odd_least), CONSTANTS)
+        used_evidence_share(believing(odd=share * CONSTANTS.chosen.odd_least), CONSTANTS)
         for share in (0.0, 0.3, 0.8, 1.0, 2.0)
     ]
     assert shares[0] == 1.0
@@ -99,7 +99,7 @@ def test_tilted_and_turned_sensors_strain_and_as_the_file_says_they_do_not() -> 
     wrong[:, S.AX] += 0.5
     wrong[:, S.DELTA : S.DELTA + 2] += 0.01
     level, strained = (float(after(s, t, vehicle)[0]["strain"]) for s in (signals, wrong))
-    assert level < CONSTANTS.strain_usual < 1.0 < strained
+    assert level < CONSTANTS.chosen.strain_usual < 1.0 < strained
 
 
 @pytest.mark.parametrize("manoeuvre", ["braking", "acceleration", "slalom", "pulses"])
@@ -107,7 +107,7 @@ def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
     t, signals, vehicle = drive(manoeuvre, 0.15)
     trust, said = after(signals, t, vehicle)
     assert not said.any()
-    assert trust["odd"] < CONSTANTS.odd_least
+    assert trust["odd"] < CONSTANTS.chosen.odd_least
 
 
 @pytest.mark.parametrize(("held", "grows"), [(0.0, True), (1.0, False)])
@@ -137,13 +137,13 @@ def test_a_reset_counts_half_unless_it_is_explained(
     memory["slip"]["held"] = held  # a wheel slides
     memory["trust"]["odd"] = memory["trust"]["ratio"] = 0.0
     update_consistency(memory, bank._contexts["design"][0], 0.05, 0.0, flags.RESET)
-    expected = share * CONSTANTS.odd_least
+    expected = share * CONSTANTS.chosen.odd_least
     assert float(memory["trust"]["odd"]) == pytest.approx(expected, rel=0.1, abs=0.01)
 
 
 def test_unexplained_side_force_contradicts_until_patience_ends() -> None:
     vehicle = drive("straight", 0.85)[2]
-    t = np.arange(0.0, 5.0 + CONSTANTS.patience, 0.01)
+    t = np.arange(0.0, 5.0 + CONSTANTS.chosen.patience, 0.01)
     signals = np.zeros((len(t), 18))
     signals[:, S.OMEGA : S.OMEGA + 4] = 60.0
     signals[:, S.AY] = np.where(t < 4.0, 3.0 * np.sin(2.0 * t), 0.0)
@@ -151,7 +151,7 @@ def test_unexplained_side_force_contradicts_until_patience_ends() -> None:
     began = t[said.argmax()]
     ended = t[len(t) - 1 - said[::-1].argmax()]
     assert 0.5 < began < 4.0
-    assert ended - began == pytest.approx(CONSTANTS.patience, abs=0.2)
+    assert ended - began == pytest.approx(CONSTANTS.chosen.patience, abs=0.2)
 
 
 def test_without_adaptation_nothing_is_strained_or_distrusted() -> None:

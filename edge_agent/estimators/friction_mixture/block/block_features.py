@@ -54,8 +54,8 @@ def strained_noise(trust: Trust, constants: Constants) -> float:
     prior. If these states show large errors of the car, errors that the filter does not estimate
     are probably large too.
     """
-    factor = (trust.strain / constants.strain_usual) ** constants.strain_power
-    return float(min(max(factor, constants.strain_least), constants.strain_most))
+    factor = (trust.strain / constants.chosen.strain_usual) ** constants.chosen.strain_power
+    return float(min(max(factor, constants.guards.strain_least), constants.guards.strain_most))
 
 
 @compiled
@@ -163,7 +163,9 @@ def _compute_wheel_forces(
                 torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS]
             )
             inertial = row[Parameter.WHEEL_INERTIA] * features.spin[wheel] / row[Parameter.RADIUS]
-            spread = math.hypot(constants.force_share * force, constants.spin_share * inertial)
+            spread = math.hypot(
+                constants.physical.force_share * force, constants.physical.spin_share * inertial
+            )
             unit = 0.0
         else:
             if math.isnan(torque):
@@ -171,15 +173,15 @@ def _compute_wheel_forces(
             known = row[Parameter.MASS] * features.change
             unit = 0.5 * (front if wheel < 2 else 1.0 - front) * row[Parameter.MASS]
             force = unit * features.change
-            apart = math.hypot(constants.force_share * force, 0.5 * front_std * known)
-            spread = math.hypot(apart, constants.floor_x * loads[wheel])
+            apart = math.hypot(constants.physical.force_share * force, 0.5 * front_std * known)
+            spread = math.hypot(apart, constants.physical.floor_x * loads[wheel])
             if math.isnan(ax):
                 unit = 0.0
                 spread = NO_FORCE_SHARE * loads[wheel]
             elif lone >= 0 and not brakes:  # the other axle provides the rest of the force m*a_x
                 unit = 0.5 * row[Parameter.MASS]
                 force = 0.5 * (known - axle_force(memory, features, lone))
-                spread = math.hypot(spread, constants.force_share * unit * features.change)
+                spread = math.hypot(spread, constants.physical.force_share * unit * features.change)
         features.force[wheel], features.force_unit[wheel] = (
             force / loads[wheel],
             unit / loads[wheel],
@@ -305,13 +307,17 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     speed = max(features.speed, SLOWEST_SLIP_M_S)
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
-        noise = max(constants.omega_noise, ROUNDING * memory.last.omega_step[wheel])
+        noise = max(constants.physical.omega_noise, ROUNDING * memory.last.omega_step[wheel])
         linear = row[Parameter.SLOPE_X] / speed
         slip_variance = (linear * noise * row[Parameter.RADIUS]) ** 2
         features.abrupt_noise[wheel] = (
-            linear * constants.abrupt_share * wheel_speed_jump(memory, constants, features, wheel)
+            linear
+            * constants.physical.abrupt_share
+            * wheel_speed_jump(memory, constants, features, wheel)
         ) ** 2
-        variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2
+        variance = (
+            0.5 * slip_variance + constants.physical.floor_x**2 + features.noise_std[wheel] ** 2
+        )
         features.noise_std[wheel] = math.sqrt(variance * scale)
         features.slip_noise[wheel] = slip_variance * scale
     scale = (
@@ -327,14 +333,14 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         turning = (
             YAW_STD * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
         )
-        pointing = constants.angle_share * features.steer_sin[2 * axle]
+        pointing = constants.physical.angle_share * features.steer_sin[2 * axle]
         angle = row[Parameter.SLOPE_Y] * math.hypot(turning, pointing)
-        share = constants.axle_share * side
+        share = constants.physical.axle_share * side
         change = side - before[axle]
-        lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
+        lag = 0.0 if math.isnan(change) else constants.physical.lag * change / features.duration
         before[axle] = side
-        shape = constants.shape_share * side * side
-        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
+        shape = constants.physical.shape_share * side * side
+        variance = 0.5 * angle**2 + constants.physical.floor_y**2 + share**2 + shape**2 + lag**2
         variance += (locked / (features.loads[2 * axle] + features.loads[2 * axle + 1])) ** 2
         wide = (
             wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
@@ -359,7 +365,7 @@ def wheel_speed_jump(
     now = at_centre(memory.row, features, wheel)
     usual = memory.usual_rolling
     expected = usual[wheel] + features.change * features.duration
-    share = 1.0 - math.exp(-features.duration / constants.abrupt_time)
+    share = 1.0 - math.exp(-features.duration / constants.physical.abrupt_time)
     usual[wheel] = now if math.isnan(expected) else expected + share * (now - expected)
     apart = abs(now - expected)
     return 0.0 if math.isnan(apart) else apart
@@ -388,9 +394,9 @@ def _compute_information(constants: Constants, features: BlockFeatures) -> None:
     for axle in range(2):
         along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
         side = features.side[axle]
-        features.informs_x[axle] = along * along / (along * along + constants.informing**2)
+        features.informs_x[axle] = along * along / (along * along + constants.chosen.informing**2)
         features.informs_y[axle] = (
-            0.0 if math.isnan(side) else side * side / (side * side + constants.informing**2)
+            0.0 if math.isnan(side) else side * side / (side * side + constants.chosen.informing**2)
         )
 
 
@@ -426,7 +432,12 @@ def unexplained_slip_difference(
         slip = (faster - turning) / speed
         unknown = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j], 0.0))
         samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
-        noise = constants.omega_noise * row[Parameter.RADIUS] / speed * math.sqrt(2.0 / samples)
+        noise = (
+            constants.physical.omega_noise
+            * row[Parameter.RADIUS]
+            / speed
+            * math.sqrt(2.0 / samples)
+        )
         apart = abs(row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left])
         if not math.isnan(apart):
             most = max(most, apart - row[Parameter.SLOPE_X] * LIKELY * (noise + unknown))

@@ -93,11 +93,11 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
     apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
     rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     per_force = pull / row[Parameter.SLOPE_X]
-    look = min(features.duration / constants.correlation_time, 1.0)
+    look = min(features.duration / constants.physical.correlation_time, 1.0)
     total = 0.0
     for kind in range(3):
         asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))
-        spread = constants.wheel_std + UNLIKE * (per_force + abs(asked))
+        spread = constants.physical.wheel_std + UNLIKE * (per_force + abs(asked))
         off = (apart - asked) / spread
         one_axle = DRIVES[kind] in (0.0, 1.0)
         if one_axle and off * asked > 0.0:
@@ -105,8 +105,8 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
         odds[kind] *= math.exp(
             -look
             * (
-                min(0.5 * off * off, constants.largest_loss)
-                + math.log(spread / constants.wheel_std)
+                min(0.5 * off * off, constants.guards.largest_loss)
+                + math.log(spread / constants.physical.wheel_std)
             )
         )
         total += odds[kind]

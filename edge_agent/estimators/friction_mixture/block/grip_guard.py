@@ -28,8 +28,8 @@ def note_grip(grip: GripInUse, constants: Constants, ax: float, ay: float, dt: f
     the body. The upper end of the interval uses the one smoothed over a block.
     """
     size = math.hypot(ax, ay) / GRAVITY
-    grip.slow += (1.0 - math.exp(-dt / constants.abrupt_time)) * (size - grip.slow)
-    grip.fast += (1.0 - math.exp(-dt / constants.block_time)) * (size - grip.fast)
+    grip.slow += (1.0 - math.exp(-dt / constants.physical.abrupt_time)) * (size - grip.slow)
+    grip.fast += (1.0 - math.exp(-dt / constants.chosen.block_time)) * (size - grip.fast)
     grip.age += dt
     if grip.fast >= grip.held:
         grip.held = grip.fast
@@ -44,8 +44,8 @@ def guard_penalty(grip: GripInUse, constants: Constants, side_mu: FloatArray) ->
     (2,) is the hypothetical friction on the left and right side; their mean counts. The penalty is
     0 if this mean is not below the grip in use.
     """
-    lack = (grip.slow - 0.5 * (side_mu[0] + side_mu[1])) / constants.force_share - 1.0
-    return float(min(0.5 * max(lack, 0.0) ** 2, constants.largest_loss))
+    lack = (grip.slow - 0.5 * (side_mu[0] + side_mu[1])) / constants.physical.force_share - 1.0
+    return float(min(0.5 * max(lack, 0.0) ** 2, constants.guards.largest_loss))
 
 
 @compiled

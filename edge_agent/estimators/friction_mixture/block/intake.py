@@ -80,7 +80,7 @@ def take_sample(
     _integrate_motion(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
     _add_sample(memory, ax, ay)
     last.time = time
-    return health, time - memory.block.time >= design.constants.block_time - EARLY_S
+    return health, time - memory.block.time >= design.constants.chosen.block_time - EARLY_S
 
 
 @compiled
@@ -160,7 +160,7 @@ def _integrate_motion(
     time = last.time + dt
     if not math.isnan(ax + ay):
         last.inertial_time = time
-    elif time - last.inertial_time < 0.5 * constants.block_time:  # a short gap is filled
+    elif time - last.inertial_time < 0.5 * constants.chosen.block_time:  # a short gap is filled
         ax = last.ax if math.isnan(ax) else ax
         ay = last.ay if math.isnan(ay) else ay
     leak_y = ay

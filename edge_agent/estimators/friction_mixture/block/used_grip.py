@@ -30,7 +30,7 @@ def used_grip(memory: MixtureMemory, constants: Constants, features: BlockFeatur
     """Return the grip in use [1]: the larger force over load of the two axles, smoothed over time.
     The smoothed forces in `memory` are updated with the block (the samples within 0.05 s).
     """
-    share = 1.0 - math.exp(-features.duration / constants.abrupt_time)
+    share = 1.0 - math.exp(-features.duration / constants.physical.abrupt_time)
     most = 0.0
     for axle in range(2):
         left = 2 * axle

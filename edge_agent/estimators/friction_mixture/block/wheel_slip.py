@@ -40,7 +40,9 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
         # The rear tyres need `abrupt_time` to build up their force at the place of the front axle.
         slip.rear_unlike_until = (
-            memory.last.time + wheelbase / max(features.speed, SLOW_M_S) + constants.abrupt_time
+            memory.last.time
+            + wheelbase / max(features.speed, SLOW_M_S)
+            + constants.physical.abrupt_time
         )
 
 

@@ -28,7 +28,7 @@ def grow_patches(memory: MixtureMemory, design: MixtureDesign, metres: float) ->
     """Increase the probabilities that the car is now on a short ice patch, according to the metres
     driven since the last call.
     """
-    share = 1.0 - math.exp(-metres / design.constants.patch_length)
+    share = 1.0 - math.exp(-metres / design.constants.physical.patch_length)
     for j in range(PATCH_NODES):
         memory.patch[j] += share * (max(design.prior[j] - memory.weight[j], 0.0) - memory.patch[j])
 

@@ -67,18 +67,18 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
     weight = memory.weight
     visit = memory.visit_weight
     constants = design.constants
-    sign = scratch.features.asymmetry > constants.split_asymmetry
+    sign = scratch.features.asymmetry > constants.chosen.split_asymmetry
     if memory.split:
         total = 0.0
         for j in range(NODES, ALL_NODES):
             total += weight[j]
-        if total < SLEEPING_SHARE * constants.split_prior and not sign:
+        if total < SLEEPING_SHARE * constants.physical.split_prior and not sign:
             put_split_to_sleep(memory)
     elif sign:
         memory.split = True
         for j in range(NODES):
-            weight[j] *= 1.0 - constants.split_prior
-            visit[j] *= 1.0 - constants.split_prior
+            weight[j] *= 1.0 - constants.physical.split_prior
+            visit[j] *= 1.0 - constants.physical.split_prior
         for j in range(NODES, ALL_NODES):
             weight[j] = visit[j] = design.sides.prior[j]
             memory.penalty[j] = 0.0
@@ -111,14 +111,14 @@ def apply_road_change(
     count = active_nodes(memory)
     constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
-    hazard = 1.0 - math.exp(-metres * constants.hazard)
+    hazard = 1.0 - math.exp(-metres * constants.physical.hazard)
     ended = max(memory.slip.ended, memory.slip.axle_ended)
     ended *= carried_degree(memory, constants, scratch.features.demand)
-    slid = 1.0 - math.exp(-metres * constants.slip_hazard * ended)
-    hazard = max(hazard, slid, constants.slip_change * memory.slip.begins)
+    slid = 1.0 - math.exp(-metres * constants.physical.slip_hazard * ended)
+    hazard = max(hazard, slid, constants.physical.slip_change * memory.slip.begins)
     # While the model is distrusted, friction returns to its prior.
     hazard = max(hazard, memory.trust.distrust)
-    drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
+    drift = min(metres * constants.physical.diffusion * NODES, LARGEST_DRIFT)
     predicted = scratch.predicted[:count]
     weight = memory.weight[:count]
     visit = memory.visit_weight[:count]
@@ -150,7 +150,7 @@ def carried_degree(memory: MixtureMemory, constants: Constants, demand: float) -
     """
     slippery = min(memory.friction_left.median, memory.friction_right.median)
     share = demand / max(slippery, TINY)
-    return min(max(share / constants.carried_share - 1.0, 0.0), 1.0)
+    return min(max(share / constants.chosen.carried_share - 1.0, 0.0), 1.0)
 
 
 @compiled
@@ -228,7 +228,7 @@ def reset_diverged(
             abs(own[0, j % LANES] - velocity[group, 0, lane]),
             abs(own[1, j % LANES] - velocity[group, 1, lane]),
         )
-        if astray > constants.diverged:
+        if astray > constants.guards.diverged:
             _copy_node(memory, j, best)
             weight[j] = SMALLEST
 

@@ -80,7 +80,9 @@ def update_consistency(
     # deviations into strain.
     cost = mixture_cost(memory.overall_mean, design.nominal)
     trust.strain = belief_strain(
-        cost, degrees_of_freedom(memory.overall_covariance, design.nominal), constants.strain_prior
+        cost,
+        degrees_of_freedom(memory.overall_covariance, design.nominal),
+        constants.chosen.strain_prior,
     )
     trust.hurry = forgetting_rate(
         design.rules, memory.actual[0] / max(memory.theoretical[0], TINY) - 1.0
@@ -95,20 +97,22 @@ def update_consistency(
             memory.factor[1] = 1.0
         return
     keep = math.exp(-duration / FORGIVEN_S)
-    fading = math.exp(-duration / constants.window)
+    fading = math.exp(-duration / constants.chosen.window)
     share = unexplained_share(memory, design)
     trust.ratio = fading * trust.ratio + (1.0 - fading) * share * ratio
     # A slide explains the errors before it too: the front axle reaches ice before a wheel slides.
-    pace = axles_ratio((1.0 - memory.slip.held) * trust.ratio) / constants.window
+    pace = axles_ratio((1.0 - memory.slip.held) * trust.ratio) / constants.chosen.window
     trust.odd = keep * trust.odd + duration * min(max(pace, 0.0), LARGEST_RATIO)
     trust.patience *= keep
     if health & flags.RESET:
-        trust.odd += share * CALLED_BACK * constants.odd_least
-    if trust.odd >= constants.odd_least:
-        trust.patience = min(max(RELAPSE * trust.patience, constants.patience), LONGEST_PATIENCE)
+        trust.odd += share * CALLED_BACK * constants.chosen.odd_least
+    if trust.odd >= constants.chosen.odd_least:
+        trust.patience = min(
+            max(RELAPSE * trust.patience, constants.chosen.patience), LONGEST_PATIENCE
+        )
         trust.left = trust.patience
         trust.distrust = 1.0
-        trust.odd = constants.odd_least
+        trust.odd = constants.chosen.odd_least
 
 
 @compiled
@@ -179,7 +183,7 @@ def nominal_agreement(trust: Trust, constants: Constants) -> float:
     strain (deviation of the states from their prior), decreases linearly with the strain, and is 0
     from the strain `strain_usual` on.
     """
-    return max(1.0 - trust.strain / constants.strain_usual, 0.0)
+    return max(1.0 - trust.strain / constants.chosen.strain_usual, 0.0)
 
 
 @compiled
@@ -187,7 +191,7 @@ def used_evidence_share(trust: Trust, constants: Constants) -> float:
     """Return the share of the evidence on friction that the filter uses. It decreases as evidence
     against the model grows, and is 0 once the consistency test declares a contradiction.
     """
-    return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)
+    return max(1.0 - (trust.odd / constants.chosen.odd_least) ** 2, 0.0)
 
 
 @compiled

@@ -75,8 +75,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     measurements.
     """
     features = scratch.features
-    inflation = max(design.constants.correlation_time / features.duration, 1.0)
-    steady = design.constants.steady_share
+    inflation = max(design.constants.physical.correlation_time / features.duration, 1.0)
+    steady = design.constants.chosen.steady_share
     features.novelty = steady + (1.0 - steady) * features.new
     for kind in range(2):
         put_lanes(scratch.actual_lanes, kind, 0.0)
@@ -157,9 +157,9 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
-        beyond = min(loss + constants.plausible_loss, 0.0)
-        loss = max(loss, -constants.plausible_loss)
-        loss = max(moving * (share * loss + beyond), -constants.largest_loss)
+        beyond = min(loss + constants.guards.plausible_loss, 0.0)
+        loss = max(loss, -constants.guards.plausible_loss)
+        loss = max(moving * (share * loss + beyond), -constants.guards.largest_loss)
         loss -= moving * guard_penalty(memory.grip, constants, design.sides.mu[j])
         charged = charge_penalty(memory, j, moving * price * scratch.moved[j])
         scratch.log_likelihood[j] = 0.0 if blind else loss - charged
@@ -210,7 +210,7 @@ def update_novelty(
     mean velocity in the block (0.05 s).
     """
     constants = design.constants
-    keep = math.exp(-features.duration / constants.window)
+    keep = math.exp(-features.duration / constants.chosen.window)
     force = slip = slides = 0.0
     for r in range(6):
         now = features.force[r] if r < 4 else features.side[r - 4]
@@ -220,7 +220,7 @@ def update_novelty(
         slip = max(slip, advance_usual(memory.usual_slip, axle, now, keep))
         slides = max(slides, saturation(now, memory.friction.median))
     change = max(force, slip)
-    features.new = change**2 / (change**2 + constants.steady_half**2)
+    features.new = change**2 / (change**2 + constants.chosen.steady_half**2)
     slides *= slippery_probability(memory, design)
     held = memory.slip.axle_held * math.exp(-features.duration / UTILISED_WINDOW_S)
     memory.slip.axle_held = max(slides, held)
@@ -274,7 +274,7 @@ def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
     averaged over the latest blocks (of 0.05 s each). Compute from them the factors on the
     measurement noise R for the next block.
     """
-    keep = math.exp(-scratch.features.duration / design.constants.window)
+    keep = math.exp(-scratch.features.duration / design.constants.chosen.window)
     for group in range(2):
         if scratch.theoretical_sum[group] > 0.0:
             memory.actual[group] = (

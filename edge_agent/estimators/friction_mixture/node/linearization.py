@@ -60,7 +60,7 @@ def linearize_nodes(
     find_slips(row, constants, mean, features, node, node.slip)
     find_ratios(design.curve, features, node, node.slip)
     find_shape_force(design.curve, features, node)
-    price = weigh_slopes(design.curve, features, constants.sliding_slope, node)
+    price = weigh_slopes(design.curve, features, constants.chosen.sliding_slope, node)
     correct_forces(row, design.curve, features, node, node.forces)
     find_residuals(features, node.slip, node.forces, node.residual)
     _differentiate_forces(row, design, mean, features, node)

@@ -102,10 +102,10 @@ def update_nodes(
     find_covariances(covariance, node)
     plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
     before = belief_cost(mean, memory.nominal)
-    loss = take_rows(features, mean, covariance, node, design.constants.freedom_penalty)
+    loss = take_rows(features, mean, covariance, node, design.constants.chosen.freedom_penalty)
     keep_within(mean, design.constants, memory.nominal)
     moved = belief_cost(mean, memory.nominal) - before
-    price *= design.constants.freedom_penalty / inflation
+    price *= design.constants.chosen.freedom_penalty / inflation
     return NodeUpdate(-loss - price, moved, plain)
 
 
@@ -169,7 +169,7 @@ def weigh_rows(
         curvature = lanes_at(node.nonlinearity, r)
         variance = lanes_at(node.spread, (r, r)) + curvature
         total = variance + noise
-        excess = residual * residual * (1.0 / constants.huber**2) - variance
+        excess = residual * residual * (1.0 / constants.guards.huber**2) - variance
         factor = inflation if r < 4 else across
         if r in REAR_ROWS:
             factor *= unlike
@@ -278,8 +278,11 @@ def doubted_noise(trust: Trust, constants: Constants) -> float:
     motion estimate.
     """
     if trust.distrust > 0.0:
-        return 1.0 + constants.distrust_noise
-    return 1.0 + DOUBTED * constants.distrust_noise * (trust.odd / constants.odd_least) ** 2
+        return 1.0 + constants.chosen.distrust_noise
+    return (
+        1.0
+        + DOUBTED * constants.chosen.distrust_noise * (trust.odd / constants.chosen.odd_least) ** 2
+    )
 
 
 @compiled
@@ -288,7 +291,7 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
     above 1 while the front axle is already on another surface, because then no single friction
     explains both axles.
     """
-    return constants.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
+    return constants.chosen.rear_unlike if memory.last.time < memory.slip.rear_unlike_until else 1.0
 
 
 @compiled
@@ -382,13 +385,13 @@ def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
     """Limit the vehicle and sensor states in `mean` (n, LANES) to a range around their prior. The
-    range is `constants.farthest` standard deviations on each side.
+    range is `constants.guards.farthest` standard deviations on each side.
 
     The function also subtracts the mean of the four wheels' radius errors from each of them. Only
     the ratios of the radii are observable: a common error scales the speed, and no sensor here
     measures that scale.
     """
-    far = constants.farthest
+    far = constants.guards.farthest
     common = 0.0
     for wheel in range(4):
         common += 0.25 * lanes_at(mean, NodeState.RADIUS + wheel)

@@ -168,8 +168,8 @@ def find_slips(
         ln_ky = mean_ky + features.informs_y[axle] * (lanes_at(x, NodeState.LN_KY) - mean_ky)
         slope_x = row[Parameter.SLOPE_X] * exp_lanes(ln_kx)
         slope_y = row[Parameter.SLOPE_Y] * exp_lanes(ln_ky)
-        put_lanes(slip.scale_x, axle, exp_lanes(-constants.stiffness_power_x * ln_kx))
-        put_lanes(slip.scale_y, axle, exp_lanes(-constants.stiffness_power_y * ln_ky))
+        put_lanes(slip.scale_x, axle, exp_lanes(-constants.chosen.stiffness_power_x * ln_kx))
+        put_lanes(slip.scale_y, axle, exp_lanes(-constants.chosen.stiffness_power_y * ln_ky))
         for wheel in range(2 * axle, 2 * axle + 2):
             cos = features.steer_cos[wheel]
             sin = features.steer_sin[wheel]

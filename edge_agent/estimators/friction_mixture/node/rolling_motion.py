@@ -86,13 +86,13 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         rolling.disagreed_time = time
         return
     middle = total / seen
-    error = constants.wheel_std * abs(middle) + SMALLEST_STD + step
+    error = constants.physical.wheel_std * abs(middle) + SMALLEST_STD + step
     if not most - least <= 2.0 * error:
         rolling.disagreed_time = time
     unsure = memory.trust.distrust > 0.0
     if unsure and seen == 4:
         middle = 0.5 * (total - least - most)
-    if unsure or time - rolling.disagreed_time >= constants.window:
+    if unsure or time - rolling.disagreed_time >= constants.chosen.window:
         pull = features.change / GRAVITY if free < 0 else 0.0
         _compute_velocities(memory, constants, features, (middle, step, pull))
 
@@ -107,13 +107,15 @@ def _update_standstill(
         rolling.resting_ax = features.change
     if not still:
         rolling.moved_time = time
-    keep = math.exp(-features.duration / constants.window)
+    keep = math.exp(-features.duration / constants.chosen.window)
     rolling.resting_ax = keep * rolling.resting_ax + (1.0 - keep) * features.change
-    wait = constants.window
+    wait = constants.chosen.window
     if features.speed >= SLOW_M_S:
-        wait = 2.0 * constants.window if abs(features.change) < SLIDES_M_S2 else LONGEST_SLIDE_S
+        wait = (
+            2.0 * constants.chosen.window if abs(features.change) < SLIDES_M_S2 else LONGEST_SLIDE_S
+        )
     # A larger change of a_x than the usual offset means that the car may start to move.
-    quiet = abs(features.change - rolling.resting_ax) < constants.offset_std
+    quiet = abs(features.change - rolling.resting_ax) < constants.physical.offset_std
     rolling.stands = still and quiet and time - rolling.moved_time >= wait
 
 
@@ -134,17 +136,17 @@ def _compute_velocities(
     row = memory.row
     middle, step, pull = seen
     slip = pull / row[Parameter.SLOPE_X]
-    share = constants.wheel_std + constants.agreeing_slip * abs(slip)
+    share = constants.physical.wheel_std + constants.physical.agreeing_slip * abs(slip)
     rolling.ahead = (1.0 - slip) * middle
     rolling.ahead_std = math.sqrt((share * middle) ** 2 + SMALLEST_STD**2 + step * step)
     side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
-    most = constants.following_most
+    most = constants.chosen.following_most
     if abs(side) < most and abs(features.yaw_rate * middle) < TURNING * most * GRAVITY:
         rolling.left = (
             row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
         )
         needed = abs(side) / row[Parameter.SLOPE_Y]
-        share = constants.steer_std + constants.agreeing_slip * needed
+        share = constants.physical.steer_std + constants.physical.agreeing_slip * needed
         rolling.left_std = share * abs(middle) + SMALLEST_STD
 
 
@@ -171,16 +173,16 @@ def take_rolling(
     cost = 0.0 * lanes_at(mean, 0)
     cos = features.cos
     sin = features.sin
-    look = max(constants.correlation_time / features.duration, 1.0)
+    look = max(constants.physical.correlation_time / features.duration, 1.0)
     if not math.isnan(rolling.ahead):
         ahead = cos * lanes_at(mean, NodeState.VX) + sin * lanes_at(mean, NodeState.VY)
         innovation = rolling.ahead - (ahead + gained_by(features.gain, mean)[0])
-        reading = (rolling.ahead_std**2 * look, constants.huber)
+        reading = (rolling.ahead_std**2 * look, constants.guards.huber)
         cost += _take_velocity(mean, covariance, row, (cos, sin), innovation, reading)
     if not math.isnan(rolling.left):
         left = cos * lanes_at(mean, NodeState.VY) - sin * lanes_at(mean, NodeState.VX)
         innovation = rolling.left - (left + gained_by(features.gain, mean)[1])
-        reading = (rolling.left_std**2 * look, constants.huber)
+        reading = (rolling.left_std**2 * look, constants.guards.huber)
         cost += _take_velocity(mean, covariance, row, (-sin, cos), innovation, reading)
     return cost
 

@@ -65,34 +65,15 @@ ACTIVE = int(NodeState.SLOPE)
 STATES = NodeState.BANK + 1
 
 
-class Constants(NamedTuple):
-    """Constants of the default estimator's filter. A comment above each one gives its unit and
-    reason.
-
-    Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
-    (separable CMA-ES) on drives of two simulators. The search minimised the interval score and the
-    missed and false reports of ice. The values had to meet these conditions:
-
-    - The filter still reports a contradiction of the model if the steering signal is delayed.
-    - Tilted sensors increase the strain (deviation of the states from their prior).
-    - On split roads, the friction interval contains the true friction.
-    - The checks with logs of real cars pass.
-    - On long drives in towns, no less ice is found than before.
-
-    For a study, `Constants(name=value)` replaces one value.
+class PhysicalConstants(NamedTuple):
+    """Properties of cars, tyres, sensors and roads that the filter assumes before it measures. A
+    comment above each one gives its unit and reason.
     """
 
     # --- Time constants of the measurement update ---
-    # [s] length of a block, after which one measurement update is made. Model errors are correlated
-    # over a longer time, so joining samples loses nothing.
-    block_time: float = 0.05
     # [s] time within which tyre and wheel-speed errors are correlated (errata). R of a block is
     # multiplied by this time over the block's length.
     correlation_time: float = 0.28
-    # [s] averaging time of the innovation variances, of a_x at standstill, and of forces and slips
-    # (only a change from their averages is new evidence); time for which the wheels must agree
-    # before the speed is computed from them, and stand before the car counts as standing
-    window: float = 1.0
 
     # --- Road changes ---
     # [1] friction up to which all values are equally likely without measurements; above it, the
@@ -111,38 +92,6 @@ class Constants(NamedTuple):
     # [1] probability of a split road at its first sign (see `split_asymmetry`). With .05 split
     # roads were recognised late.
     split_prior: float = 0.2
-    # [1] sign of a split road: difference between left and right slip that the forces do not
-    # explain, as force over load of a linear tyre
-    split_asymmetry: float = 0.12
-
-    # --- Weight of the evidence on friction ---
-    # [nat] loss of log-likelihood in a block that is plausible at a wrong friction. The part beyond
-    # it counts in full at any force, because the node's velocity must be wrong.
-    plausible_loss: float = 1.7
-    # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
-    # compensate for a spike
-    largest_loss: float = 3.0
-    # [1] change of force over load from its average at which the evidence counts as new by half
-    steady_half: float = 0.03
-    # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
-    # Errors of tyre curve and offsets then repeat from block to block.
-    steady_share: float = 0.15
-    # [1] slope of the tyre curve below which a wheel counts as sliding
-    sliding_slope: float = 0.38
-    # [1] weight of the penalties for what a node leaves open: the slip of sliding wheels, which may
-    # have any value, and ln det S of the axles. Weight 0 favours nodes with a large S, weight 1
-    # nodes with saturated tyres. For the axles with .28 dry road was reported as ice, and with .24
-    # less of the snow was found.
-    freedom_penalty: float = 0.2
-
-    # --- Limits of states and innovations ---
-    # [1] limit of vehicle and sensor states: standard deviations from their prior
-    farthest: float = 3.6
-    # [1] innovation, in standard deviations, beyond which R of a measurement is increased
-    huber: float = 1.95
-    # [m/s] difference of v_x or v_y from the most probable node beyond which a node has diverged.
-    # The accelerometers exclude such a difference.
-    diverged: float = 1.0
 
     # --- Tyre ---
     # [1] shape factor C of the Magic Formula, between 1.3 (lateral) and 1.65 (longitudinal) of
@@ -154,15 +103,6 @@ class Constants(NamedTuple):
     # Vehicle files of real cars are a third off (BMW M8, AV-21), which is within 3.6 standard
     # deviations.
     stiffness_std: float = 0.12
-    # [1] exponent of the stiffness factor by which a wheel's residual is divided. It exceeds 1
-    # because slip is noisier than force.
-    stiffness_power_x: float = 1.4
-    # [1] exponent of the stiffness factor by which an axle's residual is divided. It is small,
-    # because slip and force of an axle are both noisy.
-    stiffness_power_y: float = 0.3
-    # [1] force over load at which a wheel or axle has half of its largest effect on the stiffness
-    # states. At smaller forces slip is mostly noise.
-    informing: float = 0.06
     # [s] time in which vehicle, sensor and road states return to their prior, because the errors
     # they describe change with load, bend and road. With 300 s the stated deviations were half of
     # the actual errors.
@@ -243,7 +183,6 @@ class Constants(NamedTuple):
     # [s] delay of lateral force behind slip (relaxation, roll). The error is this time multiplied
     # by the rate of the force.
     lag: float = 0.015
-
     # [1] relative error of the force that accelerates a wheel's rotation. Torque and wheel speed
     # are sampled at different times, and ABS acts at 8 Hz. Without it, snow was reported as wet
     # road between pulses of the brake.
@@ -255,6 +194,57 @@ class Constants(NamedTuple):
     # [1/m] rate of road changes where a wheel has slid and grips again under load, because ice
     # comes in patches
     slip_hazard: float = 0.06
+
+    # --- Motion according to standing or rolling wheels (`rolling_motion.py`) ---
+    # [1] relative error of slip computed from force over load with the nominal stiffness
+    agreeing_slip: float = 0.6
+
+
+class DesignConstants(NamedTuple):
+    """Choices of the method: times, weights and thresholds of its rules. A comment above each one
+    gives its unit and reason.
+    """
+
+    # --- Time constants of the measurement update ---
+    # [s] length of a block, after which one measurement update is made. Model errors are correlated
+    # over a longer time, so joining samples loses nothing.
+    block_time: float = 0.05
+    # [s] averaging time of the innovation variances, of a_x at standstill, and of forces and slips
+    # (only a change from their averages is new evidence); time for which the wheels must agree
+    # before the speed is computed from them, and stand before the car counts as standing
+    window: float = 1.0
+
+    # --- Road changes ---
+    # [1] sign of a split road: difference between left and right slip that the forces do not
+    # explain, as force over load of a linear tyre
+    split_asymmetry: float = 0.12
+
+    # --- Weight of the evidence on friction ---
+    # [1] change of force over load from its average at which the evidence counts as new by half
+    steady_half: float = 0.03
+    # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
+    # Errors of tyre curve and offsets then repeat from block to block.
+    steady_share: float = 0.15
+    # [1] slope of the tyre curve below which a wheel counts as sliding
+    sliding_slope: float = 0.38
+    # [1] weight of the penalties for what a node leaves open: the slip of sliding wheels, which may
+    # have any value, and ln det S of the axles. Weight 0 favours nodes with a large S, weight 1
+    # nodes with saturated tyres. For the axles with .28 dry road was reported as ice, and with .24
+    # less of the snow was found.
+    freedom_penalty: float = 0.2
+
+    # --- Tyre ---
+    # [1] exponent of the stiffness factor by which a wheel's residual is divided. It exceeds 1
+    # because slip is noisier than force.
+    stiffness_power_x: float = 1.4
+    # [1] exponent of the stiffness factor by which an axle's residual is divided. It is small,
+    # because slip and force of an axle are both noisy.
+    stiffness_power_y: float = 0.3
+    # [1] force over load at which a wheel or axle has half of its largest effect on the stiffness
+    # states. At smaller forces slip is mostly noise.
+    informing: float = 0.06
+
+    # --- Road changes where wheels slide ---
     # [1] tyre force over that of the slippery road from which gripping again shows a road change.
     # With less force (the driver has released the brake) a wheel grips on ice too.
     carried_share: float = 0.4
@@ -262,8 +252,6 @@ class Constants(NamedTuple):
     rear_unlike: float = 10.0
 
     # --- Motion according to standing or rolling wheels (`rolling_motion.py`) ---
-    # [1] relative error of slip computed from force over load with the nominal stiffness
-    agreeing_slip: float = 0.6
     # [1] a_y over g up to which the rear axle is assumed not to slide. Beyond it, a sliding axle
     # cannot be distinguished from one that follows.
     following_most: float = 0.15
@@ -279,12 +267,6 @@ class Constants(NamedTuple):
     # errors say about unknown ones. With 1, a car with late steering was not contradicted, and
     # called ice.
     strain_power: float = 2.0
-    # [1] smallest factor of strain on R of the axles. A search for the best R of the axles found
-    # .24 on level drives. Without it, the snowy side of a split road had too high an upper end.
-    strain_least: float = 0.25
-    # [1] largest factor of strain on R of the axles. Without it, late steering was contradicted
-    # twice as late.
-    strain_most: float = 3.0
 
     # --- Contradiction of the model (`trust.py`) ---
     # [nat] log-likelihood ratio at which the model counts as contradicted. Axle errors of three
@@ -302,3 +284,77 @@ class Constants(NamedTuple):
     # [s] time in which vehicle, sensor and road states return to their prior while the model is
     # distrusted
     distrust_forget: float = 5.0
+
+
+class GuardConstants(NamedTuple):
+    """Limits that keep single errors from spreading. A comment above each one gives its unit and
+    reason.
+    """
+
+    # --- Weight of the evidence on friction ---
+    # [nat] loss of log-likelihood in a block that is plausible at a wrong friction. The part beyond
+    # it counts in full at any force, because the node's velocity must be wrong.
+    plausible_loss: float = 1.7
+    # [nat] most that one block takes from a node or from a kind of drive, so that two later blocks
+    # compensate for a spike
+    largest_loss: float = 3.0
+
+    # --- Limits of states and innovations ---
+    # [1] limit of vehicle and sensor states: standard deviations from their prior
+    farthest: float = 3.6
+    # [1] innovation, in standard deviations, beyond which R of a measurement is increased
+    huber: float = 1.95
+    # [m/s] difference of v_x or v_y from the most probable node beyond which a node has diverged.
+    # The accelerometers exclude such a difference.
+    diverged: float = 1.0
+
+    # --- Strain (`trust.py`) ---
+    # [1] smallest factor of strain on R of the axles. A search for the best R of the axles found
+    # .24 on level drives. Without it, the snowy side of a split road had too high an upper end.
+    strain_least: float = 0.25
+    # [1] largest factor of strain on R of the axles. Without it, late steering was contradicted
+    # twice as late.
+    strain_most: float = 3.0
+
+
+class Constants(NamedTuple):
+    """Constants of the default estimator's filter, in three groups.
+
+    Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
+    (separable CMA-ES) on drives of two simulators. The search minimised the interval score and the
+    missed and false reports of ice. The values had to meet these conditions:
+
+    - The filter still reports a contradiction of the model if the steering signal is delayed.
+    - Tilted sensors increase the strain (deviation of the states from their prior).
+    - On split roads, the friction interval contains the true friction.
+    - The checks with logs of real cars pass.
+    - On long drives in towns, no less ice is found than before.
+
+    For a study, `replace_values` returns them with other values.
+    """
+
+    physical: PhysicalConstants = PhysicalConstants()
+    chosen: DesignConstants = DesignConstants()
+    guards: GuardConstants = GuardConstants()
+
+    def replace_values(self, **values: float) -> Constants:
+        """Return the constants with other `values`, given by name.
+
+        Raises:
+            KeyError: there is no constant of such a name.
+        """
+        if unknown := set(values) - set(self.by_name()):
+            raise KeyError(f"unknown constants {', '.join(sorted(unknown))}")
+
+        def pick(fields: tuple[str, ...]) -> dict[str, float]:
+            return {name: value for name, value in values.items() if name in fields}
+
+        return Constants(
+            self.physical._replace(**pick(self.physical._fields)),
+            self.chosen._replace(**pick(self.chosen._fields)),
+            self.guards._replace(**pick(self.guards._fields)),
+        )
+
+    def by_name(self) -> dict[str, float]:
+        """Return the values of all constants by name."""
+        return {name: value for group in self for name, value in group._asdict().items()}

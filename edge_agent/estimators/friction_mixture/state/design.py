@@ -66,31 +66,31 @@ def nominal_states(constants: Constants) -> Nominal:
     mean = np.zeros(STATES)
     std = np.ones(STATES)
     time = np.full(STATES, np.inf)
-    c = constants
+    p = constants.physical
     x = NodeState
     for state, spread in (
-        (x.LN_KX, c.stiffness_std),
-        (x.LN_KY, c.stiffness_std),
-        (x.LEAK_Y, c.leak),
-        (x.STEER, c.steer_std),
-        (x.SHAPE, c.shape_std),
-        (x.GAIN, c.force_share),
-        (x.BIAS_X, c.offset_std),
-        (x.BIAS_Y, c.offset_std),
-        *((x.RADIUS + wheel, c.wheel_std) for wheel in range(4)),
-        (x.LAG_WHEEL, c.lag_std),
-        (x.LAG_STEER, c.lag_std),
-        (x.COMPLIANCE, c.compliance_std),
-        (x.STEER_GAIN, c.steer_gain_std),
-        (x.SLOPE, c.offset_std),
-        (x.BANK, c.offset_std),
+        (x.LN_KX, p.stiffness_std),
+        (x.LN_KY, p.stiffness_std),
+        (x.LEAK_Y, p.leak),
+        (x.STEER, p.steer_std),
+        (x.SHAPE, p.shape_std),
+        (x.GAIN, p.force_share),
+        (x.BIAS_X, p.offset_std),
+        (x.BIAS_Y, p.offset_std),
+        *((x.RADIUS + wheel, p.wheel_std) for wheel in range(4)),
+        (x.LAG_WHEEL, p.lag_std),
+        (x.LAG_STEER, p.lag_std),
+        (x.COMPLIANCE, p.compliance_std),
+        (x.STEER_GAIN, p.steer_gain_std),
+        (x.SLOPE, p.offset_std),
+        (x.BANK, p.offset_std),
     ):
         std[state] = spread
-        time[state] = c.return_time
-    time[x.COMPLIANCE] = c.steer_time
-    time[x.STEER_GAIN] = c.steer_time
-    mean[x.LEAK_Y] = c.leak
-    mean[x.COMPLIANCE] = c.compliance_mean
+        time[state] = p.return_time
+    time[x.COMPLIANCE] = p.steer_time
+    time[x.STEER_GAIN] = p.steer_time
+    mean[x.LEAK_Y] = p.leak
+    mean[x.COMPLIANCE] = p.compliance_mean
     return Nominal(mean, std, time)
 
 
@@ -106,18 +106,18 @@ def design_of(
     """
     constants = constants or Constants()
     mu, width = node_table(NODES)
-    prior = friction_prior(mu, width, constants.common_mu)
+    prior = friction_prior(mu, width, constants.physical.common_mu)
     return MixtureDesign(
         constants=constants,
         mu=mu,
         width=width,
         prior=prior,
-        sides=side_table(mu, prior, constants.split_prior),
-        curve=curve_tables(curve or partial(magic_formulas, c=constants.curve_c, e=0.0)),
+        sides=side_table(mu, prior, constants.physical.split_prior),
+        curve=curve_tables(curve or partial(magic_formulas, c=constants.physical.curve_c, e=0.0)),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),
-        rules=rule_base(memberships) if adaptive else plain_rules(constants.steady_share),
+        rules=rule_base(memberships) if adaptive else plain_rules(constants.chosen.steady_share),
         scales=np.exp(np.array(memberships.ln_scales)),
         adaptive=adaptive,
     )

@@ -90,7 +90,9 @@ def bridge_gap(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     last = memory.last
     now = memory.last.now
     prior = design.prior
-    hazard = 1.0 - math.exp(-abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.hazard)
+    hazard = 1.0 - math.exp(
+        -abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.physical.hazard
+    )
     put_split_to_sleep(memory)
     for j in range(NODES):
         memory.weight[j] += hazard * (prior[j] - memory.weight[j])
