@@ -19,7 +19,10 @@ from typing import Final
 
 from edge_agent import known_estimators
 
-SERVICE: Final = "from fleet_service.app.precompile import warm_up; warm_up()"
+SERVICE: Final = (
+    "from fleet_service.app.precompile import warm_up; warm_up(); "
+    "from fleet_service.app.native_library import use_service_library; use_service_library()"
+)
 LIBRARY: Final = "from edge_agent.app.native_library import use_agent_library; use_agent_library()"
 AGENT: Final = "import sys; from edge_agent.cli import main; sys.exit(main())"
 DRIVE: Final = (

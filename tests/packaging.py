@@ -34,9 +34,9 @@ for package in (schemas, edge_agent, fleet_service, deploy):
 # The wheel's native kernels must give the same estimates as kernels that Numba compiles here.
 NATIVE = """
 import sys
-from edge_agent.app.native_library import use_agent_library
-from edge_agent.app.shipped_library import SHIPPED, find_shipped_library, read_processor_features
-if find_shipped_library(SHIPPED, read_processor_features()) is None:
+from edge_agent.app.native_library import LIBRARY, use_agent_library
+from schemas.runtime.shipped_library import find_shipped_library, read_processor_features
+if find_shipped_library("edge_agent", LIBRARY.shipped, read_processor_features()) is None:
     sys.exit(print("the wheel has no kernels for this processor"))
 assert use_agent_library()
 import numpy as np, pyarrow.parquet
@@ -45,6 +45,18 @@ made = estimate(read_log("drive.parquet"), load_vehicle("car.json"))
 by_numba = pyarrow.parquet.read_table("estimates.parquet")
 for name in ("mu", "mu_lower", "mu_upper"):
     np.testing.assert_allclose(made[name].to_numpy(), by_numba[name].to_numpy(), rtol=1e-5)
+assert "numba" not in sys.modules
+"""
+# A service of the wheel needs neither Numba nor a linker, unless the processor has other features.
+NATIVE_SERVICE = """
+import sys
+from fleet_service.app.native_library import LIBRARY, use_service_library
+from schemas.runtime.shipped_library import find_shipped_library, read_processor_features
+if find_shipped_library("fleet_service", LIBRARY.shipped, read_processor_features()) is None:
+    sys.exit(print("the wheel has no kernels for this processor"))
+assert use_service_library()
+from fleet_service.app.precompile import exercise_map
+exercise_map()
 assert "numba" not in sys.modules
 """
 # A foreign folder of this name hides the installed package. The import of each module listed here
@@ -145,6 +157,7 @@ def install_and_use(python: str, wheel: Path, folder: Path) -> None:
         folder,
     )
     run_command([scripts / "python", "-c", NATIVE], folder)
+    run_command([scripts / "python", "-c", NATIVE_SERVICE], folder)
     run_command([scripts / "fleet-service", "--help"], folder)
     for name, imports in HIDING.items():
         own = folder / f"own-{name}" / name

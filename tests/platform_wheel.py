@@ -1,4 +1,5 @@
-"""Build sdist and wheel, and on x86-64 also a wheel with the agent's compiled kernels.
+"""Build sdist and wheel, and on x86-64 also a wheel with the compiled kernels of agent and
+service.
 
 The wheels are built from the sdist, so that a file missing in the sdist is noticed. An installer
 chooses the wheel with kernels where it fits; the other one is for all other machines.
@@ -15,7 +16,8 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-from edge_agent.app.shipped_library import BUILD
+from edge_agent.app.native_library import LIBRARY as AGENT
+from fleet_service.app.native_library import LIBRARY as SERVICE
 from tests.structure import ROOT
 
 
@@ -35,7 +37,9 @@ def build_packages(out: Path) -> Path:
             packed.extractall(folder, filter="data")
         (source,) = Path(folder).iterdir()
         own = os.environ | {"PYTHONPATH": str(source)}
-        subprocess.run([sys.executable, "-m", BUILD], cwd=source, env=own, check=True)
+        for library in (AGENT, SERVICE):
+            build_kernels = [sys.executable, "-m", library.builder]
+            subprocess.run(build_kernels, cwd=source, env=own, check=True)
         tag = platform_tag(b"".join(path.read_bytes() for path in source.rglob("*.so")))
         option = f"--config-setting=--build-option=--plat-name={tag}"
         subprocess.run([*build, "--wheel", option, str(source)], cwd=source, check=True)

@@ -9,57 +9,24 @@ in its memory.
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import sys
 from pathlib import Path
+from typing import Final
 
-from edge_agent.app.shipped_library import (
-    BUILD,
-    SHIPPED,
-    build_shipped_libraries,
-    find_shipped_library,
-    read_processor_features,
-)
-from schemas.runtime import progress_messages
-from schemas.runtime.jit import native_library_path, use_native_kernels
-from schemas.runtime.native_kernels import LINKER, Library
+from schemas.runtime.jit import use_native_kernels
+from schemas.runtime.kernel_library import KernelLibrary
 from schemas.runtime.process import end_with_parent
+
+LIBRARY: Final = KernelLibrary(
+    "edge_agent", "edge_agent.app.native_library", Path(__file__).parents[1] / "kernels"
+)
 
 
 def use_agent_library() -> bool:
-    """Take the kernels (compiled functions) of this process from the agent's shared library. It is
-    the library of the package if one suits this machine, else a library that was built on this
-    machine, now or at an earlier start. Call this before other imports.
-
-    Return True if the library is used. Return False if there is no linker or no folder for the
-    library; Numba then compiles the kernels.
+    """Take the kernels (compiled functions) of this process from the agent's shared library. Call
+    this before other imports. Return False if there is none, see `KernelLibrary.use`.
     """
-    shipped = find_shipped_library(SHIPPED, read_processor_features())
-    if shipped is not None and _load_library(shipped):
-        return True
-    path = native_library_path("edge_agent")
-    if path is None or not (path.exists() or shutil.which(LINKER)):
-        return False
-    if not path.exists():
-        progress_messages.report_once(progress_messages.COMPILING)
-        progress_messages.set_status("compiling the agent's kernels")
-        build = [sys.executable, "-m", BUILD, str(path)]
-        if subprocess.run(build, capture_output=True, check=False).returncode:
-            return False
-    return _load_library(path)
-
-
-def _load_library(path: Path) -> bool:
-    """Take the kernels (compiled functions) of this process from the library at `path`, and return
-    True. If the operating system refuses to load the library, report the reason and return False.
-    """
-    try:
-        use_native_kernels(Library(path))
-    except OSError as error:
-        progress_messages.report(f"kernels in {path}: not used, because of an error: {error}")
-        return False
-    return True
+    return LIBRARY.use()
 
 
 def build_agent_library(path: Path) -> None:
@@ -98,4 +65,4 @@ if __name__ == "__main__":
     if sys.argv[1:]:
         build_agent_library(Path(sys.argv[1]))
     else:
-        build_shipped_libraries()
+        LIBRARY.build_shipped()

@@ -23,7 +23,7 @@ from fleet_service.ingest.paths import VehiclePaths
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from schemas import mugrid, wire
-from schemas.runtime.jit import kernel_cache
+from schemas.runtime.jit import kernel_cache, uses_native_kernels
 
 CELLS: Final = 1 << 14  # more cells than a new map has space for, so that its growth is exercised
 COMPILE: Final = "from fleet_service.app.precompile import exercise_map; exercise_map()"
@@ -31,11 +31,14 @@ DONE: Final = "fleet_service.compiled"  # marker file in the cache: all function
 
 
 def warm_up() -> None:
-    """Load all compiled functions before they are needed.
+    """Load all compiled functions before they are needed. A process that takes them from a shared
+    library (`native_library`) needs no more than that library.
 
     If they were never compiled, a separate process compiles them first. The compiler leaves a
     hundred megabytes of fragmented memory, which the service would otherwise keep for hours.
     """
+    if uses_native_kernels():
+        return
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
         beside = subprocess.run(
@@ -50,11 +53,11 @@ def warm_up() -> None:
 
 def exercise_map() -> None:
     """Call every compiled function once, with a small temporary map: update it with reports, let it
-    grow, advance in time, update it with late reports, and read beliefs (probability of each
-    friction value).
+    grow, advance in time, update it with late reports (before and after their time is final), and
+    read beliefs (probability of each friction value).
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
-    for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
+    for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2), (1, 2)):
         o = _make_visits(epoch * EPOCH_NS, cells)
         Alerts(fusion).update(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)

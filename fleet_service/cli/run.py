@@ -58,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run a fleet service; return its exit code."""
     with progress_messages.show_status("loading"):
+        from fleet_service.app.native_library import use_service_library
+
+        use_service_library()
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service
         from schemas.config import ServiceConfig, load

@@ -18,9 +18,9 @@ from fleet_service.fusion.store.records import NONE, Rows, Side
 from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Weather
-from schemas import grid
+from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 from schemas.thresholds import NS
 
 # Contribution of each bin of a stored belief to P(slippery) of the road, and to the sum of its
@@ -91,9 +91,10 @@ class BeliefMap:
         """Return P(slippery) for each slot (cell and heading sector), (k,), at its last
         observation, from reports of this cell alone (without neighbours).
         """
-        return _slippery_probability(
-            self.store.state.live, SLIPPERY_WEIGHTS[shape_class(self._shape.reader)], slots
-        )
+        out = np.empty(len(slots))
+        weights = SLIPPERY_WEIGHTS[shape_class(self._shape.reader)]
+        _write_slippery(self.store.state.live, weights, slots, np.empty(mugrid.BINS), out)
+        return out
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
         """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
@@ -161,10 +162,13 @@ class BeliefMap:
         return who, np.where(counted, when, 0)
 
 
-@compiled
-def _slippery_probability(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
-    p = np.empty(live.belief.shape[1])
-    out = np.empty(len(slots))
+@refcount_free
+def _write_slippery(
+    live: Rows, weights: FloatArray, slots: IntArray, p: FloatArray, out: FloatArray
+) -> None:
+    """Write P(slippery) of each slot (cell and heading sector) to `out` (k,). `p` (32,) is memory
+    for the belief of one slot.
+    """
     for k in range(len(slots)):
         unpack_belief(live.belief, slots[k], p)
         weight = weights[kernel_of(live.cells, slots[k])]
@@ -174,4 +178,3 @@ def _slippery_probability(live: Rows, weights: FloatArray, slots: IntArray) -> F
             slippery += weight[0, i] * p[i]
             whole += weight[1, i] * p[i]
         out[k] = slippery / whole
-    return out

@@ -18,17 +18,17 @@ order of arrival between two checkpoints does not matter.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import PADDED, PRIOR, forget, largest_bin
+from fleet_service.fusion.belief import PADDED, PRIOR, Bins, forget, largest_bin
 from fleet_service.fusion.observations import Observations
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import ByteArray, IntArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 from schemas.thresholds import NS, US_STEP
 
 # [ns] A late visit is fused only if it is at most this much older than the checkpoint. After this
@@ -66,7 +66,6 @@ def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> 
     return replace(o, time=o.time + late_by, evidence=evidence)
 
 
-@compiled
 def aged_evidence(
     evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather
 ) -> ByteArray:
@@ -75,8 +74,27 @@ def aged_evidence(
     nat. `key` (n,) is the cell and sector of each observation.
     """
     out = np.empty_like(evidence)
-    likelihood = np.empty(mugrid.BINS, np.float32)
-    padded = np.empty(PADDED, np.float32)
+    scratch = np.empty((2, PADDED), np.float32)
+    _age_evidence(evidence, Times(key, begin, end), weather, scratch, out)
+    return out
+
+
+class Times(NamedTuple):
+    """Cell and sector of each of n observations, time of the observation [ns], and time to which
+    its likelihood is aged [ns], each (n,).
+    """
+
+    key: IntArray
+    begin: IntArray
+    end: IntArray
+
+
+@refcount_free
+def _age_evidence(
+    evidence: ByteArray, times: Times, weather: Weather, scratch: Bins, out: ByteArray
+) -> None:
+    likelihood = scratch[0, : mugrid.BINS]
+    padded = scratch[1]
     for n in range(len(evidence)):
         whole = np.float32(0.0)
         for i in range(mugrid.BINS):
@@ -84,10 +102,9 @@ def aged_evidence(
             whole += likelihood[i]
         for i in range(mugrid.BINS):
             likelihood[i] /= whole
-        drift, change, _ = road_time(weather, key[n], begin[n], end[n])
+        drift, change, _ = road_time(weather, times.key[n], times.begin[n], times.end[n])
         forget(likelihood, drift, change, PRIOR, padded)
         most = largest_bin(likelihood)
         for i in range(mugrid.BINS):
             steps = mugrid.STEPS_PER_NAT * np.log(most / max(likelihood[i], np.float32(1e-30)))
             out[n, i] = np.uint8(min(steps + 0.5, float(_FLOOR)))
-    return out

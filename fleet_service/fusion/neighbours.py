@@ -61,7 +61,7 @@ from fleet_service.fusion.votes import ScratchRow
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import Float32Array, FloatArray, IntArray
-from schemas.runtime.jit import compiled, refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
@@ -163,7 +163,6 @@ class Buffers(NamedTuple):
     road: FloatArray
 
 
-@compiled
 def road_beliefs(
     live: Rows,
     table: IntArray,
@@ -184,17 +183,31 @@ def road_beliefs(
         np.empty(_BINS),
         np.empty(_BINS),
     )
+    _read_beliefs(parts, slots, now, buffers, out)
+    return out
+
+
+@refcount_free
+def _read_beliefs(
+    parts: MapParts, slots: IntArray, now: IntArray, buffers: Buffers, out: FloatArray
+) -> None:
+    """Write the belief about the road for each slot (cell and heading sector) at the times `now`
+    (k,) [ns] to `out` (k, 32).
+    """
+    live = parts.live
+    weather = parts.weather
+    rule = parts.rule
     for k in range(len(slots)):
         prior = _age_belief(live, weather, slots[k], now[k], buffers.scratch)
-        buffers.product[:] = buffers.scratch[ScratchRow.BELIEF, :_BINS]
-        buffers.quiet[:] = buffers.product
+        for i in range(_BINS):
+            buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
+            buffers.quiet[i] = buffers.product[i]
         read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
         slippery = _slippery_probability(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
         unknown = _slippery_probability(weather.prior[prior])
         _multiply_messages(parts, Asked(slots[k], now[k], prior, unknown), buffers, out[k])
-    return out
 
 
 @refcount_free_inlined
@@ -281,7 +294,6 @@ def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
     return next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)
 
 
-@compiled
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     """Return each slot (cell and heading sector), and the other slots that may belong to the same
     slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS + ACROSS). First comes the slot
@@ -291,6 +303,12 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
     out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS + ACROSS), NONE)
+    _find_stretches(live, table, slots, out)
+    return out
+
+
+@refcount_free
+def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray) -> None:
     for k in range(len(slots)):
         out[k, 0] = slots[k]
         key = live.cells[slots[k]].key
@@ -314,7 +332,6 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
                 continue
             if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
                 out[k, 1 + 2 * c.NEIGHBOURS + step] = row
-    return out
 
 
 @refcount_free_inlined

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 
 # Below this argument, ln Φ is computed from its series, whose relative error is below 10⁻⁶ there.
 # Further below, Φ itself is too small for a floating-point number.
@@ -22,7 +22,9 @@ def normal_cdf(x: FloatArray) -> FloatArray:
     """Return the distribution function Φ(x) of the standard normal distribution, in the shape of
     `x`.
     """
-    return _normal_cdf(np.ravel(x)).reshape(x.shape)
+    out = np.empty(x.shape)
+    _write_cdf(np.ravel(x), out.reshape(-1))
+    return out
 
 
 def log_distribution(x: FloatArray) -> FloatArray:
@@ -30,20 +32,19 @@ def log_distribution(x: FloatArray) -> FloatArray:
 
     Below _FAR the function uses the asymptotic series -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴).
     """
-    return _log_distribution(np.ravel(x)).reshape(x.shape)
-
-
-@compiled
-def _normal_cdf(x: FloatArray) -> FloatArray:
-    out = np.empty(len(x))
-    for i in range(len(x)):
-        out[i] = 0.5 * math.erfc(-x[i] * math.sqrt(0.5))
+    out = np.empty(x.shape)
+    _write_log_distribution(np.ravel(x), out.reshape(-1))
     return out
 
 
-@compiled
-def _log_distribution(x: FloatArray) -> FloatArray:
-    out = np.empty(len(x))
+@refcount_free
+def _write_cdf(x: FloatArray, out: FloatArray) -> None:
+    for i in range(len(x)):
+        out[i] = 0.5 * math.erfc(-x[i] * math.sqrt(0.5))
+
+
+@refcount_free
+def _write_log_distribution(x: FloatArray, out: FloatArray) -> None:
     for i in range(len(x)):
         if x[i] > _FAR:
             out[i] = math.log(0.5 * math.erfc(-x[i] * math.sqrt(0.5)))
@@ -51,4 +52,3 @@ def _log_distribution(x: FloatArray) -> FloatArray:
             square = x[i] * x[i]
             series = -1.0 / square + 3.0 / (square * square)
             out[i] = -0.5 * square - math.log(-x[i] * math.sqrt(2.0 * math.pi)) + math.log1p(series)
-    return out

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from schemas import mugrid
-from schemas.numeric import ByteArray, Float32Array
-from schemas.runtime.jit import compiled
+from schemas.numeric import ByteArray, Float32Array, FloatArray
+from schemas.runtime.jit import refcount_free
 
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
@@ -44,13 +44,16 @@ def as_reported(steps: NDArray[Any]) -> Evidence:
     """
     out = steps.astype(np.uint8)
     reported = np.full((len(steps), 3), np.nan, np.float32)
-    _describe_rows(out, reported)
+    _describe_rows(out, reported, np.empty(mugrid.BINS))
     return Evidence(out, reported)
 
 
-@compiled
-def _describe_rows(steps: ByteArray, reported: Float32Array) -> None:
-    likelihood = np.empty(mugrid.BINS)
+@refcount_free
+def _describe_rows(steps: ByteArray, reported: Float32Array, likelihood: FloatArray) -> None:
+    """Subtract its least value from each row of `steps` (n, 32), and write the mean, standard
+    deviation and P(slippery) of values to `reported` (n, 3). `likelihood` (32,) is memory for one
+    row.
+    """
     for n in range(len(steps)):
         least = np.uint8(255)
         for j in range(mugrid.BINS):

@@ -129,10 +129,14 @@ UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_PRIOR)
 
 
 def shared_kernel(
-    used: float, kinds: float, stated: float, slope: float = UNKNOWN_SHAPE.reader
+    used: float | FloatArray,
+    kinds: float | FloatArray,
+    stated: float | FloatArray,
+    slope: float = UNKNOWN_SHAPE.reader,
 ) -> FloatArray:
-    """Return the kernel K, (32, 32), which maps a belief about the friction that the fleet measures
-    to a belief about the friction of the road.
+    """Return the kernel K, (..., 32, 32), which maps a belief about the friction that the fleet
+    measures to a belief about the friction of the road. The first three arguments are numbers or
+    arrays of the same shape (...).
 
     Args:
         used: mean grip used by the vehicles that measured friction in the cell.
@@ -144,9 +148,10 @@ def shared_kernel(
     """
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
-    always += stated**2 * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
-    shape = np.clip(slope * (c.SHARED_SHARE - used / centres), 0.0, c.SHARED_MOST)
-    relative = np.sqrt(always) * centres
+    always += np.square(stated) * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
+    unused = c.SHARED_SHARE - np.asarray(used)[..., None] / centres
+    shape = np.clip(slope * unused, 0.0, c.SHARED_MOST)
+    relative = np.sqrt(np.asarray(always))[..., None] * centres
     low = np.hypot(np.hypot(relative, c.COMMON_ABSOLUTE), shape * centres)
     return _two_sided(low, np.hypot(relative, c.COMMON_HIGH))
 
@@ -161,14 +166,15 @@ def base_kernel() -> FloatArray:
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the kernel K, (32, 32): row i is the distribution of the vehicles' reading on a road
-    of friction bin i. Its standard deviation is `below` (32,) [μ] for readings that are too low,
-    and `above` (32,) [μ] for readings that are too high. K maps measured friction to that of the
-    road.
+    """Return the kernel K, (..., 32, 32): row i is the distribution of the vehicles' reading on a
+    road of friction bin i. Its standard deviation is `below` (..., 32) [μ] for readings that are
+    too low, and `above` (..., 32) [μ] for readings that are too high. K maps measured friction to
+    that of the road.
     """
     away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
-    kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
-    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+    std = np.where(away < 0.0, below[..., None], above[..., None])
+    kernel = np.exp(-0.5 * np.square(away / std))
+    return np.asarray(kernel / kernel.sum(axis=-1, keepdims=True))
 
 
 def _kernel_table(slope: float) -> Float32Array:
@@ -180,13 +186,10 @@ def _kernel_table(slope: float) -> Float32Array:
     gives the index. Each kernel is transposed, so that the 32 bins of one belief are contiguous in
     memory.
     """
-    rows = [
-        shared_kernel((row + 0.5) * USED_STEP, kinds, stated, slope).T
-        for row in range(USED_ROWS)
-        for kinds in KINDS
-        for stated in STATED
-    ]
-    return np.stack([base_kernel().T, *rows]).astype(np.float32)
+    used = (np.arange(USED_ROWS) + 0.5) * USED_STEP
+    axes = [axis.ravel() for axis in np.meshgrid(used, KINDS, STATED, indexing="ij")]
+    kernels = np.concatenate([base_kernel()[None], shared_kernel(axes[0], axes[1], axes[2], slope)])
+    return np.ascontiguousarray(kernels.swapaxes(1, 2), np.float32)
 
 
 # One table of kernels per slope in SHAPES. Compiled functions get a table as an argument, because a

@@ -47,7 +47,7 @@ from fleet_service.fusion.store.records import NONE, USED
 from fleet_service.fusion.vote_weights import VoteWeights
 from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array
-from schemas.runtime.jit import compiled, refcount_free
+from schemas.runtime.jit import refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, SLIPPERY_MU
 
@@ -255,7 +255,8 @@ def compute_vote_weights(
     invent a name: no vehicle is a newcomer, and each starts with full weight (`initial_trust`).
     """
     weight = np.empty(len(before.weight), np.float32)
-    established = _update_weights(peers, before.weight, weight, enrolled)
+    known = np.empty(len(weight), np.bool_)
+    established = _update_weights(peers, before.weight, enrolled, known, weight) == 1
     return VoteWeights(
         epoch,
         weight,
@@ -264,15 +265,16 @@ def compute_vote_weights(
     )
 
 
-@compiled
+@refcount_free
 def _update_weights(
-    peers: RecordArray, before: Float32Array, out: Float32Array, enrolled: bool
-) -> bool:
+    peers: RecordArray, before: Float32Array, enrolled: bool, known: BoolArray, out: Float32Array
+) -> int:
     """Fill `out` (V,) with the new weights (trust) of the vehicles, computed from the previous
-    weights `before`. Return True if newcomers got less weight: the service knows and trusts enough
-    vehicles, and accepts vehicles that are not on the operator's list.
+    weights `before`, and `known` (V,) with a mask of the vehicles compared with enough others.
+
+    Return 1 if newcomers got less weight: the service knows and trusts enough vehicles, and accepts
+    vehicles that are not on the operator's list. Otherwise return 0.
     """
-    known = np.empty(len(out), np.bool_)
     trusted = 0
     prior = _ENROLLED_AGREEMENT if enrolled else _AGREEMENT
     for v in range(len(out)):
@@ -292,11 +294,11 @@ def _update_weights(
             trusted += trust >= c.SOURCE_TRUST
         out[v] = _known_weight(mean) if known[v] or enrolled else trust
     if enrolled or trusted < c.ESTABLISHED_VEHICLES:
-        return False
+        return 0
     for v in range(len(out)):
         if not known[v]:
             out[v] = min(float(out[v]), c.NEWCOMER)
-    return True
+    return 1
 
 
 def heeded_flags(peers: RecordArray) -> BoolArray:
@@ -344,7 +346,7 @@ def initial_trust(*, established: bool = False, enrolled: bool = False) -> float
     return min(weight, c.NEWCOMER) if established else weight
 
 
-@compiled
+@refcount_free
 def _known_weight(agreement: float) -> float:
     """Return the vote weight r of a known or enrolled vehicle from its share of agreement g. It is
     above 1 if the vehicle disagreed with others in less than the share CONTAMINATION.
@@ -353,6 +355,6 @@ def _known_weight(agreement: float) -> float:
     return _scale_trust(agreement) * max(right, 1.0)
 
 
-@compiled
+@refcount_free
 def _scale_trust(mean: float) -> float:
     return min(max((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0), 1.0)

@@ -55,6 +55,10 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
     end = middle + NEIGHBOURS
     around = found[:, 1:middle].any(axis=1) & found[:, middle:end].any(axis=1)
     who, when = _newest_first(who.reshape(-1, places * SOURCES), when.reshape(-1, places * SOURCES))
+    # Compare only as many vehicles as the stretch with the most has; callers read two.
+    most = max(int((when > 0).sum(axis=1).max(initial=0)), 2)
+    who = who[:, :most]
+    when = when[:, :most]
     again = np.tril(who[:, :, None] == who[:, None, :], -1).any(axis=2)
     return StretchSources(*_newest_first(who, np.where(again, 0, when)), around)
 

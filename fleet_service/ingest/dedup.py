@@ -246,6 +246,11 @@ class SequenceTrackers:
         # Only few rows are above the watermark, because senders store little.
         above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])
         above = above[np.lexsort((seq[above], group[above]))]
-        starts = np.flatnonzero(np.diff(group[above], prepend=-1))
-        for start, stop in pairwise([*starts.tolist(), len(above)]):
-            streams[group[above[start]]].add(np.unique(seq[above[start:stop]]).tolist())
+        of = group[above]
+        numbers = seq[above]
+        is_new = (np.diff(of, prepend=-1) != 0) | (np.diff(numbers, prepend=0) != 0)
+        of = of[is_new]
+        numbers = numbers[is_new]
+        starts = np.flatnonzero(np.diff(of, prepend=-1))
+        for start, stop in pairwise([*starts.tolist(), len(of)]):
+            streams[of[start]].add(numbers[start:stop].tolist())

@@ -4,25 +4,44 @@ restart processes tens of millions of rows. Compiled, pure (no I/O).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import IntArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 
 Int32Array = NDArray[np.int32]
 
 
-@compiled
 def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
     """Group n rows by three numbers a, b, c (n,) each. Return the number of the group of each row,
     (n,), and the index of the first row of each group, (k,). A group is the set of rows with the
     same (a, b, c); groups are numbered in order of first appearance.
     """
-    places = 2 * len(a) + 1
-    table = np.full(places, -1, np.int32)
+    table = np.full(2 * len(a) + 1, -1, np.int32)
     group = np.empty(len(a), np.int32)
     first = np.empty(len(a), np.int64)
+    groups = _group_rows(Keys(a, b, c), table, group, first)
+    return group, first[:groups].copy()
+
+
+class Keys(NamedTuple):
+    """The three numbers (n,) by which n rows are grouped."""
+
+    a: IntArray
+    b: IntArray
+    c: IntArray
+
+
+@refcount_free
+def _group_rows(keys: Keys, table: Int32Array, group: Int32Array, first: IntArray) -> int:
+    """Write the group of each row to `group` (n,), and the first row of each group to `first`.
+    `table` is an empty hash table of group numbers. Return the number of groups.
+    """
+    a, b, c = keys
+    places = len(table)
     k = 0
     for i in range(len(a)):
         mixed = (np.uint64(a[i]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
@@ -40,16 +59,20 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
             first[k] = i
             k += 1
         group[i] = table[place]
-    return group, first[:k].copy()
+    return k
 
 
-@compiled
 def largest_of(values: IntArray, group: Int32Array, groups: int) -> IntArray:
     """Return the largest of the `values` (n,) in each group of rows, (groups,); every group must
     have a value.
     """
     out = np.full(groups, np.iinfo(np.int64).min, np.int64)
+    _raise_to_largest(values, group, out)
+    return out
+
+
+@refcount_free
+def _raise_to_largest(values: IntArray, group: Int32Array, out: IntArray) -> None:
     for i in range(len(values)):
         if values[i] > out[group[i]]:
             out[group[i]] = values[i]
-    return out

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 # [m/s] Faster than any road vehicle, even with the error of its clock.
@@ -71,12 +71,10 @@ class VehiclePaths:
         while len(self._rows) > len(self._count):
             self._grow()
         place = np.column_stack([latitude, longitude]).astype(np.float64)
-        return _find_implausible(
-            row[inverse],
-            np.asarray(time, np.int64),
-            place,
-            (self._time, self._place, self._is_gap, self._count, self._leap),
-        )
+        out = np.zeros(len(place), np.bool_)
+        paths = (self._time, self._place, self._is_gap, self._count, self._leap)
+        _find_implausible(row[inverse], np.asarray(time, np.int64), place, paths, out)
+        return out
 
     def _grow(self) -> None:
         time = self._time
@@ -96,16 +94,17 @@ class VehiclePaths:
 Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 
-@compiled
-def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: Paths) -> BoolArray:
+@refcount_free
+def _find_implausible(
+    row: IntArray, time: IntArray, place: FloatArray, paths: Paths, out: BoolArray
+) -> None:
     """Find the rows that are implausible for their vehicle's path, and add the plausible rows to
     the paths. This is the compiled part of `VehiclePaths.find_implausible`.
 
     `row` (n,) is the number of the vehicle's path, `time` (n,) in ns, `place` (n, 2) in degrees.
-    Return a mask (n,) that is True for implausible rows.
+    The mask `out` (n,), False at first, becomes True for implausible rows.
     """
     anchors, places, is_gap, count, leap = paths
-    out = np.zeros(len(row), np.bool_)
     for n in range(len(row)):
         v = row[n]
         t = time[n]
@@ -141,23 +140,24 @@ def _find_implausible(row: IntArray, time: IntArray, place: FloatArray, paths: P
             is_gap[v, dropped - 1] = True
             for k in range(dropped, ANCHORS - 1):
                 anchors[v, k] = anchors[v, k + 1]
-                places[v, k] = places[v, k + 1]
+                places[v, k, 0] = places[v, k + 1, 0]
+                places[v, k, 1] = places[v, k + 1, 1]
                 is_gap[v, k] = is_gap[v, k + 1]
             held -= 1
             after -= after > dropped
         for k in range(held, after, -1):
             anchors[v, k] = anchors[v, k - 1]
-            places[v, k] = places[v, k - 1]
+            places[v, k, 0] = places[v, k - 1, 0]
+            places[v, k, 1] = places[v, k - 1, 1]
             is_gap[v, k] = is_gap[v, k - 1]
         anchors[v, after] = t
         places[v, after, 0] = place[n, 0]
         places[v, after, 1] = place[n, 1]
         is_gap[v, after] = after > 0 and after < held and is_gap[v, after - 1]
         count[v] = held + 1
-    return out
 
 
-@compiled
+@refcount_free
 def _least_needed(anchors: IntArray) -> int:
     """Return the index of the path's anchor (time and place) that can be dropped with the least
     loss, given the anchors' times (ANCHORS,) [ns]. It is the anchor with the shortest time between
@@ -174,7 +174,7 @@ def _least_needed(anchors: IntArray) -> int:
     return best
 
 
-@compiled
+@refcount_free
 def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
     """Return the distance between two places (2,) [deg] minus the distance that a vehicle covers at
     the speed FASTEST in the time `apart` [ns]. The result is in metres, at least 0.
@@ -182,7 +182,7 @@ def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float
     return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
 
 
-@compiled
+@refcount_free
 def _distance_m(there: Float32Array, here: FloatArray | Float32Array) -> float:
     """Return the distance [m] between two places (2,) [deg], the shorter way around the earth."""
     north = here[0] - there[0]

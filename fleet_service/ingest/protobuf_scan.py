@@ -133,8 +133,8 @@ def gather_values(
     """
     width = int(_make_layout(kind).widths[column])
     each = int(_make_layout(kind).per_record[column])
-    begins = walked.begins[:, column]
-    counts = walked.counts[:, column]
+    begins = walked.begins[:, column].copy()
+    counts = walked.counts[:, column].copy()
     if width:
         _copy_bytes(
             data,

@@ -44,6 +44,13 @@ def use_native_kernels(library: Library) -> None:
     _Native.library = library
 
 
+def uses_native_kernels() -> bool:
+    """Return True if this process takes its kernels (compiled numerical functions) from a shared
+    library.
+    """
+    return _Native.library is not None
+
+
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not
     an exception).

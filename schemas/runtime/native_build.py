@@ -28,6 +28,8 @@ from numba.core import codegen, cpu, types
 from numba.extending import intrinsic
 
 from schemas.runtime.native_kernels import (
+    DONE,
+    DONE_FLOAT,
     HEADER,
     LINKER,
     Library,
@@ -44,23 +46,30 @@ RUNTIME: Final = (
     "numba_",
     "Py",
 )
-RESULTS: Final = (types.none, types.int64)
+ALLOCATION: Final = "NRT_MemInfo_alloc"  # first part of the names of functions that allocate
+RESULTS: Final = (types.none, types.int64, types.float64)
 
 
 class CallRecorder(Library):
-    """Stand-in for a library that has no kernels: it records each call of a kernel and does not run
-    it.
+    """Stand-in for a library that has no kernels: it records each call of a kernel.
+
+    Args:
+        runs: True to run each kernel with Numba as well, for a program that needs the results.
+            Otherwise each call returns 0.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, runs: bool = False) -> None:
         super().__init__(None)
         self.calls: dict[str, tuple[NativeKernel, tuple[Any, ...]]] = {}
+        self._runs = runs
 
-    def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> int:
-        """Record a call of a kernel instead of running it, and return 0 in place of its result."""
+    def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> Any:
+        """Record a call of a kernel. Run the kernel if the recorder does so, and return its
+        result.
+        """
         symbol = symbol_of(kernel.name, describe_type(arguments, []))
         self.calls.setdefault(symbol, (kernel, arguments))
-        return 0
+        return kernel.numba_kernel(*arguments) if self._runs else 0
 
 
 def build_library(recorder: CallRecorder, path: Path) -> None:
@@ -70,6 +79,7 @@ def build_library(recorder: CallRecorder, path: Path) -> None:
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
+        TypeError: a kernel allocates memory, which needs Numba's runtime.
     """
     calls: list[tuple[str, Any, tuple[Any, ...], Any]] = []
     for symbol, (native, arguments) in recorder.calls.items():
@@ -79,8 +89,8 @@ def build_library(recorder: CallRecorder, path: Path) -> None:
     _stop_before_machine_code()
     whole = llvm.parse_assembly("")
     for symbol, kernel, arguments, overload in calls:
-        returns = overload.signature.return_type != types.none
-        adapter = _compile_adapter(kernel, arguments, symbol, returns=returns)
+        result = overload.signature.return_type
+        adapter = _compile_adapter(kernel, arguments, symbol, result)
         _merge_modules(whole, overload, adapter, symbol)
     path.parent.mkdir(parents=True, exist_ok=True)
     code = _emit_object(whole, [symbol for symbol, *_ in calls], calls[0][-1].library.codegen)
@@ -127,11 +137,27 @@ def _pointer_of(context: Any, word: Any, element: Any) -> Any:  # noqa: ARG001
     return pointer(types.int64, element), generate
 
 
+def _read_only_of(context: Any, array: Any) -> Any:  # noqa: ARG001
+    kind = array.copy(readonly=True)
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        return values[0]  # both types have the same representation in memory
+
+    return kind(array), generate
+
+
 def _float_of(context: Any, word: Any) -> Any:  # noqa: ARG001
     def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         return builder.bitcast(values[0], target.get_value_type(types.float64))
 
     return types.float64(types.int64), generate
+
+
+def _bits_of(context: Any, number: Any) -> Any:  # noqa: ARG001
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        return builder.bitcast(values[0], target.get_value_type(types.int64))
+
+    return types.int64(types.float64), generate
 
 
 class _Adapter:
@@ -147,16 +173,23 @@ class _Adapter:
             "carray": numba.carray,  # type: ignore[attr-defined]
             "pointer_of": intrinsic(_pointer_of),
             "float_of": intrinsic(_float_of),
+            "bits_of": intrinsic(_bits_of),
+            "read_only_of": intrinsic(_read_only_of),
         }
         self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
 
-    def make_function(self, *, returns: bool) -> Callable[..., Any]:
+    def make_function(self, result: Any) -> Callable[..., Any]:
         """Return the adapter as a Python function with one argument, the array of 64-bit words. The
-        function calls the kernel, stores the kernel's result (if any) in word 1, and sets word 0 to
-        1 to mark completion.
+        function calls the kernel, stores the kernel's result (if any, of the type `result`) in word
+        1, and sets word 0 to DONE or DONE_FLOAT.
         """
-        result = "words[1] = " if returns else ""
-        text = f"def {ADAPTER}(words):\n    {result}{self._call}\n    words[0] = 1\n"
+        call = {
+            types.none: self._call,
+            types.int64: f"words[1] = {self._call}",
+            types.float64: f"words[1] = bits_of({self._call})",
+        }[result]
+        mark = DONE_FLOAT if result == types.float64 else DONE
+        text = f"def {ADAPTER}(words):\n    {call}\n    words[0] = {mark}\n"
         exec(text, self._known)
         return self._known[ADAPTER]  # type: ignore[no-any-return]
 
@@ -178,20 +211,23 @@ class _Adapter:
             element = self._name_of(numba.from_dtype(value.dtype))
             address = f"pointer_of({self._next_word()}, {element})"
             shape = "".join(f"{self._next_word()}, " for _ in range(value.ndim))
-            return f"carray({address}, ({shape}))"
+            array = f"carray({address}, ({shape}))"
+            return array if value.flags.writeable else f"read_only_of({array})"
         if isinstance(value, tuple):
             parts = "".join(f"{self._expression(part)}, " for part in value)
             make = "" if type(value) is tuple else self._name_of(type(value))
             return f"{make}({parts})"
         word = self._next_word()
+        if isinstance(value, bool):
+            return f"{word} != 0"
         return f"float_of({word})" if isinstance(value, float) else word
 
 
-def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, *, returns: bool) -> Any:
+def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, result: Any) -> Any:
     """Compile the adapter of a kernel (see `_Adapter`) as a C function with the name `symbol`;
-    return the Numba code library that contains it.
+    return the Numba code library that contains it. `result` is the type of the kernel's result.
     """
-    function = _Adapter(kernel, arguments).make_function(returns=returns)
+    function = _Adapter(kernel, arguments).make_function(result)
     words = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
     made: Any = numba.cfunc(types.void(words), error_model="numpy")(function)
     made._library._final_module.get_function(made.native_name).name = symbol
@@ -202,9 +238,15 @@ def _merge_modules(whole: Any, overload: Any, adapter: Any, symbol: str) -> None
     """Add the LLVM code of a kernel, of its adapter (see `_Adapter`) and of the functions that the
     adapter calls to the LLVM module `whole`. The code of a kernel already contains all functions
     that it calls.
+
+    Raises:
+        TypeError: the kernel allocates memory.
     """
     visible = {symbol, overload.fndesc.llvm_func_name}
     code = overload.library._get_module_for_linking().clone()
+    if any(function.name.startswith(ALLOCATION) for function in code.functions):
+        name = overload.fndesc.qualname
+        raise TypeError(f"{name} allocates memory: pass the array as an argument")
     _hide_functions(code, visible, "internal")
     whole.link_in(code)
     seen = {overload.library}

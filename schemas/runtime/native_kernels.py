@@ -4,8 +4,8 @@ second.
 
 Each function of the library is one kernel for fixed types of arguments; the types are part of the
 function's name. Its only argument is the address of an array of 64-bit words. These are a mark that
-the kernel has completed, its result, and then the parts of its arguments. For a call with other
-types, Numba compiles the kernel.
+the kernel has completed (DONE, or DONE_FLOAT if its result is a float), its result, and then the
+parts of its arguments. For a call with other types, Numba compiles the kernel.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ import numpy as np
 
 LINKER: Final = "cc"
 HEADER: Final = 2  # words before the arguments: success mark and result
+DONE: Final = 1
+DONE_FLOAT: Final = 2
 LARGEST: Final = 1 << 63
 
 
@@ -74,7 +76,7 @@ class NativeKernel:
         return self._compile()
 
     def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401 the type depends on the kernel
-        """Run the kernel, and return its result: None or an integer."""
+        """Run the kernel, and return its result: a number, or 0 if the kernel returns nothing."""
         words = [0, 0]
         try:
             types = describe_type(arguments, words)
@@ -89,6 +91,8 @@ class NativeKernel:
         function(row)
         if not row[0]:
             raise ArithmeticError(f"{self.name}: the native kernel has failed")
+        if row[0] == DONE_FLOAT:
+            return struct.unpack("d", struct.pack("q", row[1]))[0]
         return row[1]
 
 
@@ -120,19 +124,20 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
     represent the argument to the list `words`.
 
     An array is represented by its address and its shape, a tuple by the words of its elements, and
-    a number by one word.
+    a number or truth value by one word.
 
     Raises:
-        OtherTypesError: the argument is neither a number nor a contiguous array that may be
-            written, nor a tuple of these.
+        OtherTypesError: the argument is neither a number, nor a truth value, nor a contiguous
+            array, nor a tuple of these.
     """
     if isinstance(value, np.ndarray):
         flags = value.flags
-        if not (flags.c_contiguous and flags.writeable and flags.aligned):
+        if not (flags.c_contiguous and flags.aligned):
             raise OtherTypesError
         words.append(value.ctypes.data)
         words.extend(value.shape)
-        return f"{_describe_element(value.dtype)}[{value.ndim}]"
+        read_only = "" if flags.writeable else " read-only"
+        return f"{_describe_element(value.dtype)}[{value.ndim}]{read_only}"
     if isinstance(value, tuple):
         parts = ",".join([describe_type(part, words) for part in value])
         return f"{type(value).__qualname__}({parts})"
@@ -142,6 +147,9 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
     if (type(value) is int or type(value) is np.int64) and -LARGEST <= value < LARGEST:
         words.append(int(value))
         return "int"
+    if type(value) is bool:
+        words.append(value)
+        return "bool"
     raise OtherTypesError
 
 

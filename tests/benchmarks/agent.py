@@ -17,7 +17,7 @@ from pathlib import Path
 import gripmap
 from edge_agent.app.backfill import estimate_drives, tasks_of
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.app.shipped_library import BUILD
+from edge_agent.app.native_library import LIBRARY
 from edge_agent.cli import main as edge
 from edge_agent.inputs.signal_log import read_log
 from schemas.runtime.figures import Figure
@@ -115,7 +115,7 @@ def measure_cold_start(folder: Path, files: list[str]) -> float:
     for name in gripmap.PACKAGES:
         shutil.copytree(ROOT / name, package / name, ignore=unused)
     shutil.copy(ROOT / "gripmap.py", package)
-    subprocess.run([sys.executable, "-m", BUILD], cwd=package, check=True)
+    subprocess.run([sys.executable, "-m", LIBRARY.builder], cwd=package, check=True)
 
     def run_process() -> None:
         with tempfile.TemporaryDirectory() as empty:

@@ -28,7 +28,7 @@ from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.restart import image_of
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
-from tests.benchmarks.fusion import CELLS, START, fill_fusion
+from tests.benchmarks.full_map import CELLS, START, fill_fusion
 from tests.benchmarks.ingest import make_messages
 from tests.faults.processes import Part
 

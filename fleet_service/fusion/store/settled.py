@@ -18,7 +18,7 @@ from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import NONE, SETTLED_SINCE, SETTLED_VEHICLES, State
 from fleet_service.fusion.store.table import AHEAD
 from schemas.numeric import IntArray
-from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
@@ -156,13 +156,18 @@ def _move_report(state: State, row: int, to: int, value: int, to_value: int) -> 
     return is_value
 
 
-@compiled
 def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
     """Delete two groups of reports from `State.settled`: reports that are too old to be remembered
     at `now` [s], and reports of vehicles that report in the same cell again. The remaining reports
     move to the beginning of the arrays. Return the number of remaining reports, and the number of
     friction values among them. `names` are the records of the vehicles.
     """
+    reports = _drop_reports(state, names, now)
+    return reports, int(state.settled_begin[-1, 1])
+
+
+@refcount_free
+def _drop_reports(state: State, names: RecordArray, now: int) -> int:
     begins = state.settled_begin
     keys = state.settled_keys
     since = state.used[SETTLED_SINCE]
@@ -190,25 +195,28 @@ def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
         begin = end
     begins[-1, 0] = reports
     begins[-1, 1] = values
-    return reports, values
+    return reports
 
 
-@compiled
 def find_resting(pairs: RecordArray) -> IntArray:
     """Return the rows of the pair records (one vehicle in one slot each) without an observation
     that is still waiting to become final. These pairs can be settled, that is, moved to compact
     storage.
     """
     out = np.empty(len(pairs), np.int64)
+    return out[: _find_resting(pairs, out)].copy()
+
+
+@refcount_free
+def _find_resting(pairs: RecordArray, out: IntArray) -> int:
     count = 0
     for row in range(len(pairs)):
         if pairs[row].slot != NONE and pairs[row].last == NONE:
             out[count] = row
             count += 1
-    return out[:count].copy()
+    return count
 
 
-@compiled
 def count_settling(
     state: State, names: RecordArray, resting: IntArray, now: int
 ) -> tuple[int, int]:
@@ -219,21 +227,28 @@ def count_settling(
     Only reports that are still remembered at `now` [s] count. If a pair has no such report, record
     in the cell that the vehicle was already counted there.
     """
-    bounds = 0
-    values = 0
+    kinds = np.zeros(len(ReportKind), np.int64)
+    _count_settling(state, names, resting, now, kinds)
+    return int(kinds.sum()), int(kinds[ReportKind.VALUE])
+
+
+@refcount_free
+def _count_settling(
+    state: State, names: RecordArray, resting: IntArray, now: int, kinds: IntArray
+) -> None:
+    """Count the reports of each kind that must be moved, in `kinds` (2,)."""
     for k in range(len(resting)):
         prefetch(state.pairs, resting[min(k + AHEAD, len(resting) - 1)], 0)
         this = state.pairs[resting[k]]
         has_bound = this.time[ReportKind.BOUND] >= oldest_remembered(now, ReportKind.BOUND)
         has_value = this.time[ReportKind.VALUE] >= oldest_remembered(now, ReportKind.VALUE)
-        bounds += has_bound
-        values += has_value
+        kinds[ReportKind.BOUND] += has_bound
+        kinds[ReportKind.VALUE] += has_value
         if not has_bound and not has_value:
             _mark_returned(state, this.slot, names[this.vehicle].key)
-    return bounds + values, values
 
 
-@compiled
+@refcount_free
 def insert_reports(
     state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
 ) -> None:

@@ -45,7 +45,7 @@ from fleet_service.fusion.store.table import (
     table_of,
 )
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.jit import compiled
+from schemas.runtime.jit import refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
@@ -171,7 +171,9 @@ class Store:
                 belief=grow_rows(live.belief, rows), cells=grow_rows(live.cells, rows)
             )
             self.state = self.state._replace(live=live)
-        slots[new], self.size = slots_for(self._slots, self.state.live, keys[new], self.size)
+        found = np.empty(len(new), np.int64)
+        self.size = slots_for(self._slots, self.state.live, keys[new], self.size, found)
+        slots[new] = found
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
@@ -196,7 +198,7 @@ class Store:
             peers = no_peers(rows)
             peers[: len(self.peers)] = self.peers
             self.peers = peers
-        index, self.vehicles = assign_rows(self._known, self.names, vehicle, self.vehicles)
+        self.vehicles = assign_rows(self._known, self.names, vehicle, self.vehicles, index)
         return index
 
     def reserve(self, rows: int) -> None:
@@ -277,25 +279,30 @@ class Store:
         return place
 
 
-@compiled
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
     """Return the lateness windows (recent observations of a cell) that contain observations older
     than `before` [ns], as two arrays of row numbers: windows in which all observations are lower
     bounds of friction, and windows with at least one measured value.
     """
-    plain = np.empty(len(windows), np.int64)
-    valued = np.empty(len(windows), np.int64)
-    without = 0
-    of_value = 0
+    found = np.empty(len(windows), np.int64)
+    plain = _find_due_windows(windows, before, 0, found)
+    valued = _find_due_windows(windows, before, 1, found[plain:])
+    return found[:plain], found[plain : plain + valued]
+
+
+@refcount_free
+def _find_due_windows(windows: RecordArray, before: int, with_value: int, out: IntArray) -> int:
+    """Write to `out` the rows of the lateness windows that contain observations older than `before`
+    [ns]: those with at least one value if `with_value` is 1, else those without. Return their
+    number.
+    """
+    count = 0
     for window in range(len(windows)):
-        if windows[window].slot != NONE and windows[window].first < before:
-            if windows[window].values:
-                valued[of_value] = window
-                of_value += 1
-            else:
-                plain[without] = window
-                without += 1
-    return plain[:without], valued[:of_value]
+        is_due = windows[window].slot != NONE and windows[window].first < before
+        if is_due and (windows[window].values > 0) == with_value:
+            out[count] = window
+            count += 1
+    return count
 
 
 def no_peers(vehicles: int) -> RecordArray:

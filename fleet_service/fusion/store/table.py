@@ -23,7 +23,7 @@ import numpy as np
 from fleet_service.fusion.store.cells import begin_slot
 from fleet_service.fusion.store.records import NONE, Rows
 from schemas.numeric import IntArray
-from schemas.runtime.jit import compiled, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
@@ -96,12 +96,17 @@ def find_row(table: IntArray, rows: RecordArray, key: int) -> int:
     return _row_at(table[locate_key(table, rows, key)])
 
 
-@compiled
 def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
     """Return, for each key in `wanted` (n,), the row of `rows` with this key, found by the hash
     table `table`; NONE if the key is unknown.
     """
     out = np.empty(len(wanted), np.int64)
+    _find_rows(table, rows, wanted, out)
+    return out
+
+
+@refcount_free
+def _find_rows(table: IntArray, rows: RecordArray, wanted: IntArray, out: IntArray) -> None:
     for group in range(0, len(wanted), AHEAD):
         end = min(group + AHEAD, len(wanted))
         for i in range(group, end):
@@ -111,15 +116,14 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
             prefetch(rows, _row_at(table[out[i]]), 0)
         for i in range(group, end):
             out[i] = find_row(table, rows, wanted[i])
-    return out
 
 
-@compiled
-def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
-    """Return the slot of each of the keys `wanted` (n,), cell · 4 + sector, and the number of slots
-    in use afterwards. An unknown key gets the next free slot; the table must have room for it.
+@refcount_free
+def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int, out: IntArray) -> int:
+    """Write the slot of each of the keys `wanted` (n,), cell · 4 + sector, to `out` (n,). An
+    unknown key gets the next free slot; the table must have room for it. `used` is the number of
+    slots in use before the call; return the number afterwards.
     """
-    out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate_key(table, live.cells, wanted[i])
         if table[place] == NONE:
@@ -127,17 +131,17 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple
             begin_slot(live, used, wanted[i])
             used += 1
         out[i] = _row_at(table[place])
-    return out, used
+    return used
 
 
-@compiled
+@refcount_free
 def assign_rows(
-    table: IntArray, rows: RecordArray, wanted: IntArray, used: int
-) -> tuple[IntArray, int]:
-    """Return the row of each of the keys `wanted` (n,) and the number of rows in use afterwards. An
-    unknown key is written to the next free row.
+    table: IntArray, rows: RecordArray, wanted: IntArray, used: int, out: IntArray
+) -> int:
+    """Write the row of each of the keys `wanted` (n,) to `out` (n,). An unknown key is written to
+    the next free row. `used` is the number of rows in use before the call; return the number
+    afterwards.
     """
-    out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate_key(table, rows, wanted[i])
         if table[place] == NONE:
@@ -145,10 +149,10 @@ def assign_rows(
             rows[used].key = wanted[i]
             used += 1
         out[i] = _row_at(table[place])
-    return out, used
+    return used
 
 
-@compiled
+@refcount_free
 def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
     """Enter the row numbers from 0 to `used` - 1 into the empty hash table `table`, at the places
     that the keys of these rows determine.

@@ -24,7 +24,7 @@ from fleet_service.fusion.constants import FORGOTTEN_EVERY_S
 from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.benchmarks.fusion import SECOND, START, make_visits
+from tests.benchmarks.full_map import SECOND, START, make_visits
 from tests.benchmarks.ingest import make_messages
 from tests.benchmarks.measure import SEED, read_resident_bytes
 

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.app import native_library, shipped_library
+from edge_agent.app import native_library
 from edge_agent.lab.simulation import SimulatedFleet
-from schemas.runtime import jit
+from schemas.runtime import jit, kernel_library
+from schemas.runtime.shipped_library import FEATURES
 
 # Modules that an agent with native kernels must not load.
 HEAVY = ("grpc", "llvmlite", "numba", "pandas", "pyarrow", "rich", "scipy", "yaml")
-LEVEL = next(iter(shipped_library.FEATURES))
+LEVEL = next(iter(FEATURES))
 VEHICLES = 2
 DRIVE = f"""import hashlib, sys
 import numpy as np
@@ -58,8 +59,8 @@ print(digest.hexdigest(), records + len(last.vehicle))
 NATIVE = """
 from pathlib import Path
 from edge_agent.app import native_library
-native_library.SHIPPED = Path(sys.argv[1]).parent / "kernels"
-assert native_library.use_agent_library()
+kernels = Path(sys.argv[1]).parent / "kernels"
+assert native_library.LIBRARY._replace(shipped=kernels).use()
 """
 LOADED = f"""
 import edge_agent.app.trip, edge_agent.cli.live, edge_agent.cli.run, edge_agent.publish.publisher
@@ -107,14 +108,13 @@ def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> Non
 def test_without_a_linker_or_a_folder_numba_compiles(
     missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(native_library, "SHIPPED", tmp_path)
     monkeypatch.setenv("PATH", os.fspath(tmp_path) if missing == "linker" else os.environ["PATH"])
     monkeypatch.setattr(
-        native_library,
+        kernel_library,
         "native_library_path",
         lambda _: tmp_path / "library.so" if missing == "linker" else None,
     )
-    assert not native_library.use_agent_library()
+    assert not native_library.LIBRARY._replace(shipped=tmp_path).use()
     assert jit._Native.library is None
 
 
@@ -122,7 +122,6 @@ def test_a_library_that_cannot_be_loaded_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_library(tmp_path / "cache", "library.so")
-    monkeypatch.setattr(native_library, "SHIPPED", tmp_path / "kernels")
-    monkeypatch.setattr(native_library, "native_library_path", lambda _: path)
-    assert not native_library.use_agent_library()
+    monkeypatch.setattr(kernel_library, "native_library_path", lambda _: path)
+    assert not native_library.LIBRARY._replace(shipped=tmp_path / "kernels").use()
     assert jit._Native.library is None

@@ -17,7 +17,7 @@ from schemas.runtime.native_kernels import OtherTypesError, describe_type
 KERNELS = """import sys
 from typing import NamedTuple
 import numpy as np
-from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.jit import compiled, nogil, refcount_free
 
 class Pair(NamedTuple):
     values: object
@@ -41,9 +41,24 @@ def refuse(x):
         raise ValueError("negative")
     return x
 
+@refcount_free
+def mean(x, doubled):
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i]
+    return (2.0 if doubled else 1.0) * total / len(x)
+
 @compiled
-def mean(x):
-    return x.mean()
+def bounds(x):
+    return x[0], x[-1]
+
+@compiled
+def fill(x):
+    copy = np.empty(len(x))
+    for i in range(len(x)):
+        copy[i] = 2.0 * x[i]
+    for i in range(len(x)):
+        x[i] = copy[i]
 
 def call_kernels():
     out, values = np.zeros(4), np.arange(4.0)
@@ -52,8 +67,11 @@ def call_kernels():
         print(refuse(-1))
     except (ArithmeticError, ValueError) as error:
         print(type(error).__name__)
+    fixed = np.arange(4.0)
+    fixed.flags.writeable = False
+    print(mean(fixed, True), mean(values, False))
     print("numba" in sys.modules)
-    print(mean(values))
+    print(bounds(values))
     print(add_all(out, Pair(values[::-1], 3.0), (1, 4)), out.tolist(), "numba" in sys.modules)
 """
 BUILD = """import sys, numpy as np
@@ -65,7 +83,11 @@ use_native_kernels(recorder)
 import kernels
 kernels.add_all(np.zeros(4), kernels.Pair(np.zeros(4), 1.0), (0, 4))
 kernels.refuse(1)
-kernels.mean(np.zeros(4))
+fixed = np.zeros(4)
+fixed.flags.writeable = False
+kernels.mean(fixed, True)
+kernels.mean(np.zeros(4), True)
+kernels.bounds(np.zeros(4))
 build_library(recorder, Path(sys.argv[1]))
 """
 USE = """import sys
@@ -102,7 +124,7 @@ def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
     """The library must run kernels (compiled functions) without importing Numba, and must return
     the same results as Numba. An exception in a kernel must be raised as ArithmeticError. Numba
     must run calls for which the library has no kernel. Here these are a function that returns a
-    float, and a call with an array that is not contiguous.
+    tuple, and a call with an array that is not contiguous.
     """
     (tmp_path / "kernels.py").write_text(KERNELS)
     library = str(tmp_path / "library.so")
@@ -111,29 +133,43 @@ def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
     assert run_python(tmp_path, USE, library) == [
         result,
         "ArithmeticError",
+        "3.0 1.5",
         "False",
-        "1.5",
+        "(0.0, 3.0)",
         "6 [0.0, 4.5, 4.5, 4.5] True",
     ]
     by_numba = run_python(tmp_path, "import kernels; kernels.call_kernels()")
     assert by_numba[:2] == [result, "ValueError"]
 
 
+@pytest.mark.campaign
+def test_a_kernel_that_allocates_memory_is_refused(tmp_path: Path) -> None:
+    """A library has no memory management of Numba. So the build of a library with a kernel that
+    allocates an array must fail, and its message must tell what to do.
+    """
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    code = BUILD.replace("kernels.refuse(1)", "kernels.fill(np.zeros(4))")
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        run_python(tmp_path, code, str(tmp_path / "library.so"))
+    assert "fill allocates memory: pass the array as an argument" in failed.value.stderr
+    assert not (tmp_path / "library.so").exists()
+
+
 def test_types_are_told_apart_and_parts_become_words() -> None:
     words: list[int] = []
     array = np.zeros((2, 3))
-    assert describe_type((array, (1, 2.0)), words) == "tuple(<f8[2],tuple(int,float))"
-    assert words == [array.ctypes.data, 2, 3, 1, 1 << 62]
+    kind = describe_type((array, (1, 2.0), True), words)
+    assert kind == "tuple(<f8[2],tuple(int,float),bool)"
+    assert words == [array.ctypes.data, 2, 3, 1, 1 << 62, 1]
 
 
-@pytest.mark.parametrize("value", [np.zeros((2, 2)).T[:1], np.zeros(4)[::2], True, "text", 1 << 63])
+@pytest.mark.parametrize("value", [np.zeros((2, 2)).T[:1], np.zeros(4)[::2], "text", 1 << 63])
 def test_a_value_that_no_library_takes_is_refused(value: object) -> None:
     with pytest.raises(OtherTypesError):
         describe_type(value, [])
 
 
-def test_an_array_that_must_not_be_written_is_refused() -> None:
+def test_an_array_that_must_not_be_written_has_a_type_of_its_own() -> None:
     array = np.zeros(2)
     array.flags.writeable = False
-    with pytest.raises(OtherTypesError):
-        describe_type(array, [])
+    assert describe_type((array, np.zeros(2)), []) == "tuple(<f8[1] read-only,<f8[1])"

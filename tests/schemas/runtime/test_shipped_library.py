@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from edge_agent.app import native_library
-from edge_agent.app.shipped_library import FEATURES, find_shipped_library
-from schemas.runtime import jit, progress_messages
+from schemas.runtime import jit, kernel_library, progress_messages
 from schemas.runtime.jit import describe_sources
+from schemas.runtime.kernel_library import KernelLibrary
+from schemas.runtime.shipped_library import FEATURES, find_shipped_library
 
 LEVEL_4 = frozenset(FEATURES["x86-64-v4"].split())
 LEVEL_3 = frozenset(FEATURES["x86-64-v3"].split())
@@ -30,7 +30,7 @@ def test_the_fastest_library_that_fits_the_processor_is_found(
     features: frozenset[str], level: str, tmp_path: Path
 ) -> None:
     write_libraries(tmp_path, describe_sources("edge_agent"))
-    found = find_shipped_library(tmp_path, features)
+    found = find_shipped_library("edge_agent", tmp_path, features)
     assert found is not None
     assert found.name.endswith(f"-{level}.so")
 
@@ -54,12 +54,11 @@ def test_a_library_for_others_is_refused_with_the_reason(
     reason, and compile its kernels with Numba.
     """
     write_libraries(tmp_path, sources)
-    monkeypatch.setattr(native_library, "SHIPPED", tmp_path)
-    monkeypatch.setattr(native_library, "read_processor_features", lambda: set(features))
-    monkeypatch.setattr(native_library, "native_library_path", lambda _: None)
+    monkeypatch.setattr(kernel_library, "read_processor_features", lambda: set(features))
+    monkeypatch.setattr(kernel_library, "native_library_path", lambda _: None)
     progress_messages.enable_messages()
     try:
-        assert not native_library.use_agent_library()
+        assert not KernelLibrary("edge_agent", "no.module", tmp_path).use()
     finally:
         progress_messages.enable_messages(quiet=True)
     assert capsys.readouterr().err == f"kernels in {tmp_path}: not used, because {reason}\n"
@@ -69,5 +68,5 @@ def test_a_library_for_others_is_refused_with_the_reason(
 def test_a_package_without_libraries_reports_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert find_shipped_library(tmp_path / "none", LEVEL_4) is None
+    assert find_shipped_library("edge_agent", tmp_path / "none", LEVEL_4) is None
     assert capsys.readouterr().err == ""

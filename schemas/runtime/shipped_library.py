@@ -1,8 +1,8 @@
-"""Shared libraries of the agent's kernels inside the installed package, so that the first start
-needs neither Numba nor a linker.
+"""Shared libraries of a program's kernels (compiled functions) inside the installed package. With
+them, the first start needs neither Numba nor a linker.
 
-`python -m edge_agent.app.native_library` builds them: one for each level of the x86-64
-architecture in FEATURES. The name of a library contains a digest of the sources, and the level.
+There is one library for each level of the x86-64 architecture in FEATURES. The name of a library
+contains a digest of the sources, and the level.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from typing import Final
 from schemas.runtime.jit import describe_sources, list_processor_lines
 from schemas.runtime.progress_messages import report
 
-SHIPPED: Final = Path(__file__).parents[1] / "kernels"
-BUILD: Final = "edge_agent.app.native_library"
 LEVEL_3: Final = (
     "abm avx avx2 bmi1 bmi2 cx16 f16c fma lahf_lm movbe popcnt sse4_1 sse4_2 ssse3 xsave"
 )
@@ -36,13 +34,13 @@ def read_processor_features() -> set[str]:
     return {word for line in list_processor_lines() for word in line.split()}
 
 
-def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
-    """Return the path of the fastest library in `folder` for the present source files and a
-    processor with these `features`; None if none is suitable. Report the reason if the folder
+def find_shipped_library(package: str, folder: Path, features: Iterable[str]) -> Path | None:
+    """Return the path of the fastest library in `folder` for the present source files of `package`
+    and a processor with these `features`; None if none is suitable. Report the reason if the folder
     contains only unsuitable libraries.
     """
     libraries = set(folder.glob("*.so"))
-    sources = describe_sources("edge_agent")
+    sources = describe_sources(package)
     available = set(features)
     for level, needed in FEATURES.items():
         path = folder / f"{sources}-{level}.so"
@@ -55,11 +53,12 @@ def find_shipped_library(folder: Path, features: Iterable[str]) -> Path | None:
     return None
 
 
-def build_shipped_libraries() -> None:
-    """Build the shared libraries in the folder of the installed package, one process per level of
-    the processor architecture. Libraries that are there already are removed first.
+def build_shipped_libraries(package: str, folder: Path, builder: str) -> None:
+    """Build the shared libraries of `package` in `folder`, one process per level of the processor
+    architecture. `python -m builder FILE` builds one. Libraries that are there already are removed
+    first.
 
-    On a processor that is not x86-64, build nothing; the agent then compiles its kernels at its
+    On a processor that is not x86-64, build nothing; the program then compiles its kernels at its
     first start.
 
     Raises:
@@ -68,15 +67,15 @@ def build_shipped_libraries() -> None:
     if platform.machine() != "x86_64":
         print(f"no kernels are shipped for {platform.machine()}", file=sys.stderr)
         return
-    print(f"building kernels in {SHIPPED}: takes a minute or two", file=sys.stderr, flush=True)
-    for old in SHIPPED.glob("*.so"):
+    print(f"building kernels in {folder}: takes a minute or two", file=sys.stderr, flush=True)
+    for old in folder.glob("*.so"):
         old.unlink()
-    sources = describe_sources("edge_agent")
+    sources = describe_sources(package)
     with tempfile.TemporaryDirectory() as cache:
         own = os.environ | {"NUMBA_CACHE_DIR": cache, "NUMBA_CPU_FEATURES": ""}
         processes = [
             subprocess.Popen(
-                [sys.executable, "-m", BUILD, os.fspath(SHIPPED / f"{sources}-{level}.so")],
+                [sys.executable, "-m", builder, os.fspath(folder / f"{sources}-{level}.so")],
                 env=own | {"NUMBA_CPU_NAME": level},
             )
             for level in FEATURES
