@@ -12,7 +12,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
 from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
-from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, kernel_of, shape_class
+from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, read_slippery, shape_class
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import NONE, Rows, Side
 from fleet_service.fusion.store.store import Store
@@ -77,7 +77,7 @@ class BeliefMap:
         given, read this copy of the state instead of the live one.
         """
         rows = self.store.state.live if rows is None else rows
-        rule = ReadRule(KERNELS[shape_class(self._shape.reader)], c.SILENCE)
+        rule = _rule_of(self._shape.reader, c.SILENCE)
         at = np.full(len(slots), now)
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
@@ -113,7 +113,7 @@ class BeliefMap:
         Visits without a friction value do not weaken the evidence of neighbouring cells here. So a
         cell between icy cells gets an alert even if its own visitors gave no value.
         """
-        rule = ReadRule(KERNELS[shape_class(slope)], 0.0)
+        rule = _rule_of(slope, 0.0)
         rows = self.store.state.live
         at = self.live.time[slots]
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
@@ -162,6 +162,14 @@ class BeliefMap:
         return who, np.where(counted, when, 0)
 
 
+def _rule_of(slope: float, silence: float) -> ReadRule:
+    """Return the parameters for reading beliefs with an assumed error of `slope` per unit of unused
+    grip. `silence` is `ReadRule.silence`.
+    """
+    shape = shape_class(slope)
+    return ReadRule(KERNELS[shape], SLIPPERY_WEIGHTS[shape], silence)
+
+
 @refcount_free
 def _write_slippery(
     live: Rows, weights: FloatArray, slots: IntArray, p: FloatArray, out: FloatArray
@@ -171,10 +179,4 @@ def _write_slippery(
     """
     for k in range(len(slots)):
         unpack_belief(live.belief, slots[k], p)
-        weight = weights[kernel_of(live.cells, slots[k])]
-        slippery = 0.0
-        whole = 0.0
-        for i in range(len(p)):
-            slippery += weight[0, i] * p[i]
-            whole += weight[1, i] * p[i]
-        out[k] = slippery / whole
+        out[k] = read_slippery(weights, live.cells, slots[k], p)

@@ -54,7 +54,7 @@ import numpy as np
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
-from fleet_service.fusion.shared import read_road
+from fleet_service.fusion.shared import read_road, read_slippery
 from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
 from fleet_service.fusion.store.table import find_row
 from fleet_service.fusion.votes import ScratchRow
@@ -118,12 +118,14 @@ class ReadRule(NamedTuple):
         kernels: table of kernels, (kernels, 32, 32). A kernel maps a belief about measured friction
             to a belief about the road; it adds the error that all reports in a cell share (see
             `shared`).
+        slippery: table for P(slippery) with the same kernels, see `shared.read_slippery`.
         silence: constant SILENCE in the factor q of the module. This factor weakens messages from
             slippery neighbours if vehicles visited the cell but reported few friction values there.
             0 switches the factor off.
     """
 
     kernels: Float32Array
+    slippery: FloatArray
     silence: float
 
 
@@ -202,34 +204,30 @@ def _read_beliefs(
         for i in range(_BINS):
             buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
             buffers.quiet[i] = buffers.product[i]
-        read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
-        slippery = _slippery_probability(out[k])
-        if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
-            continue
-        unknown = _slippery_probability(weather.prior[prior])
-        _multiply_messages(parts, Asked(slots[k], now[k], prior, unknown), buffers, out[k])
+        slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.product)
+        if c.DECIDED <= slippery <= 1.0 - c.DECIDED:
+            unknown = _slippery_probability(weather.prior[prior])
+            _multiply_messages(parts, Asked(slots[k], now[k], prior, unknown), buffers, out[k])
+        else:
+            read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
 
 
 @refcount_free_inlined
 def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
     """Multiply the belief about a cell by the messages (factors) from slippery neighbours on its
-    three sides, and write the resulting belief about the road to `out` (32). If no neighbour sends
-    a message, `out` stays unchanged.
+    three sides, and write the resulting belief about the road to `out` (32).
     """
     kernels = parts.rule.kernels
     cells = parts.live.cells
-    informative = False
     weakened = False
     for side in (_BEFORE, _BEHIND, _ACROSS):
         weight, heard = _choose_message(parts, asked, side, buffers)
         if weight > 0.0:
-            informative = True
             weakened = weakened or heard < 1.0
             for i in range(_BINS):
                 buffers.product[i] *= buffers.message[i]
                 buffers.quiet[i] *= 1.0 + heard * (buffers.message[i] - 1.0)
-    if informative:
-        read_road(kernels, cells, asked.slot, buffers.product, out)
+    read_road(kernels, cells, asked.slot, buffers.product, out)
     if weakened:
         read_road(kernels, cells, asked.slot, buffers.quiet, buffers.road)
         _lower_to_unsure(out, buffers.road)
@@ -249,7 +247,7 @@ def _choose_message(
     live = parts.live
     cells = live.cells
     most = 0.0
-    heard = 1.0
+    best = NONE
     key = cells[asked.slot].key
     sector = key % grid.SECTORS
     towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
@@ -265,16 +263,20 @@ def _choose_message(
                 continue
             break
         _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
-        read_road(parts.rule.kernels, cells, row, buffers.scratch[ScratchRow.BELIEF], buffers.road)
-        slippery = _slippery_probability(buffers.road)
+        belief = buffers.scratch[ScratchRow.BELIEF]
+        slippery = read_slippery(parts.rule.slippery, cells, row, belief)
         kept_surface = _KEPT[1 if side == _ACROSS else step]
         weight = kept_surface * (slippery - asked.unknown) / (1.0 - asked.unknown)
         if weight > most:
             most = weight
-            prior = parts.weather.prior[asked.prior]
-            _write_message(buffers.message, weight, buffers.road, prior)
-            heard = _silence_factor(cells, asked.slot, row, parts.rule.silence)
-    return most, heard
+            best = row
+            for i in range(_BINS):
+                buffers.message[i] = belief[i]
+    if best == NONE:
+        return 0.0, 1.0
+    read_road(parts.rule.kernels, cells, best, buffers.message, buffers.road)
+    _write_message(buffers.message, most, buffers.road, parts.weather.prior[asked.prior])
+    return most, _silence_factor(cells, asked.slot, best, parts.rule.silence)
 
 
 @refcount_free_inlined
