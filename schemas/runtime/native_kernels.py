@@ -15,6 +15,7 @@ import functools
 import hashlib
 import os
 import struct
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -40,11 +41,15 @@ class Library:
     def __init__(self, path: Path | None) -> None:
         self._functions = None if path is None else ctypes.CDLL(os.fspath(path))
 
-    def find_function(self, name: str) -> Callable[[Any], None] | None:
+    def find_function(self, name: str) -> Callable[[int], None] | None:
         """Return the library's function with the symbol `name`, or None if the library does not
-        contain it.
+        contain it. Its argument is an address.
         """
-        return None if self._functions is None else getattr(self._functions, name, None)
+        function = getattr(self._functions, name, None)
+        if function is not None:
+            function.argtypes = [ctypes.c_void_p]
+            function.restype = None
+        return function
 
     def call_missing(self, kernel: NativeKernel, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
         """Run the Numba version of a kernel that the library does not contain, and return the
@@ -68,7 +73,7 @@ class NativeKernel:
         self.name = f"{function.__module__}.{function.__qualname__}"
         self._library = library
         self._compile = compile_with_numba
-        self._found: dict[str, Callable[[Any], None] | None] = {}
+        self._found: dict[str, Callable[[int], None] | None] = {}
 
     @functools.cached_property
     def numba_kernel(self) -> Callable[..., Any]:
@@ -87,8 +92,8 @@ class NativeKernel:
         function = self._found[types]
         if function is None:
             return self._library.call_missing(self, arguments)
-        row = (ctypes.c_int64 * len(words))(*words)
-        function(row)
+        row = array("q", words)
+        function(row.buffer_info()[0])
         if not row[0]:
             raise ArithmeticError(f"{self.name}: the native kernel has failed")
         if row[0] == DONE_FLOAT:
