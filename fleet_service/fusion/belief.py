@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from fleet_service.fusion import constants as c
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.thresholds import SLIPPERY_MU
 
 PackedArray = NDArray[np.uint16]
@@ -109,7 +109,7 @@ def quantiles(belief: FloatArray, levels: tuple[float, ...]) -> FloatArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _write_quantiles(belief: FloatArray, levels: FloatArray, out: FloatArray) -> None:
     for k in range(len(belief)):
         whole = 0.0

@@ -20,7 +20,7 @@ from fleet_service.fusion.vote_weights import VoteWeights
 from fleet_service.fusion.weather import Weather
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 from schemas.thresholds import NS
 
 # Contribution of each bin of a stored belief to P(slippery) of the road, and to the sum of its
@@ -170,7 +170,7 @@ def _rule_of(slope: float, silence: float) -> ReadRule:
     return ReadRule(KERNELS[shape], SLIPPERY_WEIGHTS[shape], silence)
 
 
-@refcount_free
+@refcount_free_locked
 def _write_slippery(
     live: Rows, weights: FloatArray, slots: IntArray, p: FloatArray, out: FloatArray
 ) -> None:

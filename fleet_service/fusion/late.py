@@ -28,7 +28,7 @@ from fleet_service.fusion.observations import Observations
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import ByteArray, IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 from schemas.thresholds import NS, US_STEP
 
 # [ns] A late visit is fused only if it is at most this much older than the checkpoint. After this
@@ -89,7 +89,7 @@ class Times(NamedTuple):
     end: IntArray
 
 
-@refcount_free
+@refcount_free_locked
 def _age_evidence(
     evidence: ByteArray, times: Times, weather: Weather, scratch: Bins, out: ByteArray
 ) -> None:

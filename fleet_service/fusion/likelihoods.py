@@ -23,7 +23,7 @@ from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.reported import Evidence, as_reported
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
 # Half a standard deviation of the grip used. A bound is flat from the grip used minus this.
@@ -96,7 +96,7 @@ def _levelled_bounds() -> ByteArray:
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
 
 
-@refcount_free
+@refcount_free_locked
 def _bound_rows(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
     for n in range(len(steps)):
         if math.isnan(used[n]):
@@ -123,7 +123,7 @@ def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _level_rows(steps: ByteArray, used: FloatArray) -> None:
     for n in range(len(steps)):
         if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= c.VALUE_DROP_STEPS:

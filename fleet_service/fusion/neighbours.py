@@ -61,7 +61,7 @@ from fleet_service.fusion.votes import ScratchRow
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
 from schemas.numeric import Float32Array, FloatArray, IntArray
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined, refcount_free_locked
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
@@ -189,7 +189,7 @@ def road_beliefs(
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _read_beliefs(
     parts: MapParts, slots: IntArray, now: IntArray, buffers: Buffers, out: FloatArray
 ) -> None:
@@ -309,7 +309,7 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray) -> None:
     for k in range(len(slots)):
         out[k, 0] = slots[k]

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 
 # Below this argument, ln Φ is computed from its series, whose relative error is below 10⁻⁶ there.
 # Further below, Φ itself is too small for a floating-point number.
@@ -37,13 +37,13 @@ def log_distribution(x: FloatArray) -> FloatArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _write_cdf(x: FloatArray, out: FloatArray) -> None:
     for i in range(len(x)):
         out[i] = 0.5 * math.erfc(-x[i] * math.sqrt(0.5))
 
 
-@refcount_free
+@refcount_free_locked
 def _write_log_distribution(x: FloatArray, out: FloatArray) -> None:
     for i in range(len(x)):
         if x[i] > _FAR:

@@ -17,7 +17,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
 
@@ -48,7 +48,7 @@ def as_reported(steps: NDArray[Any]) -> Evidence:
     return Evidence(out, reported)
 
 
-@refcount_free
+@refcount_free_locked
 def _describe_rows(steps: ByteArray, reported: Float32Array, likelihood: FloatArray) -> None:
     """Subtract its least value from each row of `steps` (n, 32), and write the mean, standard
     deviation and P(slippery) of values to `reported` (n, 3). `likelihood` (32,) is memory for one

@@ -47,7 +47,7 @@ from fleet_service.fusion.store.records import NONE, USED
 from fleet_service.fusion.vote_weights import VoteWeights
 from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free, refcount_free_locked
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, SLIPPERY_MU
 
@@ -265,7 +265,7 @@ def compute_vote_weights(
     )
 
 
-@refcount_free
+@refcount_free_locked
 def _update_weights(
     peers: RecordArray, before: Float32Array, enrolled: bool, known: BoolArray, out: Float32Array
 ) -> int:
@@ -346,7 +346,7 @@ def initial_trust(*, established: bool = False, enrolled: bool = False) -> float
     return min(weight, c.NEWCOMER) if established else weight
 
 
-@refcount_free
+@refcount_free_locked
 def _known_weight(agreement: float) -> float:
     """Return the vote weight r of a known or enrolled vehicle from its share of agreement g. It is
     above 1 if the vehicle disagreed with others in less than the share CONTAMINATION.
@@ -355,6 +355,6 @@ def _known_weight(agreement: float) -> float:
     return _scale_trust(agreement) * max(right, 1.0)
 
 
-@refcount_free
+@refcount_free_locked
 def _scale_trust(mean: float) -> float:
     return min(max((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0), 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 
 Int32Array = NDArray[np.int32]
 
@@ -35,7 +35,7 @@ class Keys(NamedTuple):
     c: IntArray
 
 
-@refcount_free
+@refcount_free_locked
 def _group_rows(keys: Keys, table: Int32Array, group: Int32Array, first: IntArray) -> int:
     """Write the group of each row to `group` (n,), and the first row of each group to `first`.
     `table` is an empty hash table of group numbers. Return the number of groups.
@@ -71,7 +71,7 @@ def largest_of(values: IntArray, group: Int32Array, groups: int) -> IntArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _raise_to_largest(values: IntArray, group: Int32Array, out: IntArray) -> None:
     for i in range(len(values)):
         if values[i] > out[group[i]]:

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 # [m/s] Faster than any road vehicle, even with the error of its clock.
@@ -94,7 +94,7 @@ class VehiclePaths:
 Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 
-@refcount_free
+@refcount_free_locked
 def _find_implausible(
     row: IntArray, time: IntArray, place: FloatArray, paths: Paths, out: BoolArray
 ) -> None:
@@ -157,7 +157,7 @@ def _find_implausible(
         count[v] = held + 1
 
 
-@refcount_free
+@refcount_free_locked
 def _least_needed(anchors: IntArray) -> int:
     """Return the index of the path's anchor (time and place) that can be dropped with the least
     loss, given the anchors' times (ANCHORS,) [ns]. It is the anchor with the shortest time between
@@ -174,7 +174,7 @@ def _least_needed(anchors: IntArray) -> int:
     return best
 
 
-@refcount_free
+@refcount_free_locked
 def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
     """Return the distance between two places (2,) [deg] minus the distance that a vehicle covers at
     the speed FASTEST in the time `apart` [ns]. The result is in metres, at least 0.
@@ -182,7 +182,7 @@ def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float
     return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
 
 
-@refcount_free
+@refcount_free_locked
 def _distance_m(there: Float32Array, here: FloatArray | Float32Array) -> float:
     """Return the distance [m] between two places (2,) [deg], the shorter way around the earth."""
     north = here[0] - there[0]

@@ -89,6 +89,14 @@ def refcount_free(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, nogil=True, references=False)
 
 
+def refcount_free_locked(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` without counting references to arrays, like `refcount_free`, but keep the
+    interpreter lock (GIL). Use this for short functions: another thread may take the lock as soon
+    as it is free, and waiting for it again may take longer than the function.
+    """
+    return _compile(function, references=False)
+
+
 def refcount_free_inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` without counting references to arrays, like `refcount_free`, and copy its
     code into each caller, as `inlined` does. Pass few arrays: an array argument is passed as seven
@@ -142,7 +150,7 @@ def _compile(
     library = _Native.library
     if library is None:
         return compile_with_numba()
-    return cast(Callable[P, R], NativeKernel(function, library, compile_with_numba))
+    return cast(Callable[P, R], NativeKernel(function, library, compile_with_numba, nogil=nogil))
 
 
 def _cache_of(package: str) -> str | None:

@@ -8,15 +8,18 @@ memory.
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from schemas.runtime import progress_messages
 from schemas.runtime.jit import native_library_path, use_native_kernels
-from schemas.runtime.native_kernels import LINKER, Library
+from schemas.runtime.native_kernels import DATA_OFFSET, LINKER, Library
 from schemas.runtime.shipped_library import (
     build_shipped_libraries,
     find_shipped_library,
@@ -67,7 +70,11 @@ class KernelLibrary(NamedTuple):
 def _load_library(path: Path) -> bool:
     """Take the kernels (compiled functions) of this process from the library at `path`, and return
     True. If the operating system refuses to load the library, report the reason and return False.
+    Also return False if this Python has another layout of array objects than a library needs.
     """
+    array = np.zeros(1)
+    if ctypes.c_void_p.from_address(id(array) + DATA_OFFSET).value != array.ctypes.data:
+        return False
     try:
         use_native_kernels(Library(path))
     except OSError as error:

@@ -24,10 +24,12 @@ from typing import Any, Final
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 import numba
 import numpy as np
+from llvmlite import ir
 from numba.core import codegen, cpu, types
 from numba.extending import intrinsic
 
 from schemas.runtime.native_kernels import (
+    DATA_OFFSET,
     DONE,
     DONE_FLOAT,
     HEADER,
@@ -137,6 +139,16 @@ def _pointer_of(context: Any, word: Any, element: Any) -> Any:  # noqa: ARG001
     return pointer(types.int64, element), generate
 
 
+def _data_of(context: Any, array: Any) -> Any:  # noqa: ARG001
+    word = ir.IntType(64)
+
+    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        place = builder.add(values[0], word(DATA_OFFSET))
+        return builder.load(builder.inttoptr(place, word.as_pointer()))
+
+    return types.int64(types.int64), generate
+
+
 def _read_only_of(context: Any, array: Any) -> Any:  # noqa: ARG001
     kind = array.copy(readonly=True)
 
@@ -175,6 +187,7 @@ class _Adapter:
             "float_of": intrinsic(_float_of),
             "bits_of": intrinsic(_bits_of),
             "read_only_of": intrinsic(_read_only_of),
+            "data_of": intrinsic(_data_of),
         }
         self._call = f"kernel({', '.join(self._expression(one) for one in arguments)})"
 
@@ -209,7 +222,7 @@ class _Adapter:
         """
         if isinstance(value, np.ndarray):
             element = self._name_of(numba.from_dtype(value.dtype))
-            address = f"pointer_of({self._next_word()}, {element})"
+            address = f"pointer_of(data_of({self._next_word()}), {element})"
             shape = "".join(f"{self._next_word()}, " for _ in range(value.ndim))
             array = f"carray({address}, ({shape}))"
             return array if value.flags.writeable else f"read_only_of({array})"

@@ -26,6 +26,9 @@ LINKER: Final = "cc"
 HEADER: Final = 2  # words before the arguments: success mark and result
 DONE: Final = 1
 DONE_FLOAT: Final = 2
+# Place of the address of an array's data in the array's Python object, [bytes]. The stable binary
+# interface of NumPy (`PyArrayObject`) puts it directly behind the head of the object.
+DATA_OFFSET: Final = object.__basicsize__
 LARGEST: Final = 1 << 63
 
 
@@ -39,13 +42,15 @@ class Library:
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._functions = None if path is None else ctypes.CDLL(os.fspath(path))
+        # PyDLL keeps the interpreter lock (GIL) during a call; CDLL releases it.
+        kinds = (ctypes.PyDLL, ctypes.CDLL)
+        self._functions = [None if path is None else kind(os.fspath(path)) for kind in kinds]
 
-    def find_function(self, name: str) -> Callable[[int], None] | None:
+    def find_function(self, name: str, *, nogil: bool) -> Callable[[int], None] | None:
         """Return the library's function with the symbol `name`, or None if the library does not
-        contain it. Its argument is an address.
+        contain it. Its argument is an address. With `nogil`, it releases the interpreter lock.
         """
-        function = getattr(self._functions, name, None)
+        function = getattr(self._functions[nogil], name, None)
         if function is not None:
             function.argtypes = [ctypes.c_void_p]
             function.restype = None
@@ -68,10 +73,13 @@ class NativeKernel:
         function: Callable[..., Any],
         library: Library,
         compile_with_numba: Callable[[], Callable[..., Any]],
+        *,
+        nogil: bool,
     ) -> None:
         functools.update_wrapper(self, function)
         self.name = f"{function.__module__}.{function.__qualname__}"
         self._library = library
+        self._nogil = nogil
         self._compile = compile_with_numba
         self._found: dict[str, Callable[[int], None] | None] = {}
 
@@ -88,7 +96,8 @@ class NativeKernel:
         except OtherTypesError:
             return self._library.call_missing(self, arguments)
         if types not in self._found:
-            self._found[types] = self._library.find_function(symbol_of(self.name, types))
+            symbol = symbol_of(self.name, types)
+            self._found[types] = self._library.find_function(symbol, nogil=self._nogil)
         function = self._found[types]
         if function is None:
             return self._library.call_missing(self, arguments)
@@ -128,8 +137,8 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
     """Return the type of `value`, an argument of a kernel, as text. Append the 64-bit words that
     represent the argument to the list `words`.
 
-    An array is represented by its address and its shape, a tuple by the words of its elements, and
-    a number or truth value by one word.
+    An array is represented by the address of its Python object (see DATA_OFFSET) and its shape, a
+    tuple by the words of its elements, and a number or truth value by one word.
 
     Raises:
         OtherTypesError: the argument is neither a number, nor a truth value, nor a contiguous
@@ -139,7 +148,7 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
         flags = value.flags
         if not (flags.c_contiguous and flags.aligned):
             raise OtherTypesError
-        words.append(value.ctypes.data)
+        words.append(id(value))
         words.extend(value.shape)
         read_only = "" if flags.writeable else " read-only"
         return f"{_describe_element(value.dtype)}[{value.ndim}]{read_only}"
@@ -160,4 +169,6 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
 
 @functools.cache
 def _describe_element(kind: np.dtype[Any]) -> str:
-    return kind.str if kind.names is None else repr(kind)
+    if kind.names is None:
+        return kind.str
+    return hashlib.blake2b(repr(kind).encode(), digest_size=8).hexdigest()

@@ -12,7 +12,7 @@ from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import NONE, PAIRS, State
 from fleet_service.fusion.store.settled import activate_reports
 from fleet_service.fusion.store.table import AHEAD, pair_place
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
@@ -93,7 +93,7 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         entries[entries[entry].after].before = NONE
 
 
-@refcount_free
+@refcount_free_locked
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_waiting: int) -> int:
     """Move the records of active pairs (one vehicle in one slot each) from the hash table `old` to
     the hash table `new`. If `only_waiting` is 1, move only pairs with an observation that is not

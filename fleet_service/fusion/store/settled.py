@@ -18,7 +18,7 @@ from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import NONE, SETTLED_SINCE, SETTLED_VEHICLES, State
 from fleet_service.fusion.store.table import AHEAD
 from schemas.numeric import IntArray
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
@@ -166,7 +166,7 @@ def drop_reports(state: State, names: RecordArray, now: int) -> tuple[int, int]:
     return reports, int(state.settled_begin[-1, 1])
 
 
-@refcount_free
+@refcount_free_locked
 def _drop_reports(state: State, names: RecordArray, now: int) -> int:
     begins = state.settled_begin
     keys = state.settled_keys
@@ -207,7 +207,7 @@ def find_resting(pairs: RecordArray) -> IntArray:
     return out[: _find_resting(pairs, out)].copy()
 
 
-@refcount_free
+@refcount_free_locked
 def _find_resting(pairs: RecordArray, out: IntArray) -> int:
     count = 0
     for row in range(len(pairs)):
@@ -232,7 +232,7 @@ def count_settling(
     return int(kinds.sum()), int(kinds[ReportKind.VALUE])
 
 
-@refcount_free
+@refcount_free_locked
 def _count_settling(
     state: State, names: RecordArray, resting: IntArray, now: int, kinds: IntArray
 ) -> None:
@@ -248,7 +248,7 @@ def _count_settling(
             _mark_returned(state, this.slot, names[this.vehicle].key)
 
 
-@refcount_free
+@refcount_free_locked
 def insert_reports(
     state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
 ) -> None:

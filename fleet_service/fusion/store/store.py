@@ -45,7 +45,7 @@ from fleet_service.fusion.store.table import (
     table_of,
 )
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free_locked
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
@@ -290,7 +290,7 @@ def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntAr
     return found[:plain], found[plain : plain + valued]
 
 
-@refcount_free
+@refcount_free_locked
 def _find_due_windows(windows: RecordArray, before: int, with_value: int, out: IntArray) -> int:
     """Write to `out` the rows of the lateness windows that contain observations older than `before`
     [ns]: those with at least one value if `with_value` is 1, else those without. Return their

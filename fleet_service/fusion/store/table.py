@@ -23,7 +23,7 @@ import numpy as np
 from fleet_service.fusion.store.cells import begin_slot
 from fleet_service.fusion.store.records import NONE, Rows
 from schemas.numeric import IntArray
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
@@ -105,7 +105,7 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
     return out
 
 
-@refcount_free
+@refcount_free_locked
 def _find_rows(table: IntArray, rows: RecordArray, wanted: IntArray, out: IntArray) -> None:
     for group in range(0, len(wanted), AHEAD):
         end = min(group + AHEAD, len(wanted))
@@ -118,7 +118,7 @@ def _find_rows(table: IntArray, rows: RecordArray, wanted: IntArray, out: IntArr
             out[i] = find_row(table, rows, wanted[i])
 
 
-@refcount_free
+@refcount_free_locked
 def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int, out: IntArray) -> int:
     """Write the slot of each of the keys `wanted` (n,), cell · 4 + sector, to `out` (n,). An
     unknown key gets the next free slot; the table must have room for it. `used` is the number of
@@ -134,7 +134,7 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int, out: Int
     return used
 
 
-@refcount_free
+@refcount_free_locked
 def assign_rows(
     table: IntArray, rows: RecordArray, wanted: IntArray, used: int, out: IntArray
 ) -> int:
@@ -152,7 +152,7 @@ def assign_rows(
     return used
 
 
-@refcount_free
+@refcount_free_locked
 def fill_table(table: IntArray, rows: RecordArray, used: int) -> None:
     """Enter the row numbers from 0 to `used` - 1 into the empty hash table `table`, at the places
     that the keys of these rows determine.

@@ -160,7 +160,7 @@ def test_types_are_told_apart_and_parts_become_words() -> None:
     array = np.zeros((2, 3))
     kind = describe_type((array, (1, 2.0), True), words)
     assert kind == "tuple(<f8[2],tuple(int,float),bool)"
-    assert words == [array.ctypes.data, 2, 3, 1, 1 << 62, 1]
+    assert words == [id(array), 2, 3, 1, 1 << 62, 1]
 
 
 @pytest.mark.parametrize("value", [np.zeros((2, 2)).T[:1], np.zeros(4)[::2], "text", 1 << 63])
