@@ -74,7 +74,7 @@ def archive_jobs(
         if not config.put_to and not any(segments.list_segments(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
-        words += ["--to", config.put_to] if config.put_to else []
+        words += ["--put-to", config.put_to] if config.put_to else []
         output = subprocess_job.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 

@@ -13,10 +13,8 @@ from schemas.errors import InputError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `fleet-service compact`."""
     add_archive(parser)
-    # Until version 0.2 the option was called --to.
     parser.add_argument(
         "--put-to",
-        "--to",
         dest="to",
         metavar="URI",
         help="URI to which new files are copied afterwards, e.g. s3://bucket/folder",

@@ -304,7 +304,7 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
     root = tmp_path / "archive"
     there = tmp_path / "there"
     fill(root, 2, 50)
-    assert main(["compact", "--archive", str(root), "--to", there.as_uri()]) == 0
+    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
     copies = {path.relative_to(there): path.read_bytes() for path in there.rglob("*.parquet")}
     originals = [path for folder in mirror.FOLDERS for path in (root / folder).rglob("*.parquet")]
     assert copies == {path.relative_to(root): path.read_bytes() for path in originals}
