@@ -8,7 +8,10 @@ start.
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +19,12 @@ from schemas.runtime.jit import use_native_kernels
 from schemas.runtime.kernel_library import KernelLibrary
 from schemas.runtime.process import end_with_parent
 
+RECORD: Final = (
+    "import sys; from pathlib import Path; from fleet_service.app.native_library import "
+    "record_calls; record_calls(Path(sys.argv[1]))"
+)
+# Variables with which Numba compiles for another processor than that of this machine.
+OTHER_PROCESSOR: Final = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
 LIBRARY: Final = KernelLibrary(
     "fleet_service", "fleet_service.app.native_library", Path(__file__).parents[1] / "kernels"
 )
@@ -32,18 +41,37 @@ def build_service_library(path: Path) -> None:
     """Build the service's shared library `path`. The library contains the kernels (compiled
     functions) that `precompile.exercise_map` calls.
 
+    A separate process records the calls, because it runs the kernels. This process may compile them
+    for a processor with instructions that the processor of this machine lacks.
+
     Raises:
-        OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
+        OSError, subprocess.CalledProcessError: there is no linker, or a step fails.
         TypeError: a kernel allocates memory.
     """
     from schemas.runtime.native_build import CallRecorder, build_library
+
+    recorder = CallRecorder()
+    use_native_kernels(recorder)
+    with tempfile.TemporaryDirectory() as folder:
+        calls = Path(folder) / "calls"
+        own = {name: value for name, value in os.environ.items() if name not in OTHER_PROCESSOR}
+        subprocess.run([sys.executable, "-c", RECORD, str(calls)], env=own, check=True)
+        recorder.load_calls(calls)
+    build_library(recorder, path)
+
+
+def record_calls(path: Path) -> None:
+    """Run `precompile.exercise_map`, and write the calls of kernels (compiled functions) to the
+    file `path`.
+    """
+    from schemas.runtime.native_build import CallRecorder
 
     recorder = CallRecorder(runs=True)
     use_native_kernels(recorder)
     from fleet_service.app.precompile import exercise_map
 
     exercise_map()
-    build_library(recorder, path)
+    recorder.save_calls(path)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,15 @@ run.
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import subprocess
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 import numba
@@ -72,6 +74,55 @@ class CallRecorder(Library):
         symbol = symbol_of(kernel.name, describe_type(arguments, []))
         self.calls.setdefault(symbol, (kernel, arguments))
         return kernel.numba_kernel(*arguments) if self._runs else 0
+
+    def save_calls(self, path: Path) -> None:
+        """Write the recorded calls to the file `path`. Arrays are replaced by their types, because
+        only these matter for a library.
+        """
+        calls = [
+            (*kernel.name.rsplit(".", 1), _replace_arrays(arguments))
+            for kernel, arguments in self.calls.values()
+        ]
+        path.write_bytes(pickle.dumps(calls))
+
+    def load_calls(self, path: Path) -> None:
+        """Record the calls that `save_calls` of another process wrote to the file `path`."""
+        for module, name, types_of_arrays in pickle.loads(path.read_bytes()):
+            kernel = getattr(import_module(module), name)
+            arguments = _make_arrays(types_of_arrays)
+            symbol = symbol_of(kernel.name, describe_type(arguments, []))
+            self.calls.setdefault(symbol, (kernel, arguments))
+
+
+class _ArrayType(NamedTuple):
+    """Type of an array: type of its elements, number of dimensions, and whether it may be
+    written.
+    """
+
+    element: np.dtype[Any]
+    dimensions: int
+    writeable: bool
+
+
+def _replace_arrays(value: Any) -> Any:
+    """Return an argument of a kernel with each array replaced by its `_ArrayType`."""
+    if isinstance(value, np.ndarray):
+        return _ArrayType(value.dtype, value.ndim, value.flags.writeable)
+    return _rebuild_tuple(value, _replace_arrays) if isinstance(value, tuple) else value
+
+
+def _make_arrays(value: Any) -> Any:
+    """Return an argument of a kernel with an empty array for each `_ArrayType`."""
+    if isinstance(value, _ArrayType):
+        array = np.empty((0,) * value.dimensions, value.element)
+        array.flags.writeable = value.writeable
+        return array
+    return _rebuild_tuple(value, _make_arrays) if isinstance(value, tuple) else value
+
+
+def _rebuild_tuple(value: tuple[Any, ...], change: Callable[[Any], Any]) -> tuple[Any, ...]:
+    parts = [change(part) for part in value]
+    return tuple(parts) if type(value) is tuple else type(value)(*parts)
 
 
 def build_library(recorder: CallRecorder, path: Path) -> None:
