@@ -258,9 +258,9 @@ def read_road(
 
 @refcount_free_inlined
 def read_slippery(weights: FloatArray, cells: RecordArray, row: int, p: FloatArray) -> float:
-    """Return P(slippery) of the belief about a road, see `read_road`, in a sixteenth of its time.
-    `weights` (kernels, 2, 32) are the contributions of each bin of `p` to P(slippery) of the road,
-    and to the sum of its probabilities.
+    """Return P(slippery) of the belief about a road, see `read_road`, with a sixteenth of its
+    multiplications. `weights` (kernels, 2, 32) are the contributions of each bin of `p` to
+    P(slippery) of the road, and to the sum of its probabilities.
     """
     weight = weights[kernel_of(cells, row)]
     slippery = 0.0

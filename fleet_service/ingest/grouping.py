@@ -4,8 +4,6 @@ restart processes tens of millions of rows. Compiled, pure (no I/O).
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,24 +21,17 @@ def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntAr
     table = np.full(2 * len(a) + 1, -1, np.int32)
     group = np.empty(len(a), np.int32)
     first = np.empty(len(a), np.int64)
-    groups = _group_rows(Keys(a, b, c), table, group, first)
+    groups = _group_rows(a, b, c, table, group, first)
     return group, first[:groups].copy()
 
 
-class Keys(NamedTuple):
-    """The three numbers (n,) by which n rows are grouped."""
-
-    a: IntArray
-    b: IntArray
-    c: IntArray
-
-
 @refcount_free_locked
-def _group_rows(keys: Keys, table: Int32Array, group: Int32Array, first: IntArray) -> int:
+def _group_rows(
+    a: IntArray, b: IntArray, c: IntArray, table: Int32Array, group: Int32Array, first: IntArray
+) -> int:
     """Write the group of each row to `group` (n,), and the first row of each group to `first`.
     `table` is an empty hash table of group numbers. Return the number of groups.
     """
-    a, b, c = keys
     places = len(table)
     k = 0
     for i in range(len(a)):
