@@ -221,7 +221,7 @@ def test_region_is_announced_only_while_queries_are_answered(
         running(router, tmp_path / "one", name="first", regions=NAMES[:1]),
         zenoh_session(router) as other,
     ):
-        assert {token.service for token in presence.active_tokens(other)} == {"first"}
+        until(lambda: {token.service for token in presence.active_tokens(other)} == {"first"})
     assert seen == [set(), set()]
 
 
