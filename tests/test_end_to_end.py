@@ -20,6 +20,7 @@ from schemas import mugrid
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
+from tests.event_lines import logger_into
 from tests.waiting import matched, until
 
 VEHICLES = ("anna", "bert", "cleo")
@@ -48,7 +49,7 @@ class System:
     def start(self) -> None:
         """Start a service on the archive, also after `stop`, and wait until it is ready."""
         self._stop = threading.Event()
-        service = Service(self.config, self.folder / "archive", self.said.append)
+        service = Service(self.config, self.folder / "archive", logger_into(self.said))
         self._thread = threading.Thread(target=service.run, args=(self._stop,))
         before = len(self.said)
         self._thread.start()

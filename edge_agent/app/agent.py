@@ -39,8 +39,8 @@ from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from schemas.config import AgentConfig
 from schemas.runtime import progress_messages
+from schemas.runtime.logs import event_logger, log_warnings, print_line, values
 from schemas.runtime.metrics import Metric, serve_metrics
-from schemas.runtime.process import LogLine, line_logger, log_as, print_line
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
 
@@ -131,7 +131,7 @@ class Agent:
         Print one line with the counts of blocks and records, and return 0.
         """
         config = self.options.config
-        log_as(config.log, sys.stderr)
+        log_warnings(config.log, sys.stderr)
         self._warm_up()
         with (
             stop_on_signal() as stop,
@@ -162,14 +162,11 @@ class Agent:
             options.names, options.config, self.estimator, self._attach_session
         )
         self._publisher = publisher
-        log_line = line_logger(options.config.log, sys.stderr)
+        events = event_logger("agent", options.config.log, sys.stderr)
         who = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
-        log_line(
-            LogLine(
-                f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s",
-                event="ready",
-                vehicles=len(options.names),
-            )
+        events.info(
+            f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s",
+            extra=values(event="ready", vehicles=len(options.names)),
         )
         watch = SignalWatch()
         connect = options.config.zenoh.connect
@@ -177,7 +174,7 @@ class Agent:
             lambda: reasons_not_publishing(
                 watch, publisher.status, connect, source.health_problems()
             ),
-            log_line,
+            events,
         )
         for part in self.parts:
             part.start_part()
@@ -193,7 +190,7 @@ class Agent:
             publisher,
             stop,
             LoopOptions(
-                on_status=partial(print_status, publisher=publisher, log_line=log_line),
+                on_status=partial(print_status, publisher=publisher, events=events),
                 duration_s=options.duration_s,
                 is_admitted=source.is_admitted,
                 after=after_block,

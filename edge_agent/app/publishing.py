@@ -5,13 +5,14 @@ closing function prints the final counts of records.
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from schemas.config import AgentConfig
-from schemas.runtime.process import LogLine, print_line
+from schemas.runtime.logs import print_line, values
 
 if TYPE_CHECKING:
     import zenoh
@@ -79,7 +80,7 @@ def close_publisher(
     print(json.dumps(final_counts(progress, publisher) | more), flush=True)
 
 
-def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
+def print_status(progress: Progress, publisher: Publisher, events: logging.Logger) -> None:
     """Print one line with the progress of the estimation loop and the publisher's counts of
     records.
     """
@@ -93,4 +94,4 @@ def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[s
         f"{sum(counts.acknowledged.values())} acknowledged, "
         f"{publisher.count_unsettled()} unsettled{late}"
     )
-    log_line(LogLine(text, event="status", **final_counts(progress, publisher)))
+    events.info(text, extra=values(event="status", **final_counts(progress, publisher)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,7 @@ import numpy as np
 
 from edge_agent.inputs.block import Block
 from edge_agent.publish.ack_settlement import Counts
-from schemas.runtime.process import LogLine
+from schemas.runtime.logs import values
 from schemas.signals import S
 
 # [s] time from the first block to the first check. Meanwhile a session opens and a receiver finds
@@ -142,18 +143,18 @@ class ReasonReporter:
 
     Args:
         find: returns the present reasons.
-        say: prints a line.
+        events: logger of the agent's events.
         clock: returns the time of a monotonic clock [s].
     """
 
     def __init__(
         self,
         find: Callable[[], list[str]],
-        say: Callable[[str], None],
+        events: logging.Logger,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._find = find
-        self._say = say
+        self._events = events
         self._clock = clock
         self._due: float | None = None
         self._told: list[str] = []
@@ -174,4 +175,5 @@ class ReasonReporter:
             return
         self._told = alike
         text = f"not published: {'; '.join(found)}" if found else "publishing: records are sent"
-        self._say(LogLine(text, event="unpublished" if found else "publishing", reasons=found))
+        event = "unpublished" if found else "publishing"
+        self._events.info(text, extra=values(event=event, reasons=found))

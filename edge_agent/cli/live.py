@@ -17,7 +17,7 @@ from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
 from schemas.runtime import progress_messages
-from schemas.runtime.process import LogLine, line_logger
+from schemas.runtime.logs import event_logger, values
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
@@ -109,22 +109,17 @@ def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     A warning contains the time [s] until the car reaches the slippery stretch of road. In JSON, an
     infinite time is written as null.
     """
-    say = line_logger(config.log, sys.stdout)
+    events = event_logger("ahead", config.log, sys.stdout)
 
     def print_warning(vehicle: str, warning: GripWarning) -> None:
-        values = {
+        parts = {
             name: None if value == math.inf else value
             for name, value in vars(warning).items()
             if name != "time"
         }
-        say(
-            LogLine(
-                f"{vehicle}: {warning.line()}",
-                event="warning",
-                vehicle=vehicle,
-                at=warning.time,
-                **values,
-            )
+        events.info(
+            f"{vehicle}: {warning.line()}",
+            extra=values(event="warning", vehicle=vehicle, at=warning.time, **parts),
         )
 
     return print_warning

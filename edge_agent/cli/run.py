@@ -185,7 +185,7 @@ def _make_vss_output(
     if not args.vss and args.kuksa is None:
         return None
     from edge_agent.publish.vss import RoadFrictionOutput
-    from schemas.runtime.process import print_line
+    from schemas.runtime.logs import print_line
 
     def print_signal(line: str) -> None:
         if args.vss:

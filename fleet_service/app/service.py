@@ -11,6 +11,7 @@ Zenoh queries  ─► answered in Zenoh's own threads
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -63,7 +64,7 @@ class Service:
     Args:
         config: settings.
         root: folder of the archive.
-        log_line: called with lines for the operator.
+        events: logger of the lines for the operator.
         holding: ownership of the archive; None to open it without a lease (ownership limited in
             time).
 
@@ -75,12 +76,12 @@ class Service:
         self,
         config: ServiceConfig,
         root: Path,
-        log_line: Callable[[str], None],
+        events: logging.Logger,
         holding: Ownership | None = None,
     ) -> None:
         self._config = config
         self._root = root
-        self._log_line = log_line
+        self._events = events
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
@@ -100,7 +101,7 @@ class Service:
         self._endpoints = Endpoints(config, self.engine, self.inbox, self._replies)
         self.engine.settlement.call_when_written(self.inbox.wake)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
-        self._upkeep = BackgroundJobs(jobs, self.engine.counts, log_line)
+        self._upkeep = BackgroundJobs(jobs, self.engine.counts, events.info)
         # Exception that ended the worker. Closing the session after it may hang.
         self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
@@ -112,7 +113,7 @@ class Service:
             time.monotonic,
         )
         self._stepped_at = self._flushed_at = self._repeated_at = time.monotonic()
-        self._status_line = StatusLine(self.engine, self.inbox, self._clock, log_line)
+        self._status_line = StatusLine(self.engine, self.inbox, self._clock, events)
         self._began = self._stepped_at
         self._survived = False
         self._followed = False  # True once another service has the lease
@@ -155,7 +156,7 @@ class Service:
             serving_regions(session, mine),
         ):
             self._session = session
-            self._log_line(
+            self._events.info(
                 f"ready: {self._config.name}, {self.engine.state.fusion.size} cells from the "
                 f"archive{address}"
             )
@@ -249,7 +250,7 @@ class Service:
         if self._status_line.is_due(now):
             self._status_line.write_line(now)
             if hanging := self._hanging():
-                self._log_line(f"watchdog signal withheld: {hanging}")
+                self._events.info(f"watchdog signal withheld: {hanging}")
             else:
                 watchdog.notify_alive()
         if not self._survived and now - self._began >= SURVIVED_S:
@@ -264,7 +265,7 @@ class Service:
             self._followed = True
             # From here on, waiting for a bucket or a router must not delay the end for long.
             stop.set()
-            self._log_line(
+            self._events.info(
                 "lease lost to another service; senders keep everything that was not acknowledged"
             )
             return

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable
 from typing import Final
 
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Inbox
-from schemas.runtime.process import LogLine
+from schemas.runtime.logs import values
 from schemas.wire import Kind
 
 STATUS_S: Final = 5.0
@@ -20,12 +20,12 @@ class StatusLine:
     """Status of a service as a line of text: observations, cells, alerts, queue and clock."""
 
     def __init__(
-        self, engine: Engine, inbox: Inbox, clock: SteadyClock, log_line: Callable[[str], None]
+        self, engine: Engine, inbox: Inbox, clock: SteadyClock, events: logging.Logger
     ) -> None:
         self._engine = engine
         self._inbox = inbox
         self._clock = clock
-        self._log_line = log_line
+        self._events = events
         self._reported_at = time.monotonic()
         self._reported = 0
 
@@ -58,11 +58,7 @@ class StatusLine:
                 else ""
             )
         )
-        self._log_line(
-            LogLine(
-                text,
-                cells=self._engine.state.fusion.size,
-                queue=len(self._inbox),
-                counts=dict(counts),
-            )
+        cells = self._engine.state.fusion.size
+        self._events.info(
+            text, extra=values(cells=cells, queue=len(self._inbox), counts=dict(counts))
         )

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 from fleet_service.cli.common import stop_on_signals
 from schemas.errors import InputError
 from schemas.runtime import progress_messages
-from schemas.runtime.process import force_exit, line_logger, log_as
+from schemas.runtime.logs import event_logger, log_warnings
+from schemas.runtime.process import force_exit
 
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     os.umask(os.umask(0o077) | PRIVATE)
     config = load(arguments.config, ServiceConfig)
-    log_as(config.log, sys.stderr, service=config.name)
+    log_warnings(config.log, sys.stderr, service=config.name)
     root = arguments.archive or config.archive.path
     if root is None:
         raise InputError(
@@ -79,16 +80,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     try:
-        log_line = line_logger(config.log, sys.stdout, service=config.name)
+        events = event_logger("service", config.log, sys.stdout, service=config.name)
         if config.standby:
             with progress_messages.show_status("compiling"):
                 warm_up()  # so that a take-over does not wait for compilation
-        holding = _open_archive(config, root, stop, log_line)
+        holding = _open_archive(config, root, stop, events.info)
         if holding is None:
             return 0
         try:
             with progress_messages.show_status("starting"):
-                service = Service(config, root, log_line, holding)
+                service = Service(config, root, events, holding)
         except BaseException:
             holding.close()
             raise
@@ -101,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     gc.freeze()
     stopped = threading.Event()
     threading.Thread(
-        target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True
+        target=_force_exit_when_stuck, args=(stop, stopped, service, events.info), daemon=True
     ).start()
     service.run(stop)
     stopped.set()

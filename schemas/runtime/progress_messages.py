@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
-from schemas.runtime.process import print_line
+from schemas.runtime.logs import print_line
 
 PATIENCE_S: Final = 0.8  # delay of the spinner: short commands show none
 TICK_S: Final = 1.0

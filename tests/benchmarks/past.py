@@ -26,6 +26,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
+from tests.event_lines import logger_into
 from tests.waiting import until
 
 WORLD = SyntheticFleet(1_000_000, days=3)
@@ -88,7 +89,7 @@ def _open_service(root: Path) -> Iterator[zenoh.Session]:
     stop = threading.Event()
     with router:
         service = Service(
-            ServiceConfig(zenoh=settings, compact_s=0.0, snapshot_s=0.0), root, lines.append
+            ServiceConfig(zenoh=settings, compact_s=0.0, snapshot_s=0.0), root, logger_into(lines)
         )
         thread = threading.Thread(target=service.run, args=(stop,))
         thread.start()

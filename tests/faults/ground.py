@@ -23,6 +23,7 @@ from fleet_service.app.service import Service
 from schemas import keys, wire
 from schemas.config import ServiceConfig
 from schemas.errors import WireError
+from tests.event_lines import logger_into
 from tests.fleet_service.examples import SECOND, TILE, batch, key
 from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, settings
 from tests.waiting import matched, until
@@ -153,7 +154,7 @@ def open_ground(network: Network) -> Iterator[Ground]:
         segment_s=0.05,
     )
     lines: list[str] = []
-    service = Service(config, Path(network.folder, "archive"), lines.append)
+    service = Service(config, Path(network.folder, "archive"), logger_into(lines))
     stop = threading.Event()
     thread = threading.Thread(target=service.run, args=(stop,))
     thread.start()

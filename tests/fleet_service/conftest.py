@@ -16,6 +16,7 @@ from fleet_service.app.service import Service
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.buckets import BucketServer, bucket_server
+from tests.event_lines import logger_into
 from tests.waiting import until
 
 PUT_S = 0.1
@@ -63,7 +64,7 @@ def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Ru
         **changed,  # type: ignore[arg-type]
     )
     lines: list[str] = []
-    service = Service(config, root, lines.append)
+    service = Service(config, root, logger_into(lines))
     stop = threading.Event()
     thread = threading.Thread(target=service.run, args=(stop,))
     thread.start()

@@ -199,7 +199,7 @@ import sys, threading
 from fleet_service.app import service
 from fleet_service.app.jobs import Job
 from fleet_service.cli import main
-from schemas.runtime.process import print_line
+from schemas.runtime.logs import print_line
 def hangs(_):
     print_line("hangs", sys.stdout)
     threading.Event().wait()

@@ -27,6 +27,7 @@ from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.changed_tiles import changed_tiles
+from tests.event_lines import logger_into
 from tests.fleet_service.archive.kept import DATA
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.secured import make_enrolment
@@ -81,7 +82,7 @@ def of_compaction(config: ServiceConfig, root: Path) -> object:
 
 def of_service(look: Callable[[Service], object]) -> Show:
     def show(config: ServiceConfig, root: Path) -> object:
-        made = Service(config, root, lambda _: None)
+        made = Service(config, root, logger_into([]))
         with closing(made.engine):
             return look(made)
 

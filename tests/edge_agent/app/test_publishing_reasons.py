@@ -15,6 +15,7 @@ from edge_agent.inputs.block import Block
 from edge_agent.publish.ack_settlement import Counts
 from schemas.signals import CHANNELS, S
 from schemas.wire import Kind
+from tests.event_lines import logger_into
 
 ENDPOINTS = ("tcp/127.0.0.1:7447",)
 NAMED_S = 5.0
@@ -80,7 +81,7 @@ def told_within(
     clock = Clock()
     lines = list[str]()
     watch = SignalWatch(clock)
-    reporter = ReasonReporter(lambda: find(watch), lines.append, clock)
+    reporter = ReasonReporter(lambda: find(watch), logger_into(lines), clock)
     for _ in range(round(seconds / 0.1)):
         watch.add(source)
         reporter.print_if_due()

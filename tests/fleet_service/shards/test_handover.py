@@ -21,6 +21,7 @@ from fleet_service.replication.ownership import acquire_archive
 from fleet_service.shards.serving import standby_signs
 from schemas.config import ServiceConfig, ZenohSettings
 from tests.buckets import BucketServer
+from tests.event_lines import logger_into
 from tests.fleet_service.app.test_copy import BATCHES, read_image, reports
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.replication.test_lease import make_driver
@@ -69,7 +70,7 @@ class Machine:
         with standby_signs(self._config, self.stop) as signs:
             holding = acquire_archive(self._config, self._root, self.stop, self.lines.append, signs)
         if holding is not None:
-            self.service = Service(self._config, self._root, self.lines.append, holding)
+            self.service = Service(self._config, self._root, logger_into(self.lines), holding)
             self.service.run(self.stop)
 
 

@@ -4,9 +4,7 @@ health must follow the reported problems, and log lines must be JSON if requeste
 
 from __future__ import annotations
 
-import io
 import json
-import logging
 import socket
 import urllib.error
 import urllib.request
@@ -19,7 +17,6 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from schemas.errors import InputError
 from schemas.runtime import metrics
 from schemas.runtime.metrics import Metric, gauge, serve_metrics
-from schemas.runtime.process import LogLine, line_logger, log_as
 
 HOSTILE = 'a"b\\c\nd<script>'
 
@@ -83,46 +80,6 @@ def test_a_taken_port_is_said() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"^metrics_port: cannot listen on 127.0.0.1:{port}"):
             serve_metrics("127.0.0.1", port, read_metrics, list).__enter__()
-
-
-def test_lines_are_text_for_people_and_json_for_programs() -> None:
-    line = LogLine("status: 3 rows", rows=3, counts={"late": 1})
-    plain = io.StringIO()
-    structured = io.StringIO()
-    line_logger("text", plain)(line)
-    line_logger("json", structured, service="shard-0")(line)
-    line_logger("json", structured)("compacted: 7 rows\nof <many>")
-    assert plain.getvalue() == "status: 3 rows\n"
-    first, second = (json.loads(text) for text in structured.getvalue().splitlines())
-    assert (first["event"], first["rows"], first["counts"], first["service"]) == (
-        "status",
-        3,
-        {"late": 1},
-        "shard-0",
-    )
-    assert (second["event"], second["message"], second["level"]) == (
-        "compacted",
-        "compacted: 7 rows\nof <many>",
-        "info",
-    )
-
-
-def test_warnings_of_the_program_take_the_same_form() -> None:
-    stream = io.StringIO()
-    before = logging.root.handlers[:]
-    level = logging.root.level
-    try:
-        log_as("json", stream, service="shard-0")
-        logging.getLogger("edge_agent.publish.publisher").warning("batch %d was rejected", 7)
-    finally:
-        logging.root.handlers[:] = before
-        logging.root.setLevel(level)
-    record = json.loads(stream.getvalue())
-    assert (record["level"], record["event"], record["message"]) == (
-        "warning",
-        "edge_agent.publish.publisher",
-        "batch 7 was rejected",
-    )
 
 
 def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TALK = "import sys\nfrom schemas.runtime.process import print_line\n"
+TALK = "import sys\nfrom schemas.runtime.logs import print_line\n"
 TALK += "for _ in range(3): print_line('hello', sys.stderr)\nsys.exit(7)"
 
 
@@ -78,7 +78,7 @@ def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
 
 MANY = """
 import sys, threading
-from schemas.runtime.process import print_line
+from schemas.runtime.logs import print_line
 sys.setswitchinterval(1e-6)
 def talk(who):
     for number in range(5000):
