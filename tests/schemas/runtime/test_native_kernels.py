@@ -119,7 +119,6 @@ def run_python(folder: Path, code: str, *words: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.campaign
 def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
     """The library must run kernels (compiled functions) without importing Numba, and must return
     the same results as Numba. An exception in a kernel must be raised as ArithmeticError. Numba
@@ -142,7 +141,6 @@ def test_a_library_runs_kernels_without_numba(tmp_path: Path) -> None:
     assert by_numba[:2] == [result, "ValueError"]
 
 
-@pytest.mark.campaign
 def test_a_kernel_that_allocates_memory_is_refused(tmp_path: Path) -> None:
     """A library has no memory management of Numba. So the build of a library with a kernel that
     allocates an array must fail, and its message must tell what to do.
