@@ -26,9 +26,9 @@ from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.weather import weather_files as weather_files
 from fleet_service.replay import checkpoints
-from fleet_service.replay.checkpoints import Taken
 from fleet_service.replication.ownership import Ownership, open_exclusive
 from schemas.config import ServiceConfig
+from schemas.runtime.forked import ForkedWork, run_forked
 
 T = TypeVar("T")
 
@@ -121,19 +121,38 @@ class Engine:
         with self._shared.guard:
             return self.state.drop_old()
 
-    def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """Return the content of a checkpoint (for a fast restart): a copy of the state, and the
-        name of the last segment (file of new rows) that it includes. Return None if the event
-        `stop` is set before the copy is made.
+    def save_checkpoint(self, stop: threading.Event) -> bool:
+        """Save a checkpoint (state of the service, for a fast restart). Return False if the event
+        `stop` is set before it is complete.
 
-        Another thread calls this. The worker (the thread that processes messages) makes the copy
-        directly after a segment was written, when all rows in the state are on disk.
+        Another thread calls this. A child process with a copy of the memory writes the files, so
+        that the service continues meanwhile. The worker (the thread that processes messages) starts
+        it directly after a segment (file of new rows) was written, when all rows in the state are
+        on disk.
+
+        Raises:
+            OSError: the disk is full, no segment could be written for too long, or the operating
+                system has no memory for the child process.
         """
-        return self.settlement.run_between_segments(self._image, stop)
+        writing = self.settlement.run_between_segments(self._start_checkpoint, stop)
+        if writing is None:
+            return False
+        try:
+            writing.wait()
+        except ChildProcessError:
+            if stop.is_set():
+                return False
+            raise
+        return True
 
-    def _image(self) -> Taken:
+    def _start_checkpoint(self) -> ForkedWork:
+        known = weather_files(self._root)
         with self._shared.guard:
-            return self.state.image(self.settlement.newest_segment, weather_files(self._root))
+            return run_forked(
+                lambda: checkpoints.save_checkpoint(
+                    self._root, self.state.image(self.settlement.newest_segment, known)
+                )
+            )
 
     def mark_survived(self) -> None:
         """Record that the service has run well for a while after starting from its checkpoint

@@ -23,7 +23,6 @@ from fleet_service.archive.format.load import count_set_aside
 from fleet_service.archive.maintenance import disk_reserve
 from fleet_service.archive.maintenance.retention import retire_rows
 from fleet_service.ingest import weather
-from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.process import trim_memory
@@ -90,9 +89,7 @@ def archive_jobs(
         return None
 
     def checkpoint(stop: threading.Event) -> str | None:
-        taken = engine.checkpoint(stop)
-        if taken is not None:
-            checkpoints.save_checkpoint(root, taken)
+        engine.save_checkpoint(stop)
         return None
 
     def retention(_: threading.Event) -> str | None:

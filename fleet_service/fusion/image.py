@@ -62,7 +62,8 @@ LAYOUT: Final = hashlib.blake2b(
 
 def image_of(fusion: Fusion) -> Image:
     """Return the complete state of a fusion (beliefs about all cells) as plain arrays. Rows keep
-    their numbers, because the tables refer to each other by row.
+    their numbers, because the tables refer to each other by row. Later updates of the fusion also
+    change the arrays.
     """
     store = fusion.store
     state = fusion.store.state
@@ -108,9 +109,7 @@ def image_of(fusion: Fusion) -> Image:
     }
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
-    return {
-        name: {key: column.copy() for key, column in table.items()} for name, table in image.items()
-    }
+    return image
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:

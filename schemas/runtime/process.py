@@ -46,12 +46,12 @@ def trim_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def end_with_parent() -> None:
-    """On Linux, make the operating system end this process as soon as its parent process ends;
-    elsewhere do nothing.
+def end_with_parent(number: int = signal.SIGTERM) -> None:
+    """On Linux, make the operating system send the signal `number` to this process as soon as the
+    thread that started it ends; elsewhere do nothing.
     """
     with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, number)
 
 
 def force_exit(code: int) -> NoReturn:

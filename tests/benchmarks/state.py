@@ -53,7 +53,7 @@ def state() -> list[Figure]:
         )
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
-            took, held = checkpoint_s(engine, root, make_messages(SINCE, 10, now), now)
+            took, held = checkpoint_s(engine, make_messages(SINCE, 10, now), now)
             cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
     told = (
@@ -71,7 +71,7 @@ def state() -> list[Figure]:
     ]
 
 
-def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
+def checkpoint_s(engine: Engine, sent: list[Message], now: int) -> tuple[float, float]:
     """Ingest all messages of `sent`, and request a checkpoint (saved state) meanwhile. Return two
     times [s]: from the request until the checkpoint is on disk, and the longest pass of the
     service's main loop (worker).
@@ -96,9 +96,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
         engine.intake.ingest(part, now)
     worker.start()
     began = time.perf_counter()
-    taken = engine.checkpoint(threading.Event())
-    assert taken is not None
-    checkpoints.save_checkpoint(root, taken)
+    assert engine.save_checkpoint(threading.Event())
     took = time.perf_counter() - began
     busy = len(turns)
     saved.set()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 import time
 from contextlib import closing
 from io import BytesIO
@@ -20,7 +19,7 @@ from fleet_service.app import UNUSED
 from schemas.runtime.process import limit_memory
 
 if TYPE_CHECKING:
-    from fleet_service.app.engine import Engine
+    pass
 
 
 def main() -> None:
@@ -46,10 +45,11 @@ def _answer_past(root: Path) -> dict[str, float]:
 def _start_engine(root: Path, and_checkpoint: bool) -> dict[str, float]:
     from fleet_service.app.engine import Engine
     from schemas.config import ServiceConfig
+    from tests.fleet_service.checkpoint_writer import save_checkpoint
 
     with closing(Engine(ServiceConfig(), root)) as engine:
         if and_checkpoint:
-            _write_checkpoint(engine, root)
+            save_checkpoint(engine)
         return {"cells": engine.state.fusion.size, "processor_s": time.process_time()}
 
 
@@ -59,19 +59,6 @@ def _most_mb() -> float:
     """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
-
-
-def _write_checkpoint(engine: Engine, root: Path) -> None:
-    from fleet_service.replay import checkpoints
-
-    taken: list[checkpoints.Taken | None] = []
-    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(threading.Event())))
-    thread.start()
-    while thread.is_alive():
-        engine.settlement.flush()
-        thread.join(0.1)
-    assert taken[0] is not None
-    checkpoints.save_checkpoint(root, taken[0])
 
 
 if __name__ == "__main__":

@@ -39,7 +39,6 @@ from fleet_service.archive.maintenance.retention import (
 )
 from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
-from fleet_service.replay import checkpoints
 from schemas import grid, keys, tables, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -186,15 +185,13 @@ class ServiceHistory(Lives[Sent]):
         """
         stop = threading.Event()
         with ThreadPoolExecutor(1) as upkeep:
-            coming = upkeep.submit(engine.checkpoint, stop)
+            coming = upkeep.submit(engine.save_checkpoint, stop)
             try:
                 while not coming.done():
                     self._flush_acks(engine)
             finally:
                 stop.set()
-        taken = coming.result()
-        if taken is not None:
-            checkpoints.save_checkpoint(root, taken)
+        if coming.result():
             snapshots.write_snapshot(root, engine.queries.whole_map(self._now), self._now)
 
     def _make_batch(self) -> Sent:

@@ -24,7 +24,6 @@ from fleet_service.archive.format import reading, segments
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
-from fleet_service.replay import checkpoints
 from fleet_service.replication.replica import OWNER
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
@@ -33,6 +32,7 @@ from tests.buckets import SECRET, BucketServer, list_copied_files
 from tests.fleet_service.app.test_erasing import MONTH, pseudonyms_of
 from tests.fleet_service.app.test_kill import identities, list_archived
 from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
 
@@ -65,7 +65,7 @@ def read_image(engine: Engine) -> dict[str, pa.Table]:
     """Return the engine's state that a service restores after a restart: map, trust in vehicles,
     known batches and alerts. The engine is a service without network.
     """
-    return dict(engine._image().tables)
+    return dict(engine.state.image(engine.settlement.newest_segment, []).tables)
 
 
 @pytest.mark.parametrize("with_checkpoint", [False, True])
@@ -81,7 +81,7 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         take(engine, first)
         assert len(engine.settlement.flush()) == VEHICLES
         if with_checkpoint:
-            checkpoints.save_checkpoint(root, engine._image())
+            save_checkpoint(engine)
             assert engine.copy is not None
             engine.copy.sync()
         take(engine, second)

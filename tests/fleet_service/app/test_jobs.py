@@ -118,7 +118,7 @@ def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
         closing(Engine(ServiceConfig(), tmp_path)) as engine,
         pytest.raises(OSError, match="no segment"),
     ):
-        engine.checkpoint(threading.Event())  # no worker runs here, so nothing is written
+        engine.save_checkpoint(threading.Event())  # no worker runs here, so nothing is written
 
 
 def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -32,13 +31,12 @@ from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import WeatherMessage
-from fleet_service.replay import checkpoints
 from fleet_service.serve.encode import cell_table
 from schemas import grid, keys, weather, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Batch, Kind
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import SECOND, batch
-from tests.waiting import until
 
 DATA: Final = Path(__file__).parent / "data"
 MIDNIGHT: Final = 20_001 * 86_400 * SECOND
@@ -121,27 +119,6 @@ def messages(turn: int) -> Iterator[Message]:
             )
 
 
-def take_checkpoint(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
-    """Write a checkpoint as the service does: one thread requests it, and the worker (which
-    processes messages) writes it.
-    """
-    found: list[object] = []
-    stop = threading.Event()
-    thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))
-    thread.start()
-
-    def is_taken() -> bool:
-        engine.settlement.flush()
-        return bool(found)
-
-    try:
-        until(is_taken)
-    finally:
-        stop.set()
-        thread.join()
-    return found[0]
-
-
 def map_of(engine: Engine, at: int) -> dict[str, Any]:
     """Return the map at the time `at`: for every cell its columns and its belief (probabilities of
     friction), sorted by cell and heading sector.
@@ -176,7 +153,7 @@ def make(root: Path) -> dict[str, Any]:
                 compact(root)
                 rollup.complete_parts(root)
                 snapshots.write_snapshot(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
-                checkpoints.save_checkpoint(root, take_checkpoint(engine))
+                save_checkpoint(engine)
         rows = {str(kind): engine.counts[kind] for kind in Kind}
         return map_of(engine, now_of(ROUNDS)) | {
             "alerts": engine.alerts.count,

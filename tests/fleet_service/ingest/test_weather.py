@@ -40,7 +40,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError, WireError
 from schemas.weather import Report
 from schemas.wire import Kind
-from tests.fleet_service.archive.kept import take_checkpoint
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.waiting import matched, until
@@ -175,7 +175,7 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
             engine.intake.update_weather(start + 600 * k * SECOND)
             drive(engine, start + 600 * k * SECOND, 1 + k)
             if k == 3:
-                checkpoints.save_checkpoint(root, take_checkpoint(engine))
+                save_checkpoint(engine)
         now = start + 5000 * SECOND
         right = beliefs(engine, now)
         before = archived_reports(root)

@@ -29,8 +29,8 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
-from tests.waiting import until
 
 DAY_S = 86_400.0
 
@@ -51,22 +51,8 @@ def keep(engine: Engine, root: Path) -> Path:
     thread requests the checkpoint; the worker thread makes it between two segments (files of new
     rows).
     """
-    taken: list[checkpoints.Taken | None] = []
-    stop = threading.Event()
-    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(stop)))
-    thread.start()
-
-    def is_taken() -> bool:
-        engine.settlement.flush()
-        return bool(taken)
-
-    try:
-        until(is_taken)
-    finally:
-        stop.set()
-        thread.join()
-    assert taken[0] is not None
-    return checkpoints.save_checkpoint(root, taken[0])
+    save_checkpoint(engine)
+    return checkpoints.list_checkpoints(root)[0]
 
 
 def beliefs(engine: Engine, at: int) -> FloatArray:
@@ -261,7 +247,7 @@ def test_a_checkpoint_half_written_is_none(tmp_path: Path) -> None:
     (tmp_path / "checkpoints" / ".draft").mkdir(parents=True)
     assert checkpoints.list_checkpoints(tmp_path) == []
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert engine.checkpoint(_set()) is None  # the service stops meanwhile
+        assert not engine.save_checkpoint(_set())  # the service stops meanwhile
         assert keep(engine, tmp_path).exists()
 
 

@@ -4,7 +4,6 @@ deceleration on them.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -20,7 +19,6 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
-from fleet_service.replay import checkpoints
 from fleet_service.serve.public_cells import PERIOD_NS
 from fleet_service.serve.view import CellView, coarsen_cells
 from fleet_service.serve.visitors import PART_NS, Visitors
@@ -28,6 +26,7 @@ from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.changed_tiles import changed_tiles
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import (
     CELL,
     LATITUDE,
@@ -196,8 +195,7 @@ def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
     engine = start(3)
     hear(engine, *MORE)
     engine.settlement.flush()
-    taken = taken_from(engine)
-    checkpoints.save_checkpoint(tmp_path, taken)
+    save_checkpoint(engine)
     for _ in ("checkpoint", "log"):
         engine.close()
         engine = start(3)
@@ -230,26 +228,12 @@ def test_a_restart_does_not_show_a_lone_vehicle(start: Start, tmp_path: Path, ba
     expected = rows(engine, at)
     assert [row["cell"] for row in expected] == [before["cell"]]
     if basis == "checkpoint":
-        checkpoints.save_checkpoint(tmp_path, taken_from(engine))
+        save_checkpoint(engine)
     engine.close()
     again = rows(start(3), at)
     assert len(again) == 1
     for name in ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "observations"):
         assert again[0][name] == pytest.approx(expected[0][name], abs=1e-6)
-
-
-def taken_from(engine: Engine) -> checkpoints.Taken:
-    """Return a checkpoint (saved state) of an engine, which is a service without network. The
-    calling thread acts as the worker, which writes segments (files of new rows) meanwhile.
-    """
-    found: list[checkpoints.Taken | None] = []
-    thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))
-    thread.start()
-    while thread.is_alive():
-        engine.settlement.flush()
-        thread.join(0.01)
-    assert found[0] is not None
-    return found[0]
 
 
 def test_visitors_are_never_counted_as_more_than_they_were() -> None:
