@@ -23,14 +23,13 @@ from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.rebuild import (
-    Begin,
     Since,
     first_day,
     ignore_observations,
     replay,
-    restore_streams,
 )
 from fleet_service.replay.restart import image_of, load_restart
+from fleet_service.replay.streams import Begin, read_streams, restore_streams
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
 from fleet_service.serve.map_state import MapState
@@ -174,17 +173,18 @@ def load_state(
     heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
-        noted = partial(restore_streams, root, streams, matters, damaged)
-        # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so update it
-        # later.
-        noting = None if begin.cut else beside.submit(noted)
+        # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so the later
+        # rows, which are few, are read now and added afterwards.
+        noting = beside.submit(
+            (lambda: list(read_streams(root, matters, damaged)))
+            if begin.cut
+            else partial(restore_streams, root, streams, matters, damaged)
+        )
         for slots in chain(restored, (updated.slots for updated in rest)):
             alerts.update(slots)
             shown.mark_changed(slots)
-        if noting is None:
-            noted()
-        else:
-            noting.result()
+        for kind, rows in noting.result() or []:
+            streams.restore(kind, rows)
     pa.default_memory_pool().release_unused()  # memory from reading the archive
     memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, public)
     memory.drop_old()

@@ -55,6 +55,9 @@ _RECORDS: Final = {
     "peers": PEER,
     "names": VEHICLE,
 }
+# Rows of a restored array per stored row, so that the next new cell does not cause another copy.
+# Unused rows take no memory.
+ROOM: Final = {"cells": 2, "reporters": 2}
 LAYOUT: Final = hashlib.blake2b(
     repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8
 ).hexdigest()
@@ -119,15 +122,18 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     """
     fusion = Fusion(lateness_s)
     records = {
-        name: _restore_records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()
+        name: _restore_records(image[name]["bytes"], kind, ROOM.get(name, 1))
+        for name, kind in _RECORDS.items()
     }
     size, vehicles, forgotten_at, epoch = image["used"]["more"].tolist()
     state = State(
         live=Rows(
-            _restore_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]
+            _restore_beliefs(image["belief"]["bins"], ROOM["cells"]),
+            records["cells"],
+            records["reporters"],
         ),
         base=Rows(
-            _restore_beliefs(image["base_belief"]["bins"]),
+            _restore_beliefs(image["base_belief"]["bins"], 1),
             records["base_cells"],
             records["base_sources"],
         ),
@@ -160,15 +166,17 @@ def _record_bytes(records: RecordArray) -> ByteArray:
     return records.view(np.uint8) if len(records) else np.zeros(0, np.uint8)
 
 
-def _restore_records(stored: ByteArray, kind: np.dtype[Any]) -> RecordArray:
-    out = rows_of_lines(len(stored) // kind.itemsize, kind)
-    out[:] = stored.view(kind)
+def _restore_records(stored: ByteArray, kind: np.dtype[Any], room: int) -> RecordArray:
+    rows = stored.view(kind)
+    out = rows_of_lines(room * len(rows), kind)
+    out[: len(rows)] = rows
     return out
 
 
-def _restore_beliefs(bins: PackedArray) -> PackedArray:
-    out = no_beliefs(len(bins) // mugrid.BINS)
-    out.reshape(-1)[:] = bins
+def _restore_beliefs(bins: PackedArray, room: int) -> PackedArray:
+    rows = len(bins) // mugrid.BINS
+    out = no_beliefs(room * rows)
+    out[:rows] = bins.reshape(rows, mugrid.BINS)
     return out
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
@@ -104,12 +105,13 @@ def load_checkpoint(path: Path) -> Taken:
     try:
         manifest = json.loads((path / _MANIFEST).read_bytes())
         content: dict[str, Any] = manifest["content"]
+        paths = [path / name for name in content["files"]]
         right = manifest["digest"] == _digest_of(content)
     except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
         raise _checkpoint_error(path, "has no readable manifest") from error
-    if not right or any(
-        file_digest(path / name) != wanted for name, wanted in content["files"].items()
-    ):
+    with ThreadPoolExecutor() as threads:
+        found = dict(zip(content["files"], threads.map(file_digest, paths), strict=True))
+    if not right or found != content["files"]:
         raise _checkpoint_error(path, "is damaged")
     if _count_tries(path) >= TRIES:
         raise _checkpoint_error(path, f"made the service fail at {TRIES} starts")

@@ -1,5 +1,5 @@
-"""Replay of an archive: it restores the record of accepted batches (messages with records), and the
-beliefs about the friction of all cells, for now or for a past moment.
+"""Replay of an archive: it restores the beliefs about the friction of all cells, for now or for a
+past moment.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,12 +20,12 @@ from fleet_service.archive.format import layout, reading, segments
 from fleet_service.archive.format.load import Damaged, skip_damaged
 from fleet_service.archive.format.row_filter import ValueRange, filter_table, matching_row_groups
 from fleet_service.archive.identity import vehicle_ids
-from fleet_service.archive.identity.pseudonyms import pseudonym_number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import RecordedResult
-from fleet_service.ingest.dedup import ArchivedRows, SequenceTrackers
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
+from fleet_service.replay.streams import IDENTITY, Begin, pseudonym_numbers
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
@@ -34,7 +34,6 @@ from schemas.signals import FLAGS
 from schemas.thresholds import US_STEP
 from schemas.wire import Kind
 
-IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
 # columns that the fusion needs
 COLUMNS: Final = [
     *(
@@ -63,65 +62,6 @@ _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
 SEGMENT_ROW_BYTES: Final = 60  # smallest size of a row in the inbox
 # [deg] Margin around a box: over 100 m, which is more than the position error of a visit.
 MARGIN_DEG: Final = 0.002
-
-
-class Begin(NamedTuple):
-    """Start of a replay.
-
-    Attributes:
-        day: first day of measurement that is read; None for all days.
-        after: only segments (files of new rows) after this position are read; None to read from the
-            first.
-        until: only segments up to this position are read; None to read to the last.
-    """
-
-    day: int | None = None
-    after: layout.Cut | None = None
-    until: layout.Cut | None = None
-
-
-def restore_streams(
-    root: Path,
-    streams: SequenceTrackers,
-    begin: Begin = Begin(),  # noqa: B008 immutable
-    damaged: Damaged = skip_damaged,
-) -> None:
-    """Record every archived batch (message with records) as accepted, so that duplicates are
-    detected after a restart.
-
-    Args:
-        root: folder of the archive.
-        streams: record of accepted batches; updated.
-        begin: start of the replay.
-        damaged: called with each damaged file.
-    """
-    for kind, first in layout.FIRST_TIME.items():
-        columns = (*IDENTITY, "first_held", first)
-        wanted = reading.Wanted(
-            columns, days=(begin.day, None), after=begin.after, until=begin.until
-        )
-        for table in reading.read_wanted(root, kind, wanted, damaged):
-            boot, region, seq, first_held = (
-                table[name].to_numpy() for name in (*IDENTITY[1:], "first_held")
-            )
-            time = segments.to_nanoseconds(table[first])
-            vehicle = pseudonym_numbers(table["vehicle"])
-            rows = ArchivedRows(vehicle, boot, region, seq, first_held, time)
-            streams.restore(kind, rows)
-
-
-def pseudonym_numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
-    """Convert pseudonyms (vehicles' names in the archive), (n,), from text to 64-bit numbers."""
-    chunked = (
-        pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
-    )
-    coded = chunked.combine_chunks().dictionary_encode()
-    if not len(coded):
-        return np.zeros(0, np.int64)
-    each = np.array(
-        [pseudonym_number(pseudonym) for pseudonym in coded.dictionary.to_pylist()], np.int64
-    )
-    return np.asarray(each[coded.indices.to_numpy()])
 
 
 class Since(NamedTuple):

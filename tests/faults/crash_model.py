@@ -34,7 +34,7 @@ from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay import restart
-from fleet_service.replay.rebuild import restore_streams
+from fleet_service.replay.streams import restore_streams
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind

@@ -22,7 +22,7 @@ from fleet_service.archive.format import load, reading, segments
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
-from fleet_service.replay.rebuild import restore_streams
+from fleet_service.replay.streams import restore_streams
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
