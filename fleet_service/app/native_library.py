@@ -1,6 +1,7 @@
-"""`python -m fleet_service.app.native_library [FILE]`: compile the kernels (compiled functions) of
-a running service, and write them into the shared library FILE. Without FILE, write the libraries
-that the installed package contains, one per level of the x86-64 architecture.
+"""`python -m fleet_service.app.native_library [FILE [CALLS]]`: compile the kernels (compiled
+functions) of a running service, and write them into the shared library FILE. Without FILE, write
+the libraries that the installed package contains, one per level of the x86-64 architecture. The
+file CALLS lists the kernels; without it, they are recorded first.
 
 The service then needs neither Numba nor LLVM, which saves 100 MB of memory and a second of each
 start.
@@ -8,10 +9,11 @@ start.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -23,8 +25,6 @@ RECORD: Final = (
     "import sys; from pathlib import Path; from fleet_service.app.native_library import "
     "record_calls; record_calls(Path(sys.argv[1]))"
 )
-# Variables with which Numba compiles for another processor than that of this machine.
-OTHER_PROCESSOR: Final = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
 LIBRARY: Final = KernelLibrary(
     "fleet_service", "fleet_service.app.native_library", Path(__file__).parents[1] / "kernels"
 )
@@ -37,27 +37,37 @@ def use_service_library() -> bool:
     return LIBRARY.use()
 
 
-def build_service_library(path: Path) -> None:
+def build_service_library(path: Path, calls: Path) -> None:
     """Build the service's shared library `path`. The library contains the kernels (compiled
-    functions) that `precompile.exercise_map` calls.
+    functions) whose calls the file `calls` lists.
 
-    A separate process records the calls, because it runs the kernels. This process may compile them
-    for a processor with instructions that the processor of this machine lacks.
+    This process may compile for a processor with instructions that the processor of this machine
+    lacks. Therefore it does not run the kernels.
 
     Raises:
-        OSError, subprocess.CalledProcessError: there is no linker, or a step fails.
+        OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
         TypeError: a kernel allocates memory.
     """
     from schemas.runtime.native_build import CallRecorder, build_library
 
     recorder = CallRecorder()
     use_native_kernels(recorder)
+    recorder.load_calls(calls)
+    build_library(recorder, path)
+
+
+@contextmanager
+def recorded_calls() -> Iterator[Path]:
+    """Yield a file with the calls of kernels (compiled functions) by `precompile.exercise_map`. A
+    separate process records them, because it runs the kernels.
+
+    Raises:
+        subprocess.CalledProcessError: the process has failed; it has printed the reason.
+    """
     with tempfile.TemporaryDirectory() as folder:
         calls = Path(folder) / "calls"
-        own = {name: value for name, value in os.environ.items() if name not in OTHER_PROCESSOR}
-        subprocess.run([sys.executable, "-c", RECORD, str(calls)], env=own, check=True)
-        recorder.load_calls(calls)
-    build_library(recorder, path)
+        subprocess.run([sys.executable, "-c", RECORD, str(calls)], check=True)
+        yield calls
 
 
 def record_calls(path: Path) -> None:
@@ -76,7 +86,11 @@ def record_calls(path: Path) -> None:
 
 if __name__ == "__main__":
     end_with_parent()
-    if sys.argv[1:]:
-        build_service_library(Path(sys.argv[1]))
+    if sys.argv[2:]:
+        build_service_library(Path(sys.argv[1]), Path(sys.argv[2]))
     else:
-        LIBRARY.build_shipped()
+        with recorded_calls() as recorded:
+            if sys.argv[1:]:
+                build_service_library(Path(sys.argv[1]), recorded)
+            else:
+                LIBRARY.build_shipped(str(recorded))

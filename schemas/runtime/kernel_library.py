@@ -62,9 +62,11 @@ class KernelLibrary(NamedTuple):
                 return False
         return _load_library(path)
 
-    def build_shipped(self) -> None:
-        """Build the libraries that the installed package contains, see `shipped_library`."""
-        build_shipped_libraries(self.package, self.shipped, self.builder)
+    def build_shipped(self, *words: str) -> None:
+        """Build the libraries that the installed package contains, see `shipped_library`. The
+        builder gets the arguments `words` after the name of the file.
+        """
+        build_shipped_libraries(self.package, self.shipped, self.builder, *words)
 
 
 def _load_library(path: Path) -> bool:

@@ -53,10 +53,10 @@ def find_shipped_library(package: str, folder: Path, features: Iterable[str]) ->
     return None
 
 
-def build_shipped_libraries(package: str, folder: Path, builder: str) -> None:
+def build_shipped_libraries(package: str, folder: Path, builder: str, *words: str) -> None:
     """Build the shared libraries of `package` in `folder`, one process per level of the processor
-    architecture. `python -m builder FILE` builds one. Libraries that are there already are removed
-    first.
+    architecture. `python -m builder FILE`, followed by `words`, builds one. Libraries that are
+    there already are removed first.
 
     On a processor that is not x86-64, build nothing; the program then compiles its kernels at its
     first start.
@@ -75,7 +75,7 @@ def build_shipped_libraries(package: str, folder: Path, builder: str) -> None:
         own = os.environ | {"NUMBA_CACHE_DIR": cache, "NUMBA_CPU_FEATURES": ""}
         processes = [
             subprocess.Popen(
-                [sys.executable, "-m", builder, os.fspath(folder / f"{sources}-{level}.so")],
+                [sys.executable, "-m", builder, f"{folder / sources}-{level}.so", *words],
                 env=own | {"NUMBA_CPU_NAME": level},
             )
             for level in FEATURES
