@@ -62,10 +62,11 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         },
     },
     "fleet_service": {
+        "counts": set(),
         "fusion": set(),
         "archive": set(),
-        "ingest": {"fusion", "archive"},
-        "serve": {"fusion"},
+        "ingest": {"counts", "fusion", "archive"},
+        "serve": {"counts", "fusion"},
         "replay": {"fusion", "archive", "ingest"},
         "replication": {"archive"},
         "shards": set(),
@@ -73,6 +74,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "client": set(),
         "page": {"archive", "client"},
         "app": {
+            "counts",
             "fusion",
             "archive",
             "ingest",
@@ -97,7 +99,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         },
     },
 }
-MOST_ARROWS = {"edge_agent": 29, "fleet_service": 34}
+MOST_ARROWS = {"edge_agent": 29, "fleet_service": 37}
 # Evaluated code does not import the evaluating code in this folder; commands start both.
 JUDGED_BY = "lab"
 

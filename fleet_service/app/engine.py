@@ -9,7 +9,6 @@ function with `run_between_segments`.
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -23,6 +22,7 @@ from fleet_service.app.state import ServiceState, SharedState, load_state
 from fleet_service.archive.format.load import count_set_aside, set_aside
 from fleet_service.archive.identity.vehicle_ids import remove_damaged_lines
 from fleet_service.archive.segment_log import SegmentLog
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.weather import weather_files as weather_files
 from fleet_service.replay import checkpoints
@@ -49,7 +49,7 @@ class Engine:
     Attributes:
         alerts: active alerts.
         copy: copy of the archive in a bucket (object store); None if there is no copy.
-        counts: counters of events in all parts.
+        counts: counts of all parts.
         holding: ownership of the archive.
         intake: admission and fusion of messages.
         queries: access to the map for readers.
@@ -73,21 +73,21 @@ class Engine:
         """Load the state from the archive, and create the parts of the service."""
         config = self._config
         root = self._root
-        self.counts: Counter[str] = Counter()
-        self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
+        self.counts = ServiceCounts()
+        self.counts.witnesses_damaged += remove_damaged_lines(root / "keys")
         upload = None if self.copy is None else self.copy.upload_segments
         log: SegmentLog[BatchId] = SegmentLog(
             root, config.name, upload, self.holding.smallest_epoch
         )
         state = load_state(root, config, set_aside)
-        self.counts["checkpoints_refused"] += state.refused
+        self.counts.checkpoints_refused += state.refused
         self._shared = SharedState(state, config.public_vehicles)
         self.intake = Intake(config, root, self._shared, log, self.counts)
         self.settlement = Settlement(self._shared, self.intake, log, self.holding, self.counts)
         self.queries = Queries(config, root, self._shared)
         self.alerts = StandingAlerts(self._shared)
         self.seen = state.streams.newest
-        self.counts["files_set_aside"] = count_set_aside(root)
+        self.counts.files_set_aside = count_set_aside(root)
         warm_up()
 
     @property

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import compress
@@ -18,6 +17,7 @@ from fleet_service.app.state import SharedState
 from fleet_service.archive.format.segments import Rows
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.archive.segment_log import SegmentLog
+from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.vote_weights import UNCORRECTED
 from fleet_service.fusion.weather import Reports
@@ -42,7 +42,7 @@ class Intake:
         root: folder of the archive.
         shared: state of the service.
         log: segment log (queue of rows for the disk), which writes the admitted rows to disk.
-        counts: counters of the service.
+        counts: counts of the service.
 
     Attributes:
         acks: acknowledgements to send.
@@ -59,7 +59,7 @@ class Intake:
         root: Path,
         shared: SharedState,
         log: SegmentLog[BatchId],
-        counts: Counter[str],
+        counts: ServiceCounts,
     ) -> None:
         self._config = config
         self._root = root
@@ -99,7 +99,7 @@ class Intake:
         for kind, accepted in self.batches.accept(messages, clock).items():
             if kind is Kind.OBSERVATION:
                 out += self._fuse(accepted)
-            self._counts[kind] += len(accepted.rows["row"])
+            self._counts.rows[kind] += len(accepted.rows["row"])
             self._log.add(kind, accepted.rows, accepted.batches)
         return out
 
@@ -129,7 +129,7 @@ class Intake:
         rows["late_by"][fused] = updated.late_by
         rows["weight"][fused] = updated.weight
         rows |= {name: np.full(n, value, np.float32) for name, value in UNCORRECTED.items()}
-        self._counts["late"] += int(updated.late.sum())
+        self._counts.late += int(updated.late.sum())
         if updated.late.any():
             missed = np.zeros(n, bool)
             missed[fused] = updated.late
@@ -151,14 +151,14 @@ class Intake:
             witness[vehicles],
             *(rows[name][vehicles] for name in ("leave_time", "latitude", "longitude")),
         )
-        self._counts["implausible_moves"] += int(beyond.sum())
+        self._counts.implausible_moves += int(beyond.sum())
         slots = self._shared.state.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64))
         new = vehicles[(slots < 0)[vehicles] & ~beyond[vehicles]]
         over = self._places.beyond(
             witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS
         )
         beyond[new[over]] = True
-        self._counts["too_many_places"] += int(over.sum())
+        self._counts.too_many_places += int(over.sum())
         return beyond
 
     def update_weather(self, now: int) -> None:
@@ -171,4 +171,4 @@ class Intake:
         if reports is not None:
             with self._shared.guard:
                 self._shared.state.fusion.update_weather(reports)
-            self._counts["weather"] += len(reports.time)
+            self._counts.weather += len(reports.time)

@@ -8,7 +8,6 @@ import logging
 import os
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -22,6 +21,7 @@ from fleet_service.archive.format import layout, segments, snapshots
 from fleet_service.archive.format.load import count_set_aside
 from fleet_service.archive.maintenance import disk_reserve
 from fleet_service.archive.maintenance.retention import retire_rows
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest import weather
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -105,7 +105,7 @@ def archive_jobs(
         return f"dropped: {dropped} cells without a visit for a week" if dropped else None
 
     def inventory(_: threading.Event) -> str | None:
-        engine.counts["files_set_aside"] = count_set_aside(root)
+        engine.counts.files_set_aside = count_set_aside(root)
         return None
 
     def with_disk_space(
@@ -169,7 +169,7 @@ class BackgroundJobs:
     """
 
     def __init__(
-        self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]
+        self, jobs: Sequence[Job], counts: ServiceCounts, log_line: Callable[[str], None]
     ) -> None:
         self._jobs = [job for job in jobs if job.every_s]
         self._counts = counts
@@ -229,11 +229,11 @@ class BackgroundJobs:
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)
-            self._counts[f"{job.name}_runs"] += 1
+            self._counts.runs[job.name] += 1
             self.failed.pop(job.name, None)
             well = True
         except Exception as error:
-            self._counts[f"{job.name}_failures"] += 1
+            self._counts.failures[job.name] += 1
             self.failed[job.name] = self.failed.get(job.name, 0) + 1
             line = f"{job.name} failed: {error}"
             well = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -17,33 +17,6 @@ STALLED_S: Final = 5.0
 # [s] Difference between service time and system clock from which a time server seems to be missing.
 CLOCK_S: Final = 60.0
 FULL: Final = 0.9  # share of the queue's capacity from which it counts as full
-_FAMILIES: Final = (  # prefix of the counts, name, label, text
-    ("refused.", "refused_messages", "reason", "batches that were refused, by reason"),
-    ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),
-)
-_SINGLE: Final = {
-    "key_failures": "batches refused because the key of their month is damaged or cannot be "
-    "written",
-    "witnesses_damaged": "damaged lines in keys/MONTH.witnesses at the start of the service",
-    "too_many_gaps": "batches refused because too many earlier batches of their stream are missing",
-    "too_many_streams": "batches not accepted because their vehicle opened too many streams; "
-    "the vehicle keeps them",
-    "too_many_places": "observations archived but not fused because their vehicle reported "
-    "too many new places",
-    "implausible_moves": "observations archived but not fused because their vehicle cannot "
-    "have reached the place",
-    "refused_queries": "queries refused because too many were waiting; the client may retry",
-    "clock_doubted": "batches neither admitted nor refused because the service's time is uncertain",
-    "checkpoints_refused": "checkpoints not used: damaged, of another version, or fatal to a "
-    "former start",
-    "duplicates": "duplicate batches",
-    "overload": "messages dropped because the queue was full",
-    "limited": "messages dropped because their vehicle exceeded its rate limit",
-    "late": "observations archived but not fused",
-    "tile_rounds_skipped": "publications of tiles skipped because the previous one was not "
-    "finished",
-    "queries": "queries",
-}
 
 
 class Pulse(NamedTuple):
@@ -70,21 +43,31 @@ def collect_metrics(
     engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path
 ) -> list[Metric]:
     """Return all metrics of a service with their current values."""
-    counts = dict(engine.counts)
+    counts = engine.counts
     report_lag_s = engine.intake.report_lag_s
     away_s = 0.0 if engine.copy is None else engine.copy.backoff.away_s
-    found = [
-        Metric(name, "counter", text, _strip_prefix(counts, prefix), label)
-        for prefix, name, label, text in _FAMILIES
+    single = [
+        Metric(name, "counter", text, {"": getattr(counts, name)})
+        for name, text in counts.texts().items()
     ]
-    found += [
-        Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()
-    ]
-    kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
-    failures = _strip_ending(counts, "_failures")
-    runs = _strip_ending(counts, "_runs")
+    failures = {**counts.failures, **({"key": counts.key_failures} if counts.key_failures else {})}
+    kinds = {"observation": counts.observations, "state": counts.states}
     return [
-        *found,
+        *single,
+        Metric(
+            "refused_messages",
+            "counter",
+            "batches that were refused, by reason",
+            dict(counts.refused),
+            "reason",
+        ),
+        Metric(
+            "bad_queries",
+            "counter",
+            "queries that were refused, by parameter",
+            dict(counts.bad_queries),
+            "field",
+        ),
         Metric("rows", "counter", "rows admitted", kinds, "kind"),
         Metric(
             "failures",
@@ -93,7 +76,7 @@ def collect_metrics(
             failures,
             "work",
         ),
-        Metric("runs", "counter", "runs of background jobs", runs, "work"),
+        Metric("runs", "counter", "runs of background jobs", dict(counts.runs), "work"),
         Metric(
             "segments",
             "gauge",
@@ -137,7 +120,7 @@ def collect_metrics(
         gauge(
             "damaged_files",
             "damaged files set aside, at the last count",
-            counts.get("files_set_aside", 0),
+            counts.files_set_aside,
         ),
     ]
 
@@ -174,14 +157,6 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
     if pulse.queued > FULL * config.queue_batches:
         found.append("the queue is full")
     return found
-
-
-def _strip_prefix(counts: Mapping[str, int], prefix: str) -> dict[str, float]:
-    return {name.removeprefix(prefix): n for name, n in counts.items() if name.startswith(prefix)}
-
-
-def _strip_ending(counts: Mapping[str, int], ending: str) -> dict[str, float]:
-    return {name.removesuffix(ending): n for name, n in counts.items() if name.endswith(ending)}
 
 
 def _per_kind(root: Path, listing: Callable[[Path, Kind], list[Path]]) -> dict[str, float]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter
 from collections.abc import Callable
 from typing import Final, TypeVar
 
@@ -16,6 +15,7 @@ from fleet_service.app.state import SharedState
 from fleet_service.app.tasks import Tasks
 from fleet_service.archive.format.layout import Cut
 from fleet_service.archive.segment_log import SegmentLog
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.replication.bucket import CopyError
 from fleet_service.replication.ownership import Ownership
@@ -42,7 +42,7 @@ class Settlement:
         intake: owner of the waiting acknowledgements.
         log: segment log (queue) with the rows that wait for the disk.
         holding: ownership of the archive.
-        counts: counters of the service.
+        counts: counts of the service.
 
     Attributes:
         failing: True if the last segment could not be written.
@@ -54,7 +54,7 @@ class Settlement:
         intake: Intake,
         log: SegmentLog[BatchId],
         holding: Ownership,
-        counts: Counter[str],
+        counts: ServiceCounts,
     ) -> None:
         self._shared = shared
         self._intake = intake
@@ -159,9 +159,9 @@ class Settlement:
             self._intake.batches.acknowledge(durable())
         except OSError as error:
             if isinstance(error, CopyError) and self._holding.copy is not None:
-                self._counts["copy_failures"] = self._holding.copy.backoff.failures
+                self._counts.failures["copy"] = self._holding.copy.backoff.failures
             else:
-                self._counts["segment_failures"] += 1
+                self._counts.failures["segment"] += 1
             self.failing = True
         else:
             self.failing = False

@@ -38,15 +38,17 @@ class StatusLine:
     def write_line(self, now: float) -> None:
         """Write the service's status line to the log; `now` is the monotonic time [s]."""
         counts = self._engine.counts
-        rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
+        rate = (counts.observations - self._reported) / max(now - self._reported_at, 1e-9)
         self._reported_at = now
-        self._reported = counts[Kind.OBSERVATION]
+        self._reported = counts.observations
         behind = self._clock.lag() * 1e-9
         rest = ", ".join(
-            f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind)
+            f"{name} {n}"
+            for name, n in sorted(counts.as_dict().items())
+            if n and name not in set(Kind)
         )
         text = (
-            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} "
+            f"status: {counts.observations} observations ({rate:.0f}/s), {counts.states} "
             "states, "
             f"{self._engine.state.fusion.size} cells, {self._engine.alerts.count} alerts, queue "
             f"{len(self._inbox)}"
@@ -60,5 +62,5 @@ class StatusLine:
         )
         cells = self._engine.state.fusion.size
         self._events.info(
-            text, extra=values(cells=cells, queue=len(self._inbox), counts=dict(counts))
+            text, extra=values(cells=cells, queue=len(self._inbox), counts=counts.as_dict())
         )

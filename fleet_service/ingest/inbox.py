@@ -9,7 +9,6 @@ an overloaded service slows its senders down (back-pressure).
 from __future__ import annotations
 
 import queue
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import compress
@@ -25,6 +24,7 @@ from fleet_service.archive.format.segments import Rows, round_to_steps
 from fleet_service.archive.identity import erasures
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number, pseudonym_texts
 from fleet_service.archive.identity.vehicle_ids import VehicleIds
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.batch_decoder import decode_many
@@ -72,11 +72,11 @@ class Inbox:
     Args:
         capacity: maximum number of messages. Threads that call `put` at the same instant may exceed
             it by one each, because the check takes no lock.
-        counts: counters; dropped messages are counted under `overload`.
+        counts: counts of the service; dropped messages are counted in `overload`.
         limits: rate limits per vehicle.
     """
 
-    def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
+    def __init__(self, capacity: int, counts: ServiceCounts, limits: RateLimiter) -> None:
         # SimpleQueue has no Python locks and costs a fifth. None only wakes the thread in `drain`.
         self._queue: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._capacity = capacity
@@ -104,7 +104,7 @@ class Inbox:
     def put(self, message: Message) -> None:
         """Add a message to the queue; if the queue is full, drop the message and count it."""
         if self._queue.qsize() >= self._capacity or self._bytes >= QUEUE_BYTES:
-            self._counts["overload"] += 1
+            self._counts.overload += 1
             return
         with self._guard:
             self._bytes += len(message.payload)
@@ -160,12 +160,12 @@ class BatchIntake:
         streams: accepted batches per stream (batches of one vehicle, start, kind and region);
             updated.
         pseudonyms: pseudonyms that replace the vehicles' names in the archive.
-        counts: counters of refusals, under `refused.RULE`, and of duplicates.
+        counts: counts of the service; refusals are counted in `refused[RULE]`.
         acks: collects refusals, and acknowledgements of duplicates that are already durable.
     """
 
     def __init__(
-        self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks
+        self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: ServiceCounts, acks: Acks
     ) -> None:
         self._streams = streams
         self._pseudonyms = pseudonyms
@@ -249,7 +249,7 @@ class BatchIntake:
                 and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt
             ):
                 # The batch is neither accepted nor refused, so the sender keeps and repeats it.
-                self._counts["clock_doubted"] += 1
+                self._counts.clock_doubted += 1
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
@@ -327,7 +327,7 @@ class BatchIntake:
             else:
                 out[batch] = place
         if again:
-            self._counts["duplicates"] += again
+            self._counts.duplicates += again
         return out
 
     def _look_up(
@@ -347,13 +347,13 @@ class BatchIntake:
             boot_pseudonym = self._pseudonyms.boot(vehicle, boot, time)
             witness = self._witnesses.id_of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
-            self._counts["key_failures"] += 1
+            self._counts.key_failures += 1
             return None
         key = (pseudonym, boot, kind, region)
         if key not in self._streams:  # older archives contain the unchanged start numbers
             key = (pseudonym, boot_pseudonym, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
-            self._counts["too_many_streams"] += 1
+            self._counts.too_many_streams += 1
             return None
         stream = self._known[kind][name] = self._streams[key]
         stream.vehicle = vehicle
@@ -388,7 +388,7 @@ class BatchIntake:
             # If there is no space to record the batch, older batches must come first. The batch is
             # not rejected, so the sender repeats it.
             if not stream.accept(seq, at):
-                self._counts["too_many_gaps"] += 1
+                self._counts.too_many_gaps += 1
                 good[place] = False
         if not good.all():
             rows = {name: column[good[owner]] for name, column in rows.items()}
@@ -433,7 +433,7 @@ class BatchIntake:
 
     def _count(self, rule: str, times: int = 1) -> None:
         if times:
-            self._counts[f"refused.{rule}"] += times
+            self._counts.refused[rule] += times
 
 
 def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:

@@ -9,9 +9,10 @@ that it is the sender's own name.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Final
+
+from fleet_service.counts import ServiceCounts
 
 # Cost [bytes] of the smallest message. Reading, checking and refusing it costs a few dozen records.
 LEAST_BYTES: Final = 1024
@@ -30,7 +31,7 @@ class RateLimiter:
         rate: long-term rate of a vehicle [bytes/s].
         burst: amount that a vehicle may send at once [bytes].
         known: enrolled names; None to accept any name.
-        counts: counters; `limited` and `refused.unknown` are increased.
+        counts: counts of the service; `limited` and `refused["unknown"]` are increased.
         clock: function that returns the time [s].
     """
 
@@ -39,7 +40,7 @@ class RateLimiter:
         rate: float,
         burst: float,
         known: Collection[str] | None,
-        counts: Counter[str],
+        counts: ServiceCounts,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._rate = rate
@@ -57,7 +58,7 @@ class RateLimiter:
         """
         name = key.rpartition("/")[2]
         if self._known is not None and name not in self._known:
-            self._counts["refused.unknown"] += 1
+            self._counts.refused["unknown"] += 1
             return False
         now = self._clock()
         if name not in self._buckets and len(self._buckets) >= MOST_NAMES and not self._forget(now):
@@ -70,7 +71,7 @@ class RateLimiter:
         fits = left >= cost
         self._buckets[name] = (left - cost if fits else left, now)
         if not fits:
-            self._counts["limited"] += 1
+            self._counts.limited += 1
         return fits
 
     def __len__(self) -> int:

@@ -15,7 +15,7 @@ archive finds the same weather and gives the same map.
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -28,6 +28,7 @@ from fleet_service.archive.format.files import SEGMENT, write_table
 from fleet_service.archive.format.layout import DAY_NS, read_epoch, with_term
 from fleet_service.archive.format.load import Damaged, load, skip_damaged
 from fleet_service.archive.format.segments import to_nanoseconds
+from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
@@ -65,10 +66,10 @@ class WeatherInbox:
         root: folder of the archive.
         name: name of the service, part of the file names.
         fusion: fusion that uses the reports.
-        counts: counters; refusals are counted under `refused.weather`.
+        counts: counts of the service; refusals are counted in `refused["weather"]`.
     """
 
-    def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
+    def __init__(self, root: Path, name: str, fusion: Fusion, counts: ServiceCounts) -> None:
         self._folder = root / FOLDER
         self.fusion = fusion
         self._counts = counts
@@ -79,7 +80,7 @@ class WeatherInbox:
     def enqueue(self, message: WeatherMessage) -> None:
         """Queue a received weather message for the next `take`; thread-safe."""
         if len(message.payload) > MOST_BYTES:
-            self._counts["refused.weather"] += 1
+            self._counts.refused["weather"] += 1
         else:
             self._waiting.append(message)
 
@@ -93,7 +94,7 @@ class WeatherInbox:
             try:
                 found.append(_decode_report(message, now))
             except InputError:
-                self._counts["refused.weather"] += 1
+                self._counts.refused["weather"] += 1
         return self._archive_reports(found, now) if found else None
 
     def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
@@ -119,7 +120,7 @@ class WeatherInbox:
             write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet", SEGMENT)
         # A report that is not archived must not take effect. The next one comes within the hour.
         except OSError:
-            self._counts["weather_failures"] += 1
+            self._counts.failures["weather"] += 1
             return None
         return _read_reports(table)
 

@@ -22,7 +22,6 @@ import heapq
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from typing import Final, NamedTuple
 
 import zenoh
 
+from fleet_service.counts import ServiceCounts
 from fleet_service.serve.query import AnswerSize
 from schemas import keys, query
 from schemas.errors import InputError
@@ -132,11 +132,11 @@ class MapQueryable:
 
     Args:
         answering: functions that estimate the size of answers and produce them.
-        counts: counters; `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and
-            `answer_failures` are increased.
+        counts: counts of the service; `queries`, `heavy_queries`, `refused_queries`, `bad_queries`
+            and `failures["answer"]` are increased.
     """
 
-    def __init__(self, answering: Answering, counts: Counter[str]) -> None:
+    def __init__(self, answering: Answering, counts: ServiceCounts) -> None:
         self._answering = answering
         self._counts = counts
         self._past = threading.Lock()
@@ -157,7 +157,7 @@ class MapQueryable:
 
     def __call__(self, request: zenoh.Query) -> None:
         """Handle one map query: answer it at once, queue it, or refuse it."""
-        self._counts["queries"] += 1
+        self._counts.queries += 1
         try:
             # `zenoh.Parameters` is iterable, but its type stub does not declare this.
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
@@ -205,11 +205,11 @@ class MapQueryable:
             self._past_waiting.release()
 
     def _queue(self, request: zenoh.Query, wanted: MapQuery, cost: float) -> None:
-        self._counts["heavy_queries"] += 1
+        self._counts.heavy_queries += 1
         with self._some:
             rank = time.monotonic() + cost / PER_S
             heapq.heappush(
-                self._heavy, _QueuedQuery(rank, self._counts["heavy_queries"], request, wanted)
+                self._heavy, _QueuedQuery(rank, self._counts.heavy_queries, request, wanted)
             )
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
@@ -222,7 +222,7 @@ class MapQueryable:
                 )
                 self._worker.start()
         if dropped is not None:
-            self._counts["refused_queries"] += 1
+            self._counts.refused_queries += 1
             self._refuse(
                 dropped.request,
                 InputError(
@@ -284,7 +284,7 @@ class MapQueryable:
         # Catch every error. A query that ends without a reply would mean that there are no data.
         except Exception as error:
             answered.whole = True
-            self._counts["answer_failures"] += 1
+            self._counts.failures["answer"] += 1
             log.exception("a query failed")
             with suppress(zenoh.ZError):
                 request.reply_err(
@@ -297,7 +297,7 @@ class MapQueryable:
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
         # Other field names are free text of the client, which must not become names of counters.
         field = error.field if error.field in MapQuery.model_fields else "query"
-        self._counts[f"bad_queries.{field}"] += 1
+        self._counts.bad_queries[field] += 1
         with request:
             request.reply_err(str(error), encoding=TEXT)
 

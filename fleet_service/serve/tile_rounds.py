@@ -10,9 +10,11 @@ so that the time of a publication does not reveal when a vehicle passed.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from typing import Final
+
+from fleet_service.counts import ServiceCounts
 
 # [s] Time for tiles per pass of the worker's loop. A segment is delayed by about as much.
 SHARE_S: Final = 0.02
@@ -25,7 +27,7 @@ class TileRounds:
         every_s: time between the beginnings of two rounds [s].
         changed: function that returns the tiles that changed since its last call.
         put: function that makes a tile and publishes it.
-        counts: counters; `tile_rounds_skipped` is increased.
+        counts: counts of the service; `tile_rounds_skipped` is increased.
         clock: function that returns monotonic time [s].
     """
 
@@ -34,7 +36,7 @@ class TileRounds:
         every_s: float,
         changed: Callable[[], list[int]],
         put: Callable[[int], None],
-        counts: Counter[str],
+        counts: ServiceCounts,
         clock: Callable[[], float],
     ) -> None:
         self._every_s = every_s
@@ -62,7 +64,7 @@ class TileRounds:
         self._due += passed * self._every_s
         skipped = passed if self._left else passed - 1
         if skipped:
-            self._counts["tile_rounds_skipped"] += skipped
+            self._counts.tile_rounds_skipped += skipped
         if not self._left:
             self._left.extend(self._changed())
         return True

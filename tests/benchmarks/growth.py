@@ -22,7 +22,6 @@ from fleet_service.app.engine import Engine
 from fleet_service.fusion.constants import EPOCH_NS
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
-from schemas.wire import Kind
 from tests.benchmarks.ingest import make_messages
 from tests.changed_tiles import changed_tiles
 
@@ -76,5 +75,5 @@ def second_s(rate: int, seconds: int) -> float:
             engine.settlement.flush()
             changed_tiles(engine.queries, now)
             spent += time.process_time() - began if second >= WARM_S else 0.0
-        assert engine.counts[Kind.OBSERVATION] == rate * (WARM_S + seconds), engine.counts
+        assert engine.counts.observations == rate * (WARM_S + seconds), engine.counts
     return spent / seconds

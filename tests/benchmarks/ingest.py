@@ -195,5 +195,5 @@ def _time_ingest(sent: list[Message], records: int) -> tuple[float, float]:
         wall = time.perf_counter() - wall
         cpu = time.process_time() - cpu
         gc.unfreeze()
-        assert engine.counts[Kind.OBSERVATION] == len(sent) * records, engine.counts
+        assert engine.counts.observations == len(sent) * records, engine.counts
     return len(sent) * records / wall, len(sent) * records / cpu

@@ -30,7 +30,6 @@ from schemas import keys, wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
-from schemas.wire import Kind
 from tests.benchmarks.ingest import make_messages
 from tests.faults.processes import Part
 from tests.waiting import matched
@@ -126,7 +125,7 @@ def engine(root: str) -> None:
                 there.intake.ingest(burst[at : at + TURN], time.time_ns())
             there.settlement.flush()
             print("done", flush=True)
-        assert there.counts[Kind.OBSERVATION] == sum(map(len, bursts)) * ROWS, there.counts
+        assert there.counts.observations == sum(map(len, bursts)) * ROWS, there.counts
 
 
 def _make_burst(number: int) -> list[Message]:

@@ -73,7 +73,7 @@ def main(vehicles: int, messages: int) -> None:
                 sent = [make_message(vehicle, number, vehicle % AREAS, end) for vehicle in some]
                 engine.intake.ingest(sent, end)
             engine.settlement.flush()
-        assert engine.counts["implausible_moves"] == 0, engine.counts
+        assert engine.counts.implausible_moves == 0, engine.counts
         store = engine.state.fusion.store
         content = MemoryContent(
             vehicles=store.vehicles,

@@ -236,7 +236,7 @@ def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     session = ground.open_session(ROGUE, ROUTERS[1])
     ground.await_judgement()  # otherwise refusals of an earlier attack would count for this one
     before = ground.admitted_count
-    refused = ground.service.engine.counts["refused.key"]
+    refused = ground.service.engine.counts.refused["key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
     session.put(
         f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION]
@@ -244,7 +244,7 @@ def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     ground.drive(session, ROGUE)
     return (
         ground.admitted_count != before + 1
-        or ground.service.engine.counts["refused.key"] != refused + 1
+        or ground.service.engine.counts.refused["key"] != refused + 1
     )
 
 
@@ -487,10 +487,10 @@ def private_message_that_is_too_large_travels(ground: Ground) -> bool:
 @register_attempt
 def question_with_a_payload_travels(ground: Ground) -> bool:
     session = ground.open_session(ROGUE, ROUTERS[1])
-    answered = ground.service.engine.counts["queries"]
+    answered = ground.service.engine.counts.queries
     asked: Any = session.get(keys.map_key(TILE), payload=SECRET + bytes(wire.MAX_BYTES))
     through = any(reply.ok is not None for reply in asked)
-    return through or ground.service.engine.counts["queries"] > answered
+    return through or ground.service.engine.counts.queries > answered
 
 
 @register_attempt

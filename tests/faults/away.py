@@ -139,12 +139,12 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
             for one in [one for one in fresh if one.fresh] + outbox.due_batches(now, 640):
                 service.put(one)
         now += STEP_S
-        before = engine.counts[Kind.OBSERVATION]
+        before = engine.counts.observations
         for vehicle, ack in service.store_queued(now):
             for stream in wire.decode_ack(ack)[1]:
                 found = Stream(vehicle, stream.boot, stream.kind, stream.region)
                 outboxes[int(vehicle.removeprefix("car-"))].settle_ranges(found, stream.durable)
-        return engine.counts[Kind.OBSERVATION] - before
+        return engine.counts.observations - before
 
     def advance_seconds(seconds: float, driving: bool = True) -> list[int]:
         return [advance_step(driving) for _ in range(math.ceil(seconds / STEP_S))]
@@ -160,7 +160,7 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
     while sum(len(outbox.held) for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
         taken.append(advance_step(driving=True))
     advance_seconds(30, driving=False)
-    lost = abs(stored - engine.counts[Kind.OBSERVATION])
+    lost = abs(stored - engine.counts.observations)
     left = sum(len(outbox.held) for outbox in outboxes)
     for outbox in outboxes:
         outbox.close()
@@ -177,7 +177,7 @@ def _run_outage(site: Site, engine: Engine) -> list[Figure]:
         make_figure("faults.away.drain_share", drain),
         make_figure("faults.away.backlog", backlog / cars),
         make_figure("faults.away.map_missing", len(cells - _list_shown_cells(engine))),
-        make_figure("faults.away.late", engine.counts["late"]),
+        make_figure("faults.away.late", engine.counts.late),
         Figure("faults.away.messages_while_away", while_away / cars, "messages a car"),
         Figure("faults.away.noticed_s", begun * STEP_S, "s until cars go fast again"),
     ]

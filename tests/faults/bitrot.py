@@ -114,8 +114,8 @@ def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
         counts = engine.counts
         told: list[Path] = []
         rows = {kind: _read_rows(root, kind, told) for kind in Kind}
-        counted = counts["files_set_aside"] + counts["checkpoints_refused"] + counts["key_failures"]
-        counted += counts["witnesses_damaged"] + len(told)
+        counted = counts.files_set_aside + counts.checkpoints_refused + counts.key_failures
+        counted += counts.witnesses_damaged + len(told)
         return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
 
 

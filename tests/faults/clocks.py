@@ -156,9 +156,7 @@ def _run_case(root: Path, case: Case, found: Found, seconds: int) -> None:
             keep(engine, root)
             compact(root)
             drive(engine, clock, 3)
-            found.rejected += sum(
-                n for name, n in engine.counts.items() if name.startswith("refused")
-            )
+            found.rejected += engine.counts.refused.total()
             found.alerts_lost += engine.alerts.count == 0
 
     def check_alert(engine: Engine) -> None:

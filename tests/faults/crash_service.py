@@ -232,12 +232,12 @@ class ServiceHistory(Lives[Sent]):
 
     def _report_weather(self, engine: Engine) -> None:
         report = Report(self._now, 0.5, 0.5, 0.5)
-        failures = engine.counts["weather_failures"]
+        failures = engine.counts.failures["weather"]
         engine.intake.weather.enqueue(
             weather.WeatherMessage(keys.weather_key(REGION), encode(report), wire.WEATHER_ENCODING)
         )
         engine.intake.update_weather(self._now)
-        if engine.counts["weather_failures"] == failures:
+        if engine.counts.failures["weather"] == failures:
             self.weather.add(report.time)
 
     def _apply_retention(self, root: Path) -> None:

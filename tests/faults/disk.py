@@ -48,7 +48,7 @@ SIZE_MB: Final = 24
 VEHICLES: Final = 5
 CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
 RESERVE_MB: Final = 2  # [MB] the same share of this small disk as 64 MB of a real one
-RUNS: Final = ("compaction_runs", "checkpoint_runs")
+JOBS: Final = ("compaction", "checkpoint")
 STUCK_S: Final = 60.0
 
 
@@ -129,24 +129,18 @@ def run(site: Site) -> list[Figure]:
                 for _ in range(site.choose_amount(10, 3)):
                     acknowledged += _drive(engine, seq, 3)
                     seq += 3
-                    failures = engine.counts["segment_failures"]
+                    failures = engine.counts.failures["segment"]
                     with fill_disk(site.folder / "disk", mounted):
                         acknowledged += _drive(engine, seq, 6)
                         seq += 6
                         # A job may remove files meanwhile, so that a later segment finds room and
                         # is written.
-                        refused += engine.counts["segment_failures"] > failures
+                        refused += engine.counts.failures["segment"] > failures
                         false += acknowledged > _count_rows(root)
                     acknowledged += _until_settled(engine)
                     stuck += engine.settlement.unsettled > 0
                 acknowledged += _until_done(engine)
-            runs.update(
-                {
-                    name: n
-                    for name, n in engine.counts.items()
-                    if name.endswith(("_runs", "_failures"))
-                }
-            )
+            runs += engine.counts.runs
             false += acknowledged > _count_rows(root)
             room = _room_made(engine, site.folder / "disk") if mounted else 0
         stuck += not _outbox_recovers(site.folder / "disk", mounted)
@@ -155,7 +149,7 @@ def run(site: Site) -> list[Figure]:
         make_figure("faults.disk.false_acks", false),
         make_figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
         make_figure("faults.disk.times_full", refused),
-        make_figure("faults.disk.jobs_run", min(runs[name] for name in RUNS)),
+        make_figure("faults.disk.jobs_run", min(runs[job] for job in JOBS)),
         make_figure("faults.disk.room_made", room)
         if mounted
         else Figure("faults.disk.room_made", 0, "days; nothing was mounted"),
@@ -204,7 +198,7 @@ def _until_done(engine: Engine) -> int:
     """
     got = 0
     deadline = time.monotonic() + STUCK_S
-    while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:
+    while not all(engine.counts.runs[job] for job in JOBS) and time.monotonic() < deadline:
         got += _count_acked(engine.settlement.flush())
         threading.Event().wait(0.05)
     return got

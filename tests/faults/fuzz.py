@@ -109,10 +109,10 @@ def run(site: Site) -> list[Figure]:
             pasts = pasts - past
         if not turn % 200:
             site.say(
-                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} "
+                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts.observations} "
                 "rows admitted"
             )
-    counts = dict(engine.counts)
+    refused = engine.counts.refused.total()
     engine.close()
     tiles, broken = _decode_damaged_tiles(site, engine, now)
     rows, impossible, found = _count_archived(site.folder / "archive", began, now)
@@ -121,10 +121,7 @@ def run(site: Site) -> list[Figure]:
         make_figure("faults.fuzz.admitted_out_of_range", impossible),
         make_figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
         Figure("faults.fuzz.malformed", count + tiles, "messages, queries and tiles"),
-        make_figure(
-            "faults.fuzz.refused",
-            sum(n for name, n in counts.items() if name.startswith("refused.")),
-        ),
+        make_figure("faults.fuzz.refused", refused),
         Figure("faults.fuzz.admitted", rows, "rows"),
         make_figure("faults.fuzz.answered", answers),
         make_figure("faults.fuzz.pasts", site.choose_amount(50, 3) - pasts),

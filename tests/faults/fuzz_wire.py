@@ -89,7 +89,7 @@ def run(site: Site) -> list[Figure]:
             for line in part.read_lines()
             if "Traceback" in line
         ]
-    failures = counts.get("gripmap_answer_failures_total", 0.0)
+    failures = counts.get('gripmap_failures_total{work="answer"}', 0.0)
     refused = sum(
         value for name, value in counts.items() if name.startswith("gripmap_refused_messages")
     )

@@ -86,7 +86,7 @@ class Ground:
     @property
     def admitted_count(self) -> int:
         """Return the number of observations that the attacked service has accepted so far."""
-        return self.service.engine.counts[wire.Kind.OBSERVATION]
+        return self.service.engine.counts.observations
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
         """Send a valid batch of one observation of the vehicle `name`, repeatedly, until the

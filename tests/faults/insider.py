@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter, deque
+from collections import deque
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -22,13 +22,14 @@ from typing import Final
 import numpy as np
 
 from fleet_service.app.engine import Engine
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
-from schemas.wire import Batch, Kind
+from schemas.wire import Batch
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch
@@ -55,7 +56,7 @@ def run(site: Site) -> list[Figure]:
     figures.
     """
     seconds = site.choose_amount(3600, 240)
-    counts = Counter[str]()
+    counts = ServiceCounts()
     random_ = np.random.default_rng(site.seed)
     start = time.time_ns() - 4000 * NS
     longest = 0.0
@@ -100,8 +101,8 @@ def run(site: Site) -> list[Figure]:
             _is_insider_only(alert.latitude, alert.longitude)
             for alert in engine.alerts.next_to_repeat(10**6)
         )
-        settled = engine.counts[Kind.OBSERVATION]
-        ours = {name: n for name, n in engine.counts.items() if n}
+        settled = engine.counts.observations
+        ours = {name: n for name, n in engine.counts.as_dict().items() if n}
     site.say(f"{sent} messages of the insider, {settled} observations; {ours}")
     return [
         make_figure("faults.insider.alerts_alone", alone),

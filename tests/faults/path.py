@@ -119,7 +119,7 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
             when = start + np.arange(30) * SECOND
             way = _make_visits(name, 1, when, _offset_position(north, np.zeros(30)), 0.8)
             wrong = _far_away(kind, name, start, rng)
-            before = engine.counts["implausible_moves"]
+            before = engine.counts.implausible_moves
             if kind == "row":
                 one = way[0]
                 (other,) = wrong
@@ -139,13 +139,13 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
                 engine.intake.ingest(_make_messages([*half, *rest, *later]), start + 100 * SECOND)
             else:
                 engine.intake.ingest(_make_messages([*way, *wrong]), start + 100 * SECOND)
-            found = engine.counts["implausible_moves"] - before
+            found = engine.counts.implausible_moves - before
             most = sum(len(b.columns["mu"]) for b in wrong)
             if found < most:
                 site.say(f"{kind}: {most - found} of {most} accepted")
             fused += max(most - found, 0)
             excluded += max(found - most, 0)
-            excluded += sum(n for name, n in engine.counts.items() if name.startswith("refused."))
+            excluded += engine.counts.refused.total()
     return fused, excluded
 
 

@@ -152,12 +152,12 @@ def count_far_moves(config: ServiceConfig, root: Path) -> int:
             where = keys.observation_key(region, "sim-001")
             body = json.dumps(report).encode()
             engine.intake.ingest([Message(Kind.OBSERVATION, where, body, wire.JSON)], now)
-        assert engine.counts[Kind.OBSERVATION] == 2
-        return engine.counts["implausible_moves"]
+        assert engine.counts.observations == 2
+        return engine.counts.implausible_moves
 
 
 def count_refused(engine: Engine) -> object:
-    return engine.counts["refused.time"], engine.counts["late"]
+    return engine.counts.refused["time"], engine.counts.late
 
 
 SETTINGS: Final[dict[str, tuple[object, Show]]] = {
@@ -175,7 +175,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
         9,
         of_engine(lambda engine: len(changed_tiles(engine.queries, time.time_ns()))),
     ),
-    "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
+    "weather": ("{rain}", of_engine(lambda engine: engine.counts.weather)),
     "compact_s": (10.0, of_jobs),
     "checkpoint_s": (10.0, of_jobs),
     "snapshot_s": (10.0, of_jobs),

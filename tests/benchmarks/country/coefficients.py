@@ -23,7 +23,6 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.constants import FORGOTTEN_EVERY_S
 from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
-from schemas.wire import Kind
 from tests.benchmarks.full_map import SECOND, START, make_visits
 from tests.benchmarks.ingest import make_messages
 from tests.benchmarks.measure import SEED, read_resident_bytes
@@ -98,7 +97,7 @@ def main(kind: str) -> None:
             if at % (16 * TURN) == 0:
                 engine.settlement.flush()
         engine.settlement.flush()
-        assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
+        assert engine.counts.observations == (MANY + FEW) * ROWS, engine.counts
         grown = read_resident_bytes() - before
         fusion = engine.state.fusion
         print(grown, fusion.size, _measure_pair(fusion))

@@ -111,7 +111,7 @@ def _alerted(
                         [Message(Kind.OBSERVATION, key, body, JSON) for key, body in batches], now
                     )
                 under_alert |= {alert.cell for alert in engine.alerts.all}
-            taken = engine.counts[Kind.OBSERVATION]
+            taken = engine.counts.observations
         finally:
             engine.close()
     assert len(set(cells)) > 0.9 * len(cells)

@@ -132,8 +132,8 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(
                 engine.settlement.flush()
                 true += SECOND
                 system.passes(SECOND, jump=jump * (start == step == 0))
-            assert engine.counts[Kind.OBSERVATION] == 2
-            assert engine.counts["refused.time"] == 0
+            assert engine.counts.observations == 2
+            assert engine.counts.refused["time"] == 0
 
 
 def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
@@ -142,9 +142,9 @@ def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: 
         engine.intake.ingest([message(1, now + DAY)], now)
         engine.intake.ingest([message(2, now)], now)
         assert (
-            engine.counts["refused.time"],
-            engine.counts[Kind.OBSERVATION],
-            engine.counts["late"],
+            engine.counts.refused["time"],
+            engine.counts.observations,
+            engine.counts.late,
         ) == (1, 1, 0)
         (_, ack), *_ = engine.settlement.flush()
         (stream,) = wire.decode_ack(ack)[1]

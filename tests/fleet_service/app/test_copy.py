@@ -103,7 +103,7 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert found.keys() == expected.keys()
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         take(engine, first + second)
-        assert engine.counts["duplicates"] == len(first + second)
+        assert engine.counts.duplicates == len(first + second)
         # The repeated batches are acknowledged again, but not written again.
         assert len(engine.settlement.flush()) == VEHICLES
         assert len(segments.list_segments(new, Kind.OBSERVATION)) == len(
@@ -128,7 +128,7 @@ def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
     )
     with closing(Engine(config, tmp_path / "new")) as engine:
         take(engine, sent)
-        assert engine.counts["refused.erased"] == len(sent)
+        assert engine.counts.refused["erased"] == len(sent)
         assert engine.state.fusion.live.visits[: engine.state.fusion.size].sum() == 3 * len(sent), (
             "the rows stay, nobody's"
         )
@@ -144,8 +144,8 @@ def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
         assert engine.settlement.flush() == []
         assert (
             engine.settlement.failing,
-            engine.counts["copy_failures"],
-            engine.counts["segment_failures"],
+            engine.counts.failures["copy"],
+            engine.counts.failures["segment"],
         ) == (
             True,
             1,

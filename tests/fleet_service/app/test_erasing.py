@@ -177,7 +177,7 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
         assert Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns()) != before
         again = wire.encode(sent)
         engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-001"), again, "")], time.time_ns())
-        assert engine.counts["refused.erased"] == 1, "nobody could tell that it was there before"
+        assert engine.counts.refused["erased"] == 1, "nobody could tell that it was there before"
 
 
 def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -23,6 +22,7 @@ from fleet_service.archive.format import layout
 from fleet_service.archive.maintenance import disk_reserve
 from fleet_service.archive.maintenance.compaction import hold_compaction_lock
 from fleet_service.cli import main
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
@@ -66,11 +66,11 @@ def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None
             raise OSError("no disk")
         return "well" if len(turns) == 2 else None
 
-    counts: Counter[str] = Counter()
+    counts = ServiceCounts()
     lines: list[str] = []
     with BackgroundJobs([Job("mending", 0.001, work)], counts, lines.append):
         until(lambda: len(turns) > 2)
-    assert counts["mending_failures"] == 1
+    assert counts.failures["mending"] == 1
     assert lines == ["mending failed: no disk", "well"]
 
 
@@ -80,10 +80,10 @@ def test_an_unforeseen_job_failure_ends_no_other_job_and_is_reported(tmp_path: P
     def work(stop: threading.Event) -> str | None:
         raise ValueError("Invalid isoformat string: '2026-01-31 (copy)'")
 
-    counts: Counter[str] = Counter()
+    counts = ServiceCounts()
     jobs = [Job("broken", 0.001, work), Job("other", 0.001, lambda _: turns.append(1))]
     with BackgroundJobs(jobs, counts, lambda _: None) as upkeep:
-        until(lambda: len(turns) > 5 and counts["broken_failures"] > 5)
+        until(lambda: len(turns) > 5 and counts.failures["broken"] > 5)
         assert upkeep.health_problems()[0].startswith("broken failed ")
         assert not upkeep.has_ended
 
@@ -93,7 +93,7 @@ def test_upkeep_that_has_died_is_known_and_told() -> None:
     def work(stop: threading.Event) -> str | None:
         raise KeyboardInterrupt
 
-    with BackgroundJobs([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
+    with BackgroundJobs([Job("fatal", 0.001, work)], ServiceCounts(), lambda _: None) as upkeep:
         until(lambda: upkeep.has_ended)
         assert (
             upkeep.health_problems()[-1]
@@ -138,7 +138,7 @@ def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(
 def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
     done: Callable[[threading.Event], str | None] = lambda _: "done"  # noqa: E731
     lines: list[str] = []
-    with BackgroundJobs([Job("never", 0.0, done)], Counter(), lines.append):
+    with BackgroundJobs([Job("never", 0.0, done)], ServiceCounts(), lines.append):
         pass
     assert not lines
 

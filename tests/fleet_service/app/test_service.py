@@ -187,7 +187,7 @@ def test_repeated_batch_is_acknowledged_again_and_not_counted_again(
     before = fleet.acks
     fleet.publish(sent)
     until(lambda: fleet.acks > before)
-    assert service.service.engine.counts["duplicates"] == 1
+    assert service.service.engine.counts.duplicates == 1
     assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
@@ -199,7 +199,7 @@ def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(
     assert fleet.rejected == [
         ("sim-001", 1, 1, "speed: lies outside [0, 100]; correct it at the source")
     ]
-    assert service.service.engine.counts["refused.speed"] == 1
+    assert service.service.engine.counts.refused["speed"] == 1
     assert service.service.engine.state.fusion.size == 0
 
 
@@ -228,7 +228,7 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
     fleet: Fleet, service: Running, name: str, payload: bytes, encoding: str, rule: str
 ) -> None:
     fleet.session.put(name, payload, encoding=encoding)
-    until(lambda: service.service.engine.counts[f"refused.{rule}"] == 1)
+    until(lambda: service.service.engine.counts.refused[rule] == 1)
     fleet.settle(batch("sim-001", 1, now(), [0.8]))
     assert service.service.engine.state.fusion.live.visits[0] == 1
 
@@ -315,8 +315,8 @@ def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
         heard = fleet.acks
         for one in sent:
             fleet.publish(one)
-        until(lambda: counts["duplicates"] == len(sent) and fleet.acks > heard)
-        assert counts[Kind.OBSERVATION] == 0
+        until(lambda: counts.duplicates == len(sent) and fleet.acks > heard)
+        assert counts.observations == 0
     kept = [pq.read_table(path) for path in (tmp_path / "inbox").glob("*.parquet")]
     rows = sum(table.num_rows for table in kept)
     assert rows == sum(one.rows for one in sent)
@@ -482,6 +482,6 @@ def test_leaving_flushes_and_acknowledges_what_was_taken_in(
         fleet = Fleet(session).await_services()
         sent = batch("sim-001", 1, now(), [0.8])
         fleet.publish(sent)
-        until(lambda: len(run.service.inbox) or run.service.engine.counts[Kind.OBSERVATION])
+        until(lambda: len(run.service.inbox) or run.service.engine.counts.observations)
     until(lambda: 1 in fleet.durable["sim-001"])
     assert run.lines[-1].startswith("status: 1 observations")

@@ -154,10 +154,10 @@ def make(root: Path) -> dict[str, Any]:
                 rollup.complete_parts(root)
                 snapshots.write_snapshot(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
                 save_checkpoint(engine)
-        rows = {str(kind): engine.counts[kind] for kind in Kind}
+        rows = {str(kind): engine.counts.rows[kind] for kind in Kind}
         return map_of(engine, now_of(ROUNDS)) | {
             "alerts": engine.alerts.count,
-            "late": engine.counts["late"],
+            "late": engine.counts.late,
             "rows": rows,
         }
 

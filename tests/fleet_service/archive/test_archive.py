@@ -87,7 +87,7 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(
     assert engine.settlement.flush() == []
     engine.intake.ingest([make_message("sim-001", 2), make_message("sim-001", 1)], time.time_ns())
     assert engine.settlement.flush() == []
-    assert engine.counts["segment_failures"] == 2
+    assert engine.counts.failures["segment"] == 2
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert (
@@ -119,8 +119,8 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(
         assert again.state.fusion.live.visits[0] == 4
         assert damaged.with_name(damaged.name + ".bad").exists()
         again.intake.ingest([make_message("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
-        assert again.counts[Kind.OBSERVATION] == 2
-        assert again.counts["duplicates"] == 2
+        assert again.counts.observations == 2
+        assert again.counts.duplicates == 2
 
 
 @pytest.mark.parametrize("place", np.linspace(0.002, 0.998, 40).round(3))
@@ -142,10 +142,10 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
             for row in table.to_pylist()
         ]
         assert repr(held) == repr(before) or not held
-        assert again.counts["files_set_aside"] == (not held)
+        assert again.counts.files_set_aside == (not held)
         assert ("is damaged and was set aside" in caplog.text) == (not held)
         again.intake.ingest([make_message("sim-001", 1)], time.time_ns())
-        assert again.counts["duplicates"] == bool(held)
+        assert again.counts.duplicates == bool(held)
 
 
 def test_unsynced_names_are_synced_before_any_acknowledgement(
@@ -158,7 +158,7 @@ def test_unsynced_names_are_synced_before_any_acknowledgement(
         patch.setattr(segments, "sync_directory", broken)
         engine.intake.ingest([make_message("sim-001", 1)], time.time_ns())
         assert engine.settlement.flush() == []
-        assert engine.counts["segment_failures"] == 1
+        assert engine.counts.failures["segment"] == 1
     engine.intake.ingest([make_message("sim-001", 2)], time.time_ns())
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 2)]}
     assert sum(table.num_rows for table in reading.read_tables(tmp_path, Kind.OBSERVATION)) == 4
@@ -245,7 +245,7 @@ def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_
     engine.intake.ingest([make_message("sim-001", 1)], now)
     engine.intake.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
     assert read_settled(engine.settlement.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
-    assert engine.counts["late"] == 1
+    assert engine.counts.late == 1
     (table,) = reading.read_tables(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
         (False, 0.75),

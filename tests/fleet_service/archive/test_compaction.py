@@ -266,7 +266,7 @@ def test_service_on_a_compacted_archive_has_the_same_map_and_batches(tmp_path: P
                 atol=1e-6,
             )
             again.intake.ingest(messages, time_ns())
-            assert again.counts["duplicates"] == 20
+            assert again.counts.duplicates == 20
             assert read_settled(again.settlement.flush()).keys() == {
                 f"sim-{k:03}" for k in range(5)
             }

@@ -203,7 +203,7 @@ def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: 
                 "of that month, and never there"
             )
             assert acknowledge_batch(engine, later, after + SECOND) == ["durable"]
-            assert (engine.counts["refused.erased"], engine.counts["duplicates"]) == (2, 1)
+            assert (engine.counts.refused["erased"], engine.counts.duplicates) == (2, 1)
             assert rows_kept(tmp_path) == 2
             assert engine.state.fusion.live.visits[: engine.state.fusion.size].sum() == 2
             keep(engine, tmp_path)
@@ -230,7 +230,7 @@ def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: 
                 "known, and counted once"
             )
             assert acknowledge_batch(engine, late, NOON + DAY) == ["durable"], "measured since"
-            assert engine.counts["refused.erased"] == 1
+            assert engine.counts.refused["erased"] == 1
         assert rows_kept(tmp_path) == 2
     (mark,) = (tmp_path / "keys").glob("*.erased")
     assert Pseudonyms(tmp_path / "keys").of("car-001", NOON) in mark.name
@@ -265,7 +265,7 @@ def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_pa
         ]
     assert retention.forget_vehicle(tmp_path, "car-001", "2026-01").rows == 1
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert engine.counts["files_set_aside"] == 0
+        assert engine.counts.files_set_aside == 0
     assert not list(tmp_path.rglob(f"*{BAD}"))
     assert rows_kept(tmp_path) == 0
 

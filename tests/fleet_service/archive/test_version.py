@@ -93,13 +93,13 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
-        assert engine.counts["checkpoints_refused"] == (begin == "checkpoint"), (
+        assert engine.counts.checkpoints_refused == (begin == "checkpoint"), (
             "it has no digests: the log is replayed"
         )
         same(map_of(engine, MADE["at"]), MADE)
         assert engine.alerts.count == MADE["alerts"] > 0
         engine.intake.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
-        assert engine.counts["duplicates"] == 8 * 2 * ROUNDS, "it knows every batch again"
+        assert engine.counts.duplicates == 8 * 2 * ROUNDS, "it knows every batch again"
     assert not list(old.rglob("*.bad"))
 
 
@@ -179,7 +179,7 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
     assert set(rows["estimator"]) == {""}
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert engine.state.fusion.size
-        assert engine.counts["files_set_aside"] == 0
+        assert engine.counts.files_set_aside == 0
 
 
 def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) -> None:
@@ -363,7 +363,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
     assert [path.name for path in old.rglob("*.bad")] == [harmed[0].name + ".bad"]
     with closing(Engine(ServiceConfig(), old)) as engine:
         # The service does not read the damaged roll-up file.
-        assert engine.counts["files_set_aside"] == 3
+        assert engine.counts.files_set_aside == 3
 
 
 def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> None:

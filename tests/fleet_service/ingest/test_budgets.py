@@ -76,7 +76,7 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
     for again in (False, True):
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
             engine.intake.ingest([message(one) for one in sent], after)
-            assert engine.counts["duplicates"] == (2 if again else 0), "a restart knows both"
+            assert engine.counts.duplicates == (2 if again else 0), "a restart knows both"
             ((vehicle, ack),) = engine.settlement.flush()
             streams = wire.decode_ack(ack)[1]
             assert {stream.boot for stream in streams} == {sent[0].boot}, (
@@ -105,7 +105,7 @@ def test_batches_with_unhashed_starts_are_recognised_again(
             engine.settlement.flush()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest(sent, now)
-        assert (engine.counts["duplicates"], engine.counts[Kind.OBSERVATION]) == (2, 1)
+        assert (engine.counts.duplicates, engine.counts.observations) == (2, 1)
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
@@ -122,7 +122,7 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
         )
         engine.intake.ingest([message(one)], now)
     assert engine.alerts.count == 0
-    assert engine.counts["refused.time"] == 20, "a batch spans no month"
+    assert engine.counts.refused["time"] == 20, "a batch spans no month"
     assert engine.state.fusion.live.vehicles[: engine.state.fusion.size].max() == 1
 
 
@@ -151,19 +151,19 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
         for k in range(3):
             engine.intake.ingest([message(batch(f"car-{k:03}", 1, now, [0.8, 0.8]))], now)
         engine.settlement.flush()
-        assert engine.counts["witnesses_damaged"] == 0
+        assert engine.counts.witnesses_damaged == 0
     path = next(tmp_path.glob("keys/*.witnesses"))
     whole = read_numbers(path.parent)
     data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data + b"half a li")  # an append that a full disk cut off
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert engine.counts["witnesses_damaged"] == 2
+        assert engine.counts.witnesses_damaged == 2
         assert len(read_numbers(path.parent)) == 2
         engine.intake.ingest([message(batch("car-001", 2, now, [0.8, 0.8]))], now)
         assert read_numbers(path.parent) == whole
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        assert engine.counts["witnesses_damaged"] == 0
+        assert engine.counts.witnesses_damaged == 0
 
 
 def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
@@ -220,9 +220,9 @@ def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: E
             engine.intake.ingest([message(one)], now)
             sent += 50
     assert sent > 2 * at_once
-    assert engine.counts[Kind.OBSERVATION] == sent, "nothing is refused"
-    assert engine.counts["implausible_moves"] == 0
-    assert engine.counts["too_many_places"] > sent - 2 * at_once
+    assert engine.counts.observations == sent, "nothing is refused"
+    assert engine.counts.implausible_moves == 0
+    assert engine.counts.too_many_places > sent - 2 * at_once
     assert engine.state.fusion.size < 3 * at_once
 
 
@@ -231,8 +231,8 @@ def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
     for boot in range(1, 1000):
         one = replace(batch("car-001", 1, now, [0.8]), boot=boot)
         engine.intake.ingest([message(one)], now)
-    assert engine.counts[Kind.OBSERVATION] == STREAMS_AT_ONCE
-    assert engine.counts["too_many_streams"] == 999 - STREAMS_AT_ONCE
+    assert engine.counts.observations == STREAMS_AT_ONCE
+    assert engine.counts.too_many_streams == 999 - STREAMS_AT_ONCE
 
 
 def test_new_cells_are_counted_once_and_by_vehicle() -> None:

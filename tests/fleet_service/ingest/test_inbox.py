@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app.engine import Engine
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.inbox import QUEUE_BYTES, STEP_BYTES, STEP_MESSAGES, Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from schemas import keys, wire
@@ -24,8 +25,8 @@ from tests.fleet_service.examples import SECOND, batch, key
 NOW = 1_750_000_000 * SECOND
 
 
-def inbox(capacity: int) -> tuple[Inbox, Counter[str]]:
-    counts: Counter[str] = Counter()
+def inbox(capacity: int) -> tuple[Inbox, ServiceCounts]:
+    counts = ServiceCounts()
     return Inbox(capacity, counts, RateLimiter(1.0, 1.0, None, counts)), counts
 
 
@@ -40,7 +41,7 @@ def test_what_waits_is_bounded_in_bytes_and_not_in_messages_only() -> None:
     for _ in range(2 * fits):
         queue.put(large)
     assert fits <= len(queue) <= fits + 1
-    assert counts["overload"] == 2 * fits - len(queue), (
+    assert counts.overload == 2 * fits - len(queue), (
         "each that found no room is counted; its sender keeps it"
     )
     waiting = len(queue)
@@ -59,7 +60,7 @@ def test_what_waits_is_bounded_in_messages_too_and_a_step_takes_so_many() -> Non
     queue, counts = inbox(3 * STEP_MESSAGES)
     for _ in range(4 * STEP_MESSAGES):
         queue.put(of_bytes(1))
-    assert (len(queue), counts["overload"]) == (3 * STEP_MESSAGES, STEP_MESSAGES)
+    assert (len(queue), counts.overload) == (3 * STEP_MESSAGES, STEP_MESSAGES)
     assert [len(queue.drain(0.0)) for _ in range(4)] == [STEP_MESSAGES] * 3 + [0]
 
 
@@ -106,7 +107,7 @@ def test_active_senders_stay_cached_and_past_days_are_dropped(tmp_path: Path) ->
         assert again is first
         (later,) = list_known(3, NOW + 3 * 86_400 * SECOND)
         assert later == (*first[:3], first[3] + 3)
-        assert engine.counts[Kind.OBSERVATION] == 3
+        assert engine.counts.observations == 3
 
 
 def test_a_waiting_worker_is_woken_without_a_message() -> None:

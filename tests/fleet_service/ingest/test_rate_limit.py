@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest import rate_limit
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import SequenceTracker
@@ -39,8 +40,8 @@ class Clock:
         return self.now
 
 
-def buckets(clock: Clock, known: set[str] | None = None) -> tuple[RateLimiter, Counter[str]]:
-    counts: Counter[str] = Counter()
+def buckets(clock: Clock, known: set[str] | None = None) -> tuple[RateLimiter, ServiceCounts]:
+    counts = ServiceCounts()
     return RateLimiter(RATE, BURST, known, counts, clock), counts
 
 
@@ -50,7 +51,7 @@ def test_a_vehicle_may_send_a_burst_and_then_its_rate() -> None:
     assert sum(found.allows("obs/a", 5_000) for _ in range(100)) == BURST / 5_000
     clock.now = 2.0
     assert sum(found.allows("obs/a", 5_000) for _ in range(100)) == 2 * RATE / 5_000
-    assert counts == {"limited": 200 - 10 - 4}
+    assert counts == ServiceCounts(limited=200 - 10 - 4)
 
 
 def test_small_messages_cost_what_it_takes_to_read_one() -> None:
@@ -63,7 +64,7 @@ def test_a_byte_of_json_costs_what_it_takes_to_read_it(encoding: str) -> None:
     found, counts = buckets(Clock())
     size = int(BURST) // (2 * JSON_COST)
     assert [found.allows("a/car", size, encoding) for _ in range(3)] == [True, True, False]
-    assert counts["limited"] == 1
+    assert counts.limited == 1
     assert all(found.allows("a/other", size) for _ in range(2 * JSON_COST))
 
 
@@ -78,7 +79,7 @@ def test_who_is_not_enrolled_is_not_looked_at() -> None:
     found, counts = buckets(Clock(), {"car-1"})
     assert found.allows("obs/1202/310/232/car-1", 300)
     assert not any(found.allows(f"obs/1202/310/232/{name}", 300) for name in ("car-2", "**", ""))
-    assert counts == {"refused.unknown": 3}
+    assert counts == ServiceCounts(refused=Counter({"unknown": 3}))
     assert len(found) == 1
 
 
@@ -134,9 +135,9 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
             for seq in range(1, 101):
                 sent = batch(name, seq, time.time_ns() - SECOND, [0.8])
                 session.put(key(name), wire.encode(sent), encoding=wire.ENCODING[Kind.OBSERVATION])
-        until(lambda: counts["limited"] + counts[Kind.OBSERVATION] == 100)
-        assert counts["refused.unknown"] == 100
-        assert 60 <= counts[Kind.OBSERVATION] < 100
+        until(lambda: counts.limited + counts.observations == 100)
+        assert counts.refused["unknown"] == 100
+        assert 60 <= counts.observations < 100
         until(lambda: heard)
         rejected = [
             refusal

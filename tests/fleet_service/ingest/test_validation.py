@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
+from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.acks import Acks, consecutive_ranges
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import BatchIntake, Inbox, Message
@@ -43,7 +44,7 @@ class Desk:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts = ServiceCounts()
         self.acks = Acks()
         self.intake = BatchIntake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
 
@@ -120,7 +121,7 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
         desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values))))
         == 0
     )
-    assert desk.counts == {f"refused.{rule}": 1}
+    assert desk.counts == ServiceCounts(refused=Counter({rule: 1}))
     ((seq, row, reason),) = desk.list_rejected()
     assert (seq, row) == (1, 0)
     assert ": " in reason
@@ -165,7 +166,7 @@ def test_controllers_and_surroundings_are_taken_as_they_were_sent(desk: Desk) ->
 def test_a_bad_batch_among_good_ones_is_refused_alone(desk: Desk) -> None:
     bad = batch("sim-002", 1, NOW - SECOND, [0.8, 0.7], speed=[1.0, 1e9])
     assert desk.take(message(good()), message(bad), message(good(vehicle="sim-003"))) == 4
-    assert desk.counts == {"refused.speed": 1}
+    assert desk.counts == ServiceCounts(refused=Counter({"speed": 1}))
     assert desk.list_rejected() == [
         (1, 1, "speed: lies outside [0, 100]; correct it at the source")
     ]
@@ -181,17 +182,17 @@ def test_a_refused_batch_that_comes_again_is_refused_again(desk: Desk) -> None:
 def test_a_batch_is_admitted_once_however_often_and_wherever_it_comes(desk: Desk) -> None:
     assert desk.take(message(good()), message(good())) == 2
     assert desk.take(message(good())) == 0
-    assert desk.counts == {"duplicates": 2}
+    assert desk.counts == ServiceCounts(duplicates=2)
     assert not desk.acks.messages(), "nothing of it is on disk yet"
 
 
 def test_a_full_queue_drops_and_counts() -> None:
-    counts: Counter[str] = Counter()
+    counts = ServiceCounts()
     inbox = Inbox(2, counts, RateLimiter(1e6, 1e6, None, counts))
     for _ in range(5):
         inbox.put(message(good()))
     assert len(inbox.drain(0.0)) == 2
-    assert counts == {"overload": 3}
+    assert counts == ServiceCounts(overload=3)
 
 
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -234,10 +235,10 @@ def test_unusable_records_are_rejected_if_the_head_can_be_read(desk: Desk) -> No
     ((seq, row, reason),) = desk.list_rejected()
     assert (seq, row) == (7, -1)
     assert reason.startswith("mu: has 1 records")
-    assert desk.counts["refused.mu"] == 1
+    assert desk.counts.refused["mu"] == 1
     # With another vehicle's key the sender is unknown, so no rejection is sent.
     pb.vehicle = "sim-002"
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString()))
     desk.take(message(batch("sim-001", 7, NOW, [0.8]), b"\xff" * 40))
     assert desk.list_rejected() == []
-    assert desk.counts["refused.payload"] == 1
+    assert desk.counts.refused["payload"] == 1

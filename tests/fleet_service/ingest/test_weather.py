@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +20,7 @@ import zenoh
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format.layout import DAY_NS
 from fleet_service.archive.maintenance.retention import drop_checkpoints
+from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import (
@@ -143,7 +143,7 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
     engine.intake.update_weather(start + 1300 * SECOND)
     drive(engine, start + 3000 * SECOND, 2)
-    assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
+    assert (engine.counts.weather, engine.counts.refused["weather"]) == (2, 1)
     engine.close()
     again = Engine(config, tmp_path / "a")
     dry = Engine(ServiceConfig(), tmp_path / "b")
@@ -210,12 +210,12 @@ def test_a_running_service_takes_weather_over_its_key(
     )
     publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     counts = service.service.engine.counts
-    until(lambda: counts["weather"] == 1 and counts["refused.weather"] == 2)
+    until(lambda: counts.weather == 1 and counts.refused["weather"] == 2)
     publisher.undeclare()
 
 
 def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path: Path) -> None:
-    counts: Counter[str] = Counter()
+    counts = ServiceCounts()
     inbox = WeatherInbox(tmp_path, "fleet", Fusion(120.0), counts)
     now = 10**18
     many = WAITING + 50
@@ -230,4 +230,4 @@ def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path:
     assert inbox.take(now) is None
     inbox.enqueue(WeatherMessage(key, bytes(MOST_BYTES + 1), wire.WEATHER_ENCODING))
     assert inbox.take(now) is None
-    assert counts["refused.weather"] == 1
+    assert counts.refused["weather"] == 1

@@ -14,7 +14,6 @@ import zenoh
 
 from fleet_service.page.server import PageSettings, run
 from schemas.config import ZenohSettings
-from schemas.wire import Kind
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.page import street
 from tests.waiting import until
@@ -79,12 +78,10 @@ def drive(session: zenoh.Session, page: RunningPage) -> Drive:
     def go(*parts: str) -> None:
         nonlocal seq
         assert page.service is not None
-        before = page.service.service.engine.counts[Kind.OBSERVATION]
+        before = page.service.service.engine.counts.observations
         named = parts or tuple(street.PARTS)
         seq = street.put(session, named, time.time_ns(), seq)
         wanted = before + street.count_known(*named) * len(street.CARS)
-        until(
-            lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] >= wanted
-        )
+        until(lambda: page.service and page.service.service.engine.counts.observations >= wanted)
 
     return go

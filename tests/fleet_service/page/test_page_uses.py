@@ -18,7 +18,6 @@ import zenoh
 from schemas import grid, keys
 from schemas.config import ZenohSettings
 from schemas.tables import MAP_SCHEMA
-from schemas.wire import Kind
 from tests.browser import Opened, open_page
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import batch, send
@@ -232,9 +231,9 @@ def test_map_of_two_continents_opens_on_one_of_them(
     )
     far = dataclasses.replace(far, region=region)
     assert page.service is not None
-    before = page.service.service.engine.counts[Kind.OBSERVATION]
+    before = page.service.service.engine.counts.observations
     send(session, far, keys.observation_key(region, "car-far"))
-    until(lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] > before)
+    until(lambda: page.service and page.service.service.engine.counts.observations > before)
     with open_map(page) as seen:
         waits(seen, "document.querySelectorAll('#panel .area').length === 2")
         assert seen.page.evaluate("gripmap.map.view.zoom") > 14

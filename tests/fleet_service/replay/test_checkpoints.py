@@ -99,9 +99,9 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(
         from_checkpoint = beliefs(again, at)
         assert replayed == [20]
         assert again.alerts.count == alerts > 0
-        assert again.counts["checkpoints_refused"] == 0
+        assert again.counts.checkpoints_refused == 0
         again.intake.ingest(sent, time.time_ns())
-        assert again.counts["duplicates"] == 60
+        assert again.counts.duplicates == 60
     assert path.name
     drop_checkpoints(tmp_path)
     with closing(Engine(ServiceConfig(), tmp_path)) as whole:
@@ -196,7 +196,7 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
         assert len(checkpoints.list_checkpoints(tmp_path)) == kept
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             found = read_state(again)
-            assert (again.seen, again.counts["checkpoints_refused"]) == (
+            assert (again.seen, again.counts.checkpoints_refused) == (
                 again.state.streams.newest,
                 0,
             )
@@ -214,7 +214,7 @@ def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 4
         again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
-        assert (again.counts["duplicates"], again.state.fusion.live.visits[0]) == (4, 8)
+        assert (again.counts.duplicates, again.state.fusion.live.visits[0]) == (4, 8)
 
 
 @pytest.mark.parametrize("harm", ["truncate", "remove", "flip"])
@@ -239,7 +239,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
         else:
             file.unlink()
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
-            assert again.counts["checkpoints_refused"] == refused
+            assert again.counts.checkpoints_refused == refused
             np.testing.assert_allclose(beliefs(again, at), running, atol=1e-6)
 
 
@@ -277,7 +277,7 @@ def test_rows_after_the_checkpoint_are_replayed_whatever_the_clock(tmp_path: Pat
         compact(tmp_path)
     assert keep_alerts > 0
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        assert again.counts["checkpoints_refused"] == 0
+        assert again.counts.checkpoints_refused == 0
         assert again.alerts.count == keep_alerts
         assert again.state.fusion.live.visits[: again.state.fusion.size].sum() == visits
         np.testing.assert_allclose(beliefs(again, at), running, atol=1e-6)
@@ -293,7 +293,7 @@ def test_compacted_file_across_the_checkpoint_is_not_replayed_twice(tmp_path: Pa
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.state.fusion.live.visits[0] == 8
         again.intake.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
-        assert again.counts["duplicates"] == 8
+        assert again.counts.duplicates == 8
 
 
 def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None:

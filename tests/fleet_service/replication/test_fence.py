@@ -5,13 +5,13 @@ Its late uploads must replace no file of the service that took over.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from fleet_service.archive.identity import vehicle_ids
 from fleet_service.archive.identity.vehicle_ids import VehicleIds
+from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, join_daily_files
 from fleet_service.ingest.weather import archived_reports as archived_weather
@@ -34,7 +34,7 @@ def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
         list_.sync()
 
     def hears(one: Machine, region: int) -> None:
-        inbox = WeatherInbox(one.root, one.config.name, fusion, Counter())
+        inbox = WeatherInbox(one.root, one.config.name, fusion, ServiceCounts())
         report = weather.encode(weather.Report(time.time_ns(), precipitation=1.0))
         inbox.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
         assert inbox.take(time.time_ns()) is not None

@@ -5,13 +5,13 @@ empty map.
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
 
 import pyarrow as pa
 import pytest
 import zenoh
 
+from fleet_service.counts import ServiceCounts
 from fleet_service.serve.query import AnswerSize
 from fleet_service.serve.queryable import (
     COST,
@@ -61,7 +61,7 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
         if len(turns) == 1:
             raise failure
 
-    counts: Counter[str] = Counter()
+    counts = ServiceCounts()
     key = keys.map_key(TILE)
     queryable = session.declare_queryable(
         key, MapQueryable(Answering(lambda *_: AnswerSize(1, 1), answer), counts), complete=True
@@ -75,14 +75,14 @@ def test_an_answer_that_fails_midway_is_an_error_and_the_next_works(
     ]
     # The previous query about the past releases its place a moment after its answer.
     until(lambda: texts(session, key + parameters) == ["a tile"])
-    assert counts["answer_failures"] == 1
+    assert counts.failures["answer"] == 1
     querier.undeclare()
     queryable.undeclare()
 
 
 def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.Session) -> None:
     key = keys.map_key(TILE)
-    counts = Counter[str]()
+    counts = ServiceCounts()
     asked = Answering(lambda *_: AnswerSize(MOST // COST[Format.JSON] + 1, 1), nothing)
     queryable = session.declare_queryable(key, MapQueryable(asked, counts), complete=True)
     querier = session.declare_querier(key)
@@ -91,7 +91,7 @@ def test_a_query_with_a_too_large_answer_is_refused_with_a_hint(session: zenoh.S
         "bbox: the answer would be too large; use a smaller bbox, or format=arrow"
     ]
     assert texts(session, key) == []
-    assert counts["heavy_queries"] == 1
+    assert counts.heavy_queries == 1
     querier.undeclare()
     queryable.undeclare()
 
@@ -116,7 +116,7 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
     cells each. The test covers both.
     """
     key = keys.map_key(TILE)
-    counts = Counter[str]()
+    counts = ServiceCounts()
     light_came = threading.Event()
 
     def size(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
@@ -154,7 +154,7 @@ class Half:
     """
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.counts = Counter[str]()
+        self.counts = ServiceCounts()
         self.go = threading.Event()
         self.session = session
         self.begun = threading.Semaphore(0)
@@ -210,22 +210,22 @@ def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> No
     """
     for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
         assert half.ask(4) == ["last"]
-    assert half.counts["queries"] > half.counts["heavy_queries"] > 0
-    assert not half.counts["refused_queries"]
+    assert half.counts.queries > half.counts.heavy_queries > 0
+    assert not half.counts.refused_queries
 
 
 def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) -> None:
     large = [
         half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0) for _ in range(WAITING + 2)
     ]
-    until(lambda: half.counts["refused_queries"] >= 1)
+    until(lambda: half.counts.refused_queries >= 1)
     assert half.ask(3) == ["last"]
     half.go.set()
     answers = [
         sorted(part.payload.to_string() for r in one if (part := r.ok or r.err)) for one in large
     ]
     refused = [answer for answer in answers if "last" not in answer]
-    assert len(refused) == half.counts["refused_queries"] < len(large)
+    assert len(refused) == half.counts.refused_queries < len(large)
     assert all(
         "query: too many large queries are waiting; ask again later, or query a smaller area"
         in answer

@@ -5,8 +5,7 @@ the service's main loop.
 
 from __future__ import annotations
 
-from collections import Counter
-
+from fleet_service.counts import ServiceCounts
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 
 COST_S = SHARE_S / 2.0  # time to make a tile
@@ -21,7 +20,7 @@ class Made:
         self.now = 100.0
         self.changed = set[int]()
         self.puts = list[tuple[int, float]]()
-        self.counts = Counter[str]()
+        self.counts = ServiceCounts()
         self.rounds = TileRounds(1.0, self.take, self.put, self.counts, lambda: self.now)
 
     def take(self) -> list[int]:
@@ -59,12 +58,12 @@ def test_skipped_tile_rounds_are_counted_and_changes_come_in_the_next() -> None:
     while len(made.puts) < 300:
         made.turn(SHARE_S)
         made.changed |= {3, 5}
-    skipped = made.counts["tile_rounds_skipped"]
+    skipped = made.counts.tile_rounds_skipped
     assert skipped >= 2
     while made.rounds.waiting or len(made.puts) == 300:
         made.turn(SHARE_S)
     assert [tile for tile, _ in made.puts[300:]] == [3, 5]
-    assert made.counts["tile_rounds_skipped"] == skipped
+    assert made.counts.tile_rounds_skipped == skipped
 
 
 def test_when_somebody_passed_does_not_move_the_moment_of_a_put() -> None:
@@ -84,7 +83,7 @@ def test_a_stalled_worker_begins_one_round_and_counts_the_missed_ones() -> None:
     made.changed = {7}
     made.turn(5.5)
     assert [tile for tile, _ in made.puts] == [7]
-    assert made.counts["tile_rounds_skipped"] == 4
+    assert made.counts.tile_rounds_skipped == 4
     made.changed = {8}
     assert made.turn(0.3) == 0
     assert made.turn(0.3) == 1

@@ -115,7 +115,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         assert [name for name in expected if not found[name].equals(expected[name])] == []
         again = Fleet(session)  # the new owner recognises repeated batches
         until(make_driver(again, sent), PATIENCE_S)
-        assert engine.counts["duplicates"] >= len(sent)
+        assert engine.counts.duplicates >= len(sent)
         config = tmp_path / "config.json"
         config.write_text(json.dumps({"zenoh": router.model_dump()}))
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", "--config", str(config)]) == 0

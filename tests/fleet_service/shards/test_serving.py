@@ -27,7 +27,7 @@ from schemas import grid, keys, query, regions
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime import presence
-from schemas.wire import Batch, Kind
+from schemas.wire import Batch
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import SECOND, batch, send
 from tests.waiting import until
@@ -95,7 +95,7 @@ def drive(session: zenoh.Session, services: list[Running]) -> None:
         for made in visits(f"sim-{car:03}"):
             send(session, made, keys.observation_key(made.region, made.vehicle))
     wanted = CARS * len(LONGITUDES)
-    until(lambda: sum(run.service.engine.counts[Kind.OBSERVATION] for run in services) == wanted)
+    until(lambda: sum(run.service.engine.counts.observations for run in services) == wanted)
 
 
 def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
@@ -283,7 +283,7 @@ def drive_one(session: zenoh.Session, service: Running) -> None:
     own = [made for made in visits("sim-000") if made.region == REGIONS[1]]
     for made in own:
         send(session, made, keys.observation_key(made.region, made.vehicle))
-    until(lambda: service.service.engine.counts[Kind.OBSERVATION] == len(own))
+    until(lambda: service.service.engine.counts.observations == len(own))
 
 
 @pytest.mark.parametrize("comes_back", [False, True])

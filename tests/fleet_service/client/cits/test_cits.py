@@ -354,7 +354,7 @@ def test_foreign_denm_alone_raise_no_alert(tmp_path: Path) -> None:
             engine.intake.ingest(
                 [Message(Kind.OBSERVATION, place, payload, JSON) for place, payload in batches], now
             )
-        assert engine.counts[Kind.OBSERVATION] == 10, dict(engine.counts)
+        assert engine.counts.observations == 10, engine.counts
         assert engine.alerts.all == []
     finally:
         engine.close()
