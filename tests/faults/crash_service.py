@@ -39,6 +39,7 @@ from fleet_service.archive.maintenance.retention import (
 )
 from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
 from schemas import grid, keys, tables, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -181,17 +182,24 @@ class ServiceHistory(Lives[Sent]):
 
     def _write_checkpoint(self, engine: Engine, root: Path) -> None:
         """Write a checkpoint (saved state of the service): a background job requests it, and the
-        worker writes it when all accepted rows are on disk.
+        worker takes it when all accepted rows are on disk. The service writes it in a child
+        process; here this process does, because it simulates the disk.
         """
         stop = threading.Event()
+
+        def take_image() -> checkpoints.Taken:
+            return engine.state.image(engine.settlement.newest_segment, weather.weather_files(root))
+
         with ThreadPoolExecutor(1) as upkeep:
-            coming = upkeep.submit(engine.save_checkpoint, stop)
+            coming = upkeep.submit(engine.settlement.run_between_segments, take_image, stop)
             try:
                 while not coming.done():
                     self._flush_acks(engine)
             finally:
                 stop.set()
-        if coming.result():
+        taken = coming.result()
+        if taken is not None:
+            checkpoints.save_checkpoint(root, taken)
             snapshots.write_snapshot(root, engine.queries.whole_map(self._now), self._now)
 
     def _make_batch(self) -> Sent:
