@@ -88,11 +88,12 @@ class ServiceCounts:
 
     def as_dict(self) -> dict[str, int]:
         """Return all counts by name, such as `late`, `refused.time` and `compaction_failures`."""
+        # `dict` copies at once. Another thread may add a key during an iteration.
         return {
             **{name: getattr(self, name) for name in (*self.texts(), "files_set_aside")},
-            **{str(kind): n for kind, n in self.rows.items()},
-            **{f"refused.{reason}": n for reason, n in self.refused.items()},
-            **{f"bad_queries.{name}": n for name, n in self.bad_queries.items()},
-            **{f"{work}_failures": n for work, n in self.failures.items()},
-            **{f"{job}_runs": n for job, n in self.runs.items()},
+            **{str(kind): n for kind, n in dict(self.rows).items()},
+            **{f"refused.{reason}": n for reason, n in dict(self.refused).items()},
+            **{f"bad_queries.{name}": n for name, n in dict(self.bad_queries).items()},
+            **{f"{work}_failures": n for work, n in dict(self.failures).items()},
+            **{f"{job}_runs": n for job, n in dict(self.runs).items()},
         }
