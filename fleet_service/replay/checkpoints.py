@@ -105,13 +105,10 @@ def load_checkpoint(path: Path) -> Taken:
     try:
         manifest = json.loads((path / _MANIFEST).read_bytes())
         content: dict[str, Any] = manifest["content"]
-        paths = [path / name for name in content["files"]]
         right = manifest["digest"] == _digest_of(content)
     except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
         raise _checkpoint_error(path, "has no readable manifest") from error
-    with ThreadPoolExecutor() as threads:
-        found = dict(zip(content["files"], threads.map(file_digest, paths), strict=True))
-    if not right or found != content["files"]:
+    if not right or not _are_whole(path, content["files"]):
         raise _checkpoint_error(path, "is damaged")
     if _count_tries(path) >= TRIES:
         raise _checkpoint_error(path, f"made the service fail at {TRIES} starts")
@@ -146,6 +143,13 @@ def file_digest(path: Path) -> str:
         while chunk := file.read(_CHUNK):
             state.update(chunk)
     return state.hexdigest()
+
+
+def _are_whole(folder: Path, wanted: dict[str, str]) -> bool:
+    """Return True if each file of a checkpoint's folder has the wanted digest."""
+    with ThreadPoolExecutor() as threads:
+        found = threads.map(file_digest, (folder / name for name in wanted))
+        return list(found) == list(wanted.values())
 
 
 def _count_tries(path: Path) -> int:

@@ -13,13 +13,9 @@ import time
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fleet_service.app import UNUSED
 from schemas.runtime.process import limit_memory
-
-if TYPE_CHECKING:
-    pass
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from schemas.runtime.forked import run_forked
 from tests.waiting import until
 
 PARENT = """
-import os, sys, threading, time
+import os, sys, time
 from pathlib import Path
 from schemas.runtime.forked import run_forked
 run_forked(lambda: (Path(sys.argv[1]).write_text(str(os.getpid())), time.sleep(300)))
