@@ -97,7 +97,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
         entries[entry].slippery = slippery
 
 
-@refcount_free
+@refcount_free_inlined
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """Compute the likelihood of a stored entry (an observation in one cell) again from its reported
     log-likelihood, and write it to `scratch` (work memory).
@@ -215,7 +215,7 @@ class CellPlace(NamedTuple):
     sources: int
 
 
-@refcount_free
+@refcount_free_inlined
 def update(
     rows: Rows,
     place: CellPlace,
