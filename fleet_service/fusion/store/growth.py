@@ -86,9 +86,7 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     begins[: len(state.settled_begin)] = state.settled_begin
     begins[len(state.settled_begin) :] = reports, values
     state = state._replace(settled_begin=begins)
-    resting = find_resting(state.pairs)
-    slot = state.pairs["slot"][resting].astype(np.int64)
-    resting = resting[np.argsort(slot << 32 | state.pairs["vehicle"][resting])]
+    resting = find_resting(state, size, len(names))
     more, more_values = count_settling(state, names, resting, now)
     # in place, because a copy would take as much memory again
     state.settled.resize(reports + more, refcheck=False)
