@@ -3,6 +3,8 @@ means that the number belongs to the definition of messages between vehicles, se
 
 EXCITED_SHARE       share of the available grip μ that a vehicle must use for its value of μ to
                     count as measured, and not only as a lower bound (contract)
+VALUE_NATS          a visit's likelihood gives a value of μ if it falls by at least this from its
+                    maximum to the highest friction [nat]; else it is only a lower bound (contract)
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
 SLIPPERY_MU         a road is slippery if its μ is below this: packed snow has .2–.35, wet asphalt
                     .5–.8 (Pacejka 2012, ch. 1)
@@ -30,6 +32,7 @@ from statistics import NormalDist
 from typing import Final
 
 EXCITED_SHARE: Final = 0.6
+VALUE_NATS: Final = 1.0
 UTILISED_WINDOW_S: Final = 1.0
 SLIPPERY_MU: Final = 0.4
 CALLED_SHARE: Final = 0.9

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from edge_agent.estimators.friction_mixture.report.visit_parts import EXCLUDED_NATS
 from edge_agent.observe.cell_tracker import NOWHERE, Located
+from edge_agent.observe.visit_likelihood import encode_likelihoods
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -433,7 +434,7 @@ def _build_observations(
         "position_std": np.full(n, config.position_std),
         "yaw_std": np.full(n, config.yaw_std),
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
-        "log_likelihood": _likelihood_bytes(ended, evidence),
+        "log_likelihood": encode_likelihoods(ended, evidence, used),
         "tyre_season": np.full(n, config.tyre_season),
         **_context_columns(ended),
         **_grip_directions(ended),
@@ -462,26 +463,6 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
         "air_temperature": mean[:, C.AIR_TEMPERATURE],
         "wiper": mean[:, C.WIPER],
     }
-
-
-def _likelihood_bytes(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
-    """Return the likelihoods of n visits (passages of a map cell) in the encoding of the message,
-    (n, 32); (n, 0) for an estimator without evidence (likelihood of friction).
-
-    The likelihood is flat for a visit that the estimator did not process from its start.
-
-    If the friction changed within the cell, the cell contains road with different frictions, but
-    the message has only one likelihood per visit. Therefore a friction gets the largest of the
-    likelihoods from before and after each change. A friction that either part supports stays
-    likely.
-    """
-    if evidence is None:
-        return np.zeros((len(ended), 0), dtype=np.uint8)
-    reported = evidence[ended["sample"], ended["vehicle"]]
-    several = ended["parts"] > 0
-    reported[several] = np.maximum(reported[several], ended["earlier"][several])
-    known = np.isfinite(reported).all(axis=-1, keepdims=True)
-    return mugrid.encode_log_likelihood(np.where(known, reported, 0.0))
 
 
 def _build_states(

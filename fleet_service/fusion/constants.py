@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import mugrid
-from schemas.thresholds import NS, SURFACES
+from schemas.thresholds import NS, SURFACES, VALUE_NATS
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS  # [μ] width of a friction bin
 
@@ -162,7 +162,7 @@ UNSURE: Final = 0.45
 
 # --- From a report to a likelihood ---
 
-# [nat] Smallest difference of log-likelihoods that counts as evidence.
+# [nat] Smallest difference of log-likelihoods that counts as evidence, the same as for a value.
 # A likelihood that falls by less than this towards the highest μ is taken as flat there, so it is a
 # bound. The contract allows senders half a nat of slope above the grip used; this is twice that.
 # A source of ice must give this evidence for ice against grip, after allowing for the error of the
@@ -170,7 +170,7 @@ UNSURE: Final = 0.45
 # .25), .6 % to wet road and .08 % to dry road; 3 nats by 12 %, .2 % and .04 %. With two nats
 # instead of one, alerts in three drives found .13 of the snow instead of .17, and as much ice
 # (.80).
-EVIDENCE_NATS: Final = 1.0
+EVIDENCE_NATS: Final = VALUE_NATS
 VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
 # Number of cells on each side that may get a part. A position that is less accurate has no use.
 SPREAD_CELLS: Final = 2
