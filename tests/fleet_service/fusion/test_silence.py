@@ -1,5 +1,5 @@
 """Tests of visits (passages of a cell) in which a vehicle measured no friction. They weaken a
-belief of ice, but never prove grip.
+belief of ice, but never prove grip. If they used much grip, they weaken values little above it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.votes import note_silent_use
 from schemas import mugrid
 from schemas.numeric import FloatArray
 from tests.fleet_service.examples import at_least, belief, interval, observations, slippery, value
@@ -63,3 +64,55 @@ def test_a_working_controller_is_no_silence() -> None:
 @pytest.mark.parametrize("noticed", [np.zeros(0), np.full(8, 0.8)], ids=["nobody", "grip"])
 def test_road_without_ice_is_not_called_slippery_by_silence(noticed: FloatArray) -> None:
     assert slippery(belief(visited(noticed))) <= UNKNOWN + 1e-6 < c.UNSURE
+
+
+def disputed_cell(values: int, silent: int, *, used: float = 0.5, limited: bool = False) -> Fusion:
+    """Return a fusion after visits to one cell, a minute apart. First, `values` vehicles report the
+    friction .57. Then `silent` other vehicles use the grip `used` and report no value; `limited` is
+    the flag of their slip controller.
+    """
+    fusion = Fusion(120.0)
+    n = values + silent
+    told = np.concatenate([value(np.full(values, 0.57), 0.08), at_least(np.full(silent, used))])
+    visits = observations(60.0 * np.arange(n), np.arange(n), told)
+    flags = np.full(n, limited)
+    fusion.update(dataclasses.replace(visits, used=np.full(n, used, np.float32), limited=flags))
+    return fusion
+
+
+def median_friction(fusion: Fusion) -> float:
+    """Return the median of the friction in the tests' cell."""
+    return float(mugrid.quantiles(belief(fusion), 0.5))
+
+
+def test_many_silent_visits_with_much_grip_outweigh_few_low_values() -> None:
+    dry = disputed_cell(3, 20)
+    assert median_friction(dry) > median_friction(disputed_cell(3, 0)) + 0.06
+    assert interval(belief(dry))[0] < 0.6
+
+
+def test_few_silent_visits_do_not_outweigh_many_values() -> None:
+    assert median_friction(disputed_cell(12, 3)) == pytest.approx(
+        median_friction(disputed_cell(12, 0)), abs=0.04
+    )
+
+
+def test_silent_visits_with_little_grip_leave_values() -> None:
+    assert median_friction(disputed_cell(3, 20, used=0.2)) == pytest.approx(
+        median_friction(disputed_cell(3, 0)), abs=0.06
+    )
+
+
+@pytest.mark.parametrize("used", [0.0, 0.3, 0.36, 0.6, 1.2, 2.0])
+def test_silent_use_never_changes_the_probability_of_slippery_road(used: float) -> None:
+    rng = np.random.default_rng(3)
+    for p in rng.dirichlet(np.ones(mugrid.BINS), 20):
+        noted = p.copy()
+        note_silent_use(noted, used, 0.7)
+        assert np.all(noted >= 0.0)
+        assert slippery(noted) == pytest.approx(slippery(p), abs=1e-12)
+
+
+def test_silent_visits_alone_raise_no_lower_bound() -> None:
+    silent, others = (belief(disputed_cell(0, 40, limited=flag)) for flag in (False, True))
+    assert np.array_equal(silent, others)
