@@ -432,7 +432,7 @@ FIGURES: Final = (
     Figure("lines over 100 columns", 0, 0, long_lines),
     Figure("functions with nesting over 4", 0, 0, deep_nesting),
     Figure("functions with more than 40 local names", 0, 0, many_locals),
-    Figure("named constants between sensor and map", 230, 229, named_constants),
+    Figure("named constants between sensor and map", 230, 230, named_constants),
     Figure("product lines that only tests use", 0, 0, only_tests_use),
 )
 

@@ -77,7 +77,7 @@ class BeliefMap:
         given, read this copy of the state instead of the live one.
         """
         rows = self.store.state.live if rows is None else rows
-        rule = _rule_of(self._shape.reader, c.SILENCE)
+        rule = _rule_of(self._shape.reader, c.SILENCE, narrow=True)
         at = np.full(len(slots), now)
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
@@ -113,7 +113,7 @@ class BeliefMap:
         Visits without a friction value do not weaken the evidence of neighbouring cells here. So a
         cell between icy cells gets an alert even if its own visitors gave no value.
         """
-        rule = _rule_of(slope, 0.0)
+        rule = _rule_of(slope, 0.0, narrow=False)
         rows = self.store.state.live
         at = self.live.time[slots]
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
@@ -162,12 +162,12 @@ class BeliefMap:
         return who, np.where(counted, when, 0)
 
 
-def _rule_of(slope: float, silence: float) -> ReadRule:
+def _rule_of(slope: float, silence: float, *, narrow: bool) -> ReadRule:
     """Return the parameters for reading beliefs with an assumed error of `slope` per unit of unused
-    grip. `silence` is `ReadRule.silence`.
+    grip. `silence` and `narrow` are those of `ReadRule`.
     """
     shape = shape_class(slope)
-    return ReadRule(KERNELS[shape], SLIPPERY_WEIGHTS[shape], silence)
+    return ReadRule(KERNELS[shape], SLIPPERY_WEIGHTS[shape], silence, narrow)
 
 
 @refcount_free_locked

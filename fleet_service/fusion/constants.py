@@ -239,6 +239,12 @@ SHARED_LEAST: Final = 0.25
 
 # --- Evidence from slippery neighbouring cells, see `neighbours` ---
 
+# Largest factor by which a measured neighbour raises the probability of a friction, and least
+# factor by which a measured belief exceeds its prior. What a cell's own visitors measured is
+# refined and never replaced. In tuning towns, measured neighbours raised the known road-hours at 20
+# cars an hour from .415 to .493 and lowered coverage on winter tyres from .846 to .825; larger
+# factors did more of both.
+HEARD_MOST: Final = 2.0
 # A cell whose P(slippery) is this close to 0 or 1 gets no messages. The reports of its own visitors
 # decide, and reading the map takes less time.
 DECIDED: Final = 0.001

@@ -18,18 +18,29 @@ information travels in a circle. They are computed when the map is read, so that
 belief depends on another's. The common error also applies to the neighbours' values, so K is
 applied once, at the end.
 
-Only slippery neighbours send messages, because dry neighbours do not show that an unvisited cell is
-dry. A cell without information sends no message, because its s is below s₀. The least value of m is
-1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell with
-grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has ended
-there. A cell sends no message if no vehicle was in it with a probability of at least HERE_SHARE
-(positions are inaccurate, see `space`).
+Only slippery neighbours send these messages, because dry neighbours do not show that an unvisited
+cell is dry. A cell without information sends no message, because its s is below s₀. The least value
+of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell
+with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
+ended there. A cell sends no message if no vehicle was in it with a probability of at least
+HERE_SHARE (positions are inaccurate, see `space`).
 
 The factor q weakens a message if few visits to the cell itself gave a friction value. On the same
 slippery surface, about as many visits would give a value as in the neighbouring cell: v_n, or
 v_n·k/k_n if the cell had fewer visits. q falls below 1 if the cell has less than this. A visit
 without a value does not show grip, so q never lowers P(slippery) below UNSURE. The weights v fade
 with time, so that values from before a change of the road count little.
+
+A *measured* cell also hears the measured cells next to it on its three sides, grip included,
+because somebody tested both. Measured means that vehicles gave values, and that some friction is
+HEARD_MOST times as probable as in the prior, so that the values have not faded:
+
+    h_i = min(1 + SAME_SURFACE·(n_i/p₀_i - 1), HEARD_MOST)
+
+A reader gets K·(b·h₁·h₂·h₃), but P(slippery) stays that of K·(b·m₁·m₂·m₃): measured neighbours
+narrow the interval of μ and never decide whether a road is slippery, so alerts do not depend on
+them. Errors of neighbouring cells are partly alike, so n contains the common error of the
+neighbour, and HEARD_MOST limits the factor.
 
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4. Here a
 neighbour's message goes directly to the cell, and cells do not pass messages on.
@@ -122,11 +133,13 @@ class ReadRule(NamedTuple):
         silence: constant SILENCE in the factor q of the module. This factor weakens messages from
             slippery neighbours if vehicles visited the cell but reported few friction values there.
             0 switches the factor off.
+        narrow: True if measured neighbours narrow the belief about a measured cell.
     """
 
     kernels: Float32Array
     slippery: FloatArray
     silence: float
+    narrow: bool
 
 
 class MapParts(NamedTuple):
@@ -204,12 +217,108 @@ def _read_beliefs(
         for i in range(_BINS):
             buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
             buffers.quiet[i] = buffers.product[i]
+        unknown = _slippery_probability(weather.prior[prior])
+        asked = Asked(slots[k], now[k], prior, unknown)
+        measured = rule.narrow and _is_measured(parts, asked, slots[k], buffers)
         slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.product)
         if c.DECIDED <= slippery <= 1.0 - c.DECIDED:
-            unknown = _slippery_probability(weather.prior[prior])
-            _multiply_messages(parts, Asked(slots[k], now[k], prior, unknown), buffers, out[k])
+            _multiply_messages(parts, asked, buffers, out[k])
         else:
             read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
+        if measured:
+            _narrow(parts, asked, buffers, out[k])
+
+
+@refcount_free_inlined
+def _is_measured(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> bool:
+    """Return True if vehicles gave values in the cell in row `row`, and if its aged belief, which
+    is in `buffers.scratch`, is still firmer than the prior by the factor HEARD_MOST.
+    """
+    if parts.live.cells[row].values <= 0.0:
+        return False
+    belief = buffers.scratch[ScratchRow.BELIEF]
+    prior = parts.weather.prior[asked.prior]
+    firmest = 0.0
+    for i in range(_BINS):
+        firmest = max(firmest, belief[i] / prior[i])
+    return firmest >= c.HEARD_MOST
+
+
+@refcount_free_inlined
+def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
+    """Combine the belief about a measured cell with those of measured cells next to it, and write
+    the resulting belief about the road to `out` (32). On entry, `out` is the belief without them;
+    its P(slippery) does not change.
+    """
+    live = parts.live
+    _age_belief(live, parts.weather, asked.slot, asked.now, buffers.scratch)
+    for i in range(_BINS):
+        buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
+    heard = False
+    for side in (_BEFORE, _BEHIND, _ACROSS):
+        row = _measured_neighbour(parts, asked, side, buffers)
+        if row != NONE:
+            heard = True
+            _multiply_limited(parts, asked, row, buffers)
+    if heard:
+        read_road(parts.rule.kernels, live.cells, asked.slot, buffers.product, buffers.road)
+        if _set_slippery(buffers.road, _slippery_probability(out)):
+            for i in range(_BINS):
+                out[i] = buffers.road[i]
+
+
+@refcount_free_inlined
+def _measured_neighbour(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> int:
+    """Return the row of the next cell on one side if it is measured, and write its aged belief to
+    `buffers.scratch`; else return NONE. In the opposite direction of the road, take the first cell
+    that is measured.
+    """
+    cells = parts.live.cells
+    key = cells[asked.slot].key
+    cell = key // grid.SECTORS
+    sector = key % grid.SECTORS
+    towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
+    for step in range(1, (ACROSS if side == _ACROSS else 1) + 1):
+        there = _step_to(cell, cell, sector, side, step)
+        row = find_row(parts.table, cells, there * grid.SECTORS + towards)
+        if row != NONE and cells[row].values > 0.0:
+            _age_belief(parts.live, parts.weather, row, asked.now, buffers.scratch)
+            if _is_measured(parts, asked, row, buffers):
+                return int(row)
+    return NONE
+
+
+@refcount_free_inlined
+def _multiply_limited(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> None:
+    """Multiply `buffers.product` (32,) by the message h of the measured cell in row `row`, whose
+    aged belief is in `buffers.scratch`.
+    """
+    prior = parts.weather.prior[asked.prior]
+    for i in range(_BINS):
+        buffers.message[i] = buffers.scratch[ScratchRow.BELIEF, i]
+    read_road(parts.rule.kernels, parts.live.cells, row, buffers.message, buffers.road)
+    for i in range(_BINS):
+        factor = 1.0 + c.SAME_SURFACE * (buffers.road[i] / prior[i] - 1.0)
+        buffers.product[i] *= min(factor, c.HEARD_MOST)
+
+
+@refcount_free_inlined
+def _set_slippery(road: FloatArray, wanted: float) -> bool:
+    """Set P(slippery) of a belief `road` (32,) in place to `wanted`, by factors that are linear in
+    a bin's slippery share. Return False if this is not possible, and then leave it.
+    """
+    told = 0.0
+    square = 0.0
+    for i in range(_BINS):
+        told += SLIPPERY_SHARE[i] * road[i]
+        square += SLIPPERY_SHARE[i] ** 2 * road[i]
+    spread = square - told**2
+    missing = wanted - told
+    if missing * told > spread or -missing * (1.0 - told) > spread or spread <= 0.0:
+        return False
+    for i in range(_BINS):
+        road[i] *= 1.0 + missing / spread * (SLIPPERY_SHARE[i] - told)
+    return True
 
 
 @refcount_free_inlined

@@ -163,3 +163,46 @@ def test_what_the_weather_says_of_a_region_is_not_told_again() -> None:
             tell(fusion, east(steps), at_least([0.1]))
     assert slippery(belief(alone)) > 0.5
     assert slippery(belief(among)) == pytest.approx(slippery(belief(alone)), abs=0.02)
+
+
+def interval_width(p: FloatArray) -> float:
+    """Return the width of the 90 % interval of a belief (32,)."""
+    lower, upper = interval(p)
+    return upper - lower
+
+
+def test_a_measured_neighbour_narrows_the_interval_of_a_measured_cell() -> None:
+    one = value([0.6, 0.6], 0.1)
+    alone = belief(road({0: one}))
+    between = belief(road({-1: one, 0: one, 1: one}))
+    assert interval_width(between) < 0.95 * interval_width(alone)
+    assert interval(between)[0] < 0.6 < interval(between)[1]
+
+
+def test_a_measured_dry_neighbour_does_not_make_a_bound_dry() -> None:
+    dry = value(np.full(5, 0.9), 0.05)
+    alone = interval(belief(road({0: UNTESTED})))
+    assert interval(belief(road({-1: dry, 0: UNTESTED, 1: dry})))[0] <= alone[0] + 1e-9
+
+
+@pytest.mark.parametrize("own", [0.15, 0.3, 0.38, 0.42, 0.6, 0.9])
+@pytest.mark.parametrize("next_to", [0.15, 0.42, 0.9])
+@pytest.mark.parametrize("count", [1, 6])
+def test_measured_neighbours_do_not_change_p_slippery(
+    own: float, next_to: float, count: int
+) -> None:
+    others = value(np.full(count, next_to), 0.05)
+    fusion = road({-1: others, 1: others, 0: value([own, own], 0.05)})
+    slot = fusion.slots_of(np.array([CELL]), np.array([0]))
+    without = slippery(fusion.beliefs_at_last_report(slot)[0])
+    now = int(fusion.live.time[slot[0]])
+    assert slippery(fusion.beliefs(slot, now)[0]) == pytest.approx(without, abs=1e-9)
+
+
+def test_values_that_faded_are_not_refreshed_by_a_neighbour() -> None:
+    fusion = road({0: value([0.3, 0.3], 0.05)})
+    week = 7 * 24 * 3600.0
+    fusion.update(observations([week], [9], value([0.7], 0.05), east(1)))
+    now = START + int(week * 1e9)
+    slot = fusion.slots_of(np.array([CELL]), np.array([0]))
+    assert np.allclose(fusion.beliefs(slot, now)[0], mugrid.PRIOR, atol=1e-4)
