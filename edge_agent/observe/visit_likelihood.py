@@ -10,15 +10,19 @@ value was:
     share of the grip used   < .5   .5–.6   .6–.7   .7–.8   .8–.9   .9–.95   > .95
     visits with a value      .003   .025    .045    .09     .27     .55      .83
 
-So a value is itself evidence that the vehicle used almost all of the grip. The estimator's
-likelihood does not contain this evidence, and values of gentle drivers, most of them wrong, count
-as much as those of drivers at the limit. The report's probability given the friction is therefore
+So a value is itself evidence that the vehicle used almost all of the grip, and a visit without a
+value is evidence that it did not. The estimator's likelihood ℓ contains neither. Without them,
+values of gentle drivers, most of them wrong, count as much as those of drivers at the limit. The
+report's probability given the friction is therefore
 
-    ln p(report | μ) = ℓ(μ) + ln clip(u/μ, EXCITED_SHARE, 1)
+    ln p(report | μ) = ℓ(μ) + ln clip(u/μ, EXCITED_SHARE, 1)              for a value
+                       ℓ(μ) + ln(1 - LIMIT_TOLD·P(μ))                     for a bound
+    P(μ) = clip((u/μ - EXCITED_SHARE)/(1 - EXCITED_SHARE), 0, 1)³
 
-for a value, and ℓ(μ) for a bound, and for a visit in which the friction changed, because its parts
-used different shares. The factor changes the ratio of two frictions by 1/EXCITED_SHARE at most,
-much less than the table shows, because visits to one place share their errors.
+P fits the table. A visit in which the friction changed keeps ℓ, because its parts used different
+shares, and so does a likelihood that excludes nothing. The factor of a value changes the ratio of
+two frictions by 1/EXCITED_SHARE at most, much less than the table shows, because visits to one
+place share their errors.
 
 Legend
     ℓ   log-likelihood of the estimator, at the friction values `mugrid.CENTRES`   (n, 32) [nat]
@@ -27,6 +31,9 @@ Legend
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +41,9 @@ from schemas import mugrid
 from schemas.numeric import FloatArray
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import EXCITED_SHARE, VALUE_NATS
+
+# share of the visits at the limit of the road's grip that are taken to give a value: two nats, .86
+LIMIT_TOLD: Final = 1.0 - math.exp(-2.0 * VALUE_NATS)
 
 
 def encode_likelihoods(
@@ -57,15 +67,19 @@ def encode_likelihoods(
     reported[several] = np.maximum(reported[several], ended["earlier"][several])
     known = np.isfinite(reported).all(axis=-1, keepdims=True)
     reported = np.where(known, reported, 0.0)
-    return mugrid.encode_log_likelihood(weigh_values(reported, np.where(several, np.nan, used)))
+    return mugrid.encode_log_likelihood(weigh_by_use(reported, np.where(several, np.nan, used)))
 
 
-def weigh_values(log_likelihood: FloatArray, used: FloatArray) -> FloatArray:
-    """Return log-likelihoods (n, 32) [nat] in which a value also counts as evidence that the grip
-    `used` (n,) was almost all of the road's grip, see the module. Bounds do not change, nor does a
-    visit whose grip used is unknown (NaN).
+def weigh_by_use(log_likelihood: FloatArray, used: FloatArray) -> FloatArray:
+    """Return log-likelihoods (n, 32) [nat] that contain the evidence of giving a value, or none, at
+    the grip `used` (n,), see the module. A visit whose grip used is unknown (NaN) does not change.
     """
-    value = log_likelihood[:, -1] <= log_likelihood.max(axis=1, initial=-np.inf) - VALUE_NATS
+    most = log_likelihood.max(axis=1, initial=-np.inf)
+    value = log_likelihood[:, -1] <= most - VALUE_NATS
+    bound = ~value & (log_likelihood.min(axis=1, initial=np.inf) <= most - VALUE_NATS)
     share = np.clip(used[:, None] / mugrid.CENTRES, EXCITED_SHARE, 1.0)
-    weighed = np.isfinite(used) & value
-    return np.where(weighed[:, None], log_likelihood + np.log(share), log_likelihood)
+    probability = ((share - EXCITED_SHARE) / (1.0 - EXCITED_SHARE)) ** 3
+    added = np.select(
+        [value[:, None], bound[:, None]], [np.log(share), np.log(1.0 - LIMIT_TOLD * probability)]
+    )
+    return log_likelihood + np.where(np.isfinite(used)[:, None], added, 0.0)

@@ -97,7 +97,7 @@ def _make_visits(time: int, cells: int) -> Observations:
         reported=flat.reported,
         used=np.full(cells, 0.9, np.float32),
         manoeuvre=np.full(cells, -1, np.int8),
-        limited=np.zeros(cells, np.bool_),
+        limited=np.zeros(cells, np.int8),
         other=np.full((cells, 1), -1),
         other_share=np.zeros((cells, 1), np.float32),
     )

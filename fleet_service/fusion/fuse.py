@@ -21,7 +21,7 @@ from fleet_service.fusion.belief_map import BeliefMap
 from fleet_service.fusion.late import LATE_MOST_NS, delay_observations, fused_at
 from fleet_service.fusion.observations import Observations
 from fleet_service.fusion.shared import shared_parts
-from fleet_service.fusion.store.records import CLAIMED, HEEDED, USED
+from fleet_service.fusion.store.records import CLAIMED, HEEDED, UNLIMITED, USED
 from fleet_service.fusion.store.store import Store, distinct_values
 from fleet_service.fusion.trust import compute_vote_weights, initial_trust, shape_of
 from fleet_service.fusion.vote_weights import VoteWeights, initial_vote_weights
@@ -173,8 +173,9 @@ class Fusion(BeliefMap):
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
             votes = self._vote_weights_at(e)
-            limited[rows] = (
-                np.where(votes.may_support_alerts(vehicle[rows]), HEEDED, CLAIMED) * o.limited[rows]
+            claimed = np.where(votes.may_support_alerts(vehicle[rows]), HEEDED, CLAIMED)
+            limited[rows] = np.where(
+                o.limited[rows] > 0, claimed, UNLIMITED * (o.limited[rows] < 0)
             )
             if before is None:
                 used[rows] = votes.weights(vehicle[rows])

@@ -136,6 +136,20 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
             steps[n, i] = 0 if i >= place else max(steps[n, i], floor) - floor
 
 
+def states_more_grip(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
+    """Return a mask of visits (n,): True if the sender gave a likelihood that is a lower bound and
+    states that the road has more grip than was `used` (n,). Its likelihood of a road with just the
+    grip used is then at least half a nat below its maximum.
+
+    Such a sender would probably have given a value if it had used all of the grip. A sender that
+    states nothing may be unable to measure friction, so its silence means nothing.
+    """
+    sent = columns["log_likelihood"]
+    place = np.minimum(np.searchsorted(mugrid.CENTRES, used), mugrid.BINS - 1)
+    bound = columns["with_likelihood"] & (sent[:, -1] < c.VALUE_DROP_STEPS)
+    return np.asarray(bound & (sent[np.arange(len(sent)), place] >= c.VALUE_DROP_STEPS // 2))
+
+
 def at_least(used: FloatArray) -> FloatArray:
     """Return the log-likelihoods (n, 32) of lower bounds of friction: ln Φ((μ - u) / σ_u), where u
     is the grip used and σ_u its standard deviation. They are flat if u is NaN.

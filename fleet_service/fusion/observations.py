@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import make_evidence
+from fleet_service.fusion.likelihoods import make_evidence, states_more_grip
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
 from schemas import grid
@@ -43,8 +43,9 @@ class Observations:
             for a lower bound.
         used: (n,) grip used; if the sender does not report it, UNTOLD_SHARE of the value.
         manoeuvre: (n,) kind of manoeuvre, see `shared.manoeuvre_of`.
-        limited: (n,) True if a slip controller intervened at so little grip used that only slippery
-            road explains it.
+        limited: (n,) 1 if a slip controller intervened at so little grip used that only slippery
+            road explains it; -1 if the likelihood states that the road has more grip than was used;
+            else 0.
         other: (n, k) other cells in which the vehicle may have been instead; -1 for none.
         other_share: (n, k) probability that the vehicle was in the other cell; the rest belongs to
             `cell`.
@@ -62,7 +63,7 @@ class Observations:
     reported: Float32Array
     used: Float32Array
     manoeuvre: SmallArray
-    limited: BoolArray
+    limited: SmallArray
     other: IntArray
     other_share: Float32Array
 
@@ -104,7 +105,9 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         reported=reported,
         used=used,
         manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
-        limited=find_limited(columns, columns["mu_utilised"]),
+        limited=np.where(
+            find_limited(columns, columns["mu_utilised"]), 1, -1 * states_more_grip(columns, used)
+        ).astype(np.int8),
         other=other,
         other_share=share,
     )

@@ -35,6 +35,7 @@ from fleet_service.fusion.store.records import (
     HEEDED,
     NONE,
     SOURCES,
+    UNLIMITED,
     UNTRUSTED,
     USED,
     Rows,
@@ -270,12 +271,13 @@ def update(
         apply_vote(
             p, scratch[ScratchRow.LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
         )
-        if entries[entry].limited == 0:
+        if entries[entry].limited <= 0:
             visits = float(cells[row].visits) + 1.0  # this one included
             noticed = float(cells[row].values) / visits
             note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
-            doubted = min(strength, 1.0) * min(float(cells[row].values), 1.0)
-            note_silent_use(p, entries[entry].used / USED, (1.0 - c.BOUND_CONTAMINATION) * doubted)
+            if entries[entry].limited == UNLIMITED:
+                doubted = (1.0 - c.BOUND_CONTAMINATION) * min(float(cells[row].values), 1.0)
+                note_silent_use(p, entries[entry].used / USED, doubted * min(strength, 1.0))
     pack_belief(p, belief, row)
     cells[row].time = time
     _count_visit(cells, row, entries, entry)
@@ -322,13 +324,14 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 def note_silent_use(p: Bins, used: float, strength: float) -> None:
     """Lower, in a belief `p` (32,) in place, the probability of roads on which the grip `used` is
     almost all of the grip, after a visit without a value to a cell with values. `strength` in [0,
-    1) is the weight of the visit's evidence.
+    1) is the weight of the visit's evidence. Only visits of vehicles that state this count
+    (UNLIMITED), because other vehicles may be unable to give a value.
 
-    Of visits that used .7 to .8 of a road's grip, .09 gave a value; of those that used .9 to .95,
-    .55 did, and of those that used more, .83 (ten tuning drives, cells of one surface). So the
-    probability of no value is taken as 1 up to the share SHARED_SHARE, and as 0 at the whole grip.
-    Without this evidence, the few values that gentle drivers give of a dry road count more than the
-    many visits that used as much grip and gave none.
+    With the default estimator, .09 of the visits that used .7 to .8 of a road's grip gave a value,
+    .55 of those that used .9 to .95, and .83 of those that used more (ten tuning drives, cells of
+    one surface). So the probability of no value is taken as 1 up to the share SHARED_SHARE, and as
+    0 at the whole grip. Without this evidence, the few values that gentle drivers give of a dry
+    road count more than the many visits that used as much grip and gave none.
 
     Only the probabilities of grip change among each other. P(slippery) does not change, because a
     visit without a value does not show grip (see `note_silence`). Cells without values do not

@@ -61,7 +61,7 @@ def make_visits(
         reported=np.full((rows, 3), np.nan, np.float32),
         used=np.full(rows, 0.9, np.float32),
         manoeuvre=np.full(rows, -1, np.int8),
-        limited=np.zeros(rows, np.bool_),
+        limited=np.zeros(rows, np.int8),
         other=np.full((rows, 1), -1),
         other_share=np.zeros((rows, 1), np.float32),
     )

@@ -68,7 +68,7 @@ WEIGHT: Final = 16.0
 UNTRUSTED: Final = 64.0
 # Intervention of a slip controller: none; reported by a vehicle whose interventions often disagree
 # with values of others; reported by a vehicle whose interventions usually agree.
-_NO_FLAG, CLAIMED, HEEDED = range(3)
+UNLIMITED, _NO_FLAG, CLAIMED, HEEDED = range(-1, 3)
 
 Int32Array = NDArray[np.int32]
 UIntArray = NDArray[np.uint32]
@@ -161,7 +161,8 @@ class EntryRecord:
             compared with no other vehicle.
         limited: CLAIMED if a slip controller (ABS, ESC, traction control) intervened below the
             slippery limit; HEEDED if in addition the vehicle's earlier interventions agreed with
-            other vehicles; else 0.
+            other vehicles; UNLIMITED if the vehicle states that it did not use all of the road's
+            grip (`likelihoods.states_more_grip`); else 0.
     """
 
     previous: np.int32

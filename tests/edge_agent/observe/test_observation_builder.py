@@ -20,7 +20,7 @@ from edge_agent.observe.observation_builder import (
     RecordBlock,
     build_records,
 )
-from edge_agent.observe.visit_likelihood import weigh_values
+from edge_agent.observe.visit_likelihood import weigh_by_use
 from schemas import grid, mugrid
 from schemas.config import AgentConfig
 from schemas.signals import S
@@ -93,7 +93,7 @@ def test_an_observation_tells_its_visit() -> None:
     )
     assert columns["health"][1] == np.bitwise_or.reduce(reported.health[first:second, 0])
     assert reported.evidence is not None
-    of_visit = weigh_values(reported.evidence[second], columns["mu_utilised"][1:2].astype(float))
+    of_visit = weigh_by_use(reported.evidence[second], columns["mu_utilised"][1:2].astype(float))
     assert np.array_equal(columns["log_likelihood"][1], mugrid.encode_log_likelihood(of_visit)[0])
     assert columns["sector"].tolist() == [0] * len(columns["sector"])
 

@@ -22,7 +22,7 @@ FLAGGED = 1  # number of the vehicle with a working slip controller
 
 
 def flags(o: Observations, limited: BoolArray, used: FloatArray) -> Observations:
-    return dataclasses.replace(o, limited=limited, used=used.astype(np.float32))
+    return dataclasses.replace(o, limited=limited.astype(np.int8), used=used.astype(np.float32))
 
 
 def make_acquainted(claims_on_dry: bool) -> Fusion:

@@ -12,6 +12,7 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.likelihoods import states_more_grip
 from fleet_service.fusion.votes import note_silent_use
 from schemas import mugrid
 from schemas.numeric import FloatArray
@@ -66,17 +67,17 @@ def test_road_without_ice_is_not_called_slippery_by_silence(noticed: FloatArray)
     assert slippery(belief(visited(noticed))) <= UNKNOWN + 1e-6 < c.UNSURE
 
 
-def disputed_cell(values: int, silent: int, *, used: float = 0.5, limited: bool = False) -> Fusion:
+def disputed_cell(values: int, silent: int, *, used: float = 0.5, states: bool = True) -> Fusion:
     """Return a fusion after visits to one cell, a minute apart. First, `values` vehicles report the
-    friction .57. Then `silent` other vehicles use the grip `used` and report no value; `limited` is
-    the flag of their slip controller.
+    friction .57. Then `silent` other vehicles use the grip `used` and report no value. If `states`,
+    they state that this was not all of the road's grip.
     """
     fusion = Fusion(120.0)
     n = values + silent
     told = np.concatenate([value(np.full(values, 0.57), 0.08), at_least(np.full(silent, used))])
     visits = observations(60.0 * np.arange(n), np.arange(n), told)
-    flags = np.full(n, limited)
-    fusion.update(dataclasses.replace(visits, used=np.full(n, used, np.float32), limited=flags))
+    limited = np.full(n, -int(states), np.int8)
+    fusion.update(dataclasses.replace(visits, used=np.full(n, used, np.float32), limited=limited))
     return fusion
 
 
@@ -114,5 +115,23 @@ def test_silent_use_never_changes_the_probability_of_slippery_road(used: float) 
 
 
 def test_silent_visits_alone_raise_no_lower_bound() -> None:
-    silent, others = (belief(disputed_cell(0, 40, limited=flag)) for flag in (False, True))
+    silent, others = (belief(disputed_cell(0, 40, states=flag)) for flag in (True, False))
     assert np.array_equal(silent, others)
+
+
+def test_silence_of_vehicles_that_state_nothing_leaves_values() -> None:
+    others = disputed_cell(3, 20, states=False)
+    assert median_friction(others) == pytest.approx(median_friction(disputed_cell(3, 0)), abs=0.04)
+
+
+def test_only_a_slope_above_the_grip_used_states_more_grip() -> None:
+    used = np.array([0.5, 0.5, 0.5, 0.5])
+    step = at_least([0.5])[0]
+    gentle = step + 0.4 * (mugrid.CENTRES - mugrid.UPPER)
+    steep = step + np.where(mugrid.CENTRES < 0.6, -0.6, 0.0)
+    low = value([0.3], 0.05)[0]
+    sent = mugrid.encode_log_likelihood(np.stack([step, gentle, steep, low]))
+    columns = {"log_likelihood": sent, "with_likelihood": np.ones(4, np.bool_)}
+    assert states_more_grip(columns, used).tolist() == [False, False, True, False]
+    columns["with_likelihood"] = np.zeros(4, np.bool_)
+    assert not states_more_grip(columns, used).any()
