@@ -135,3 +135,21 @@ def test_only_a_slope_above_the_grip_used_states_more_grip() -> None:
     assert states_more_grip(columns, used).tolist() == [False, False, True, False]
     columns["with_likelihood"] = np.zeros(4, np.bool_)
     assert not states_more_grip(columns, used).any()
+
+
+@pytest.mark.parametrize("mu", [0.5, 0.6, 0.7])
+def test_a_fleet_that_rarely_gives_values_causes_no_false_grip(mu: float) -> None:
+    """All vehicles of another make use almost all of the grip, a tenth of them give a value, and
+    none states more grip. The lower end of the interval must not exceed the true friction.
+    """
+    rng = np.random.default_rng(1)
+    n = 60
+    for _ in range(5):
+        used = 0.95 * mu * (1.0 + 0.03 * rng.standard_normal(n))
+        reading = np.maximum(mu * (1.0 + 0.08 * rng.standard_normal(n)), used)
+        gives_value = rng.random(n) < 0.1
+        told = np.where(gives_value[:, None], value(reading, 0.08 * mu), at_least(used))
+        visits = observations(60.0 * np.arange(n), np.arange(n), told)
+        fusion = Fusion(120.0)
+        fusion.update(dataclasses.replace(visits, used=used.astype(np.float32)))
+        assert interval(belief(fusion))[0] < mu
