@@ -32,6 +32,7 @@ from edge_agent.publish.publisher import Publisher
 from schemas import grid, mugrid
 from schemas.config import AgentConfig, ZenohSettings
 from schemas.numeric import IntArray
+from schemas.runtime.process import exit_fast
 from schemas.wire import Columns, Kind, column_types
 
 BLOCK_S = 0.1
@@ -179,4 +180,4 @@ def main(path: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    exit_fast(main(sys.argv[1]))
