@@ -139,7 +139,8 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
 def states_more_grip(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
     """Return a mask of visits (n,): True if the sender gave a likelihood that is a lower bound and
     states that the road has more grip than was `used` (n,). Its likelihood of a road with just the
-    grip used is then at least half a nat below its maximum.
+    grip used is then at least .75 nat below its maximum. A plain bound with a symmetric error is at
+    most ln 2 = .69 nat below, so it states nothing.
 
     Such a sender would probably have given a value if it had used all of the grip. A sender that
     states nothing may be unable to measure friction, so its silence means nothing.
@@ -147,7 +148,7 @@ def states_more_grip(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) ->
     sent = columns["log_likelihood"]
     place = np.minimum(np.searchsorted(mugrid.CENTRES, used), mugrid.BINS - 1)
     bound = columns["with_likelihood"] & (sent[:, -1] < c.VALUE_DROP_STEPS)
-    return np.asarray(bound & (sent[np.arange(len(sent)), place] >= c.VALUE_DROP_STEPS // 2))
+    return np.asarray(bound & (sent[np.arange(len(sent)), place] >= 0.75 * c.VALUE_DROP_STEPS))
 
 
 def at_least(used: FloatArray) -> FloatArray:

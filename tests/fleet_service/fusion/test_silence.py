@@ -12,6 +12,7 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.likelihoods import at_least as normal_bound
 from fleet_service.fusion.likelihoods import states_more_grip
 from fleet_service.fusion.votes import note_silent_use
 from schemas import mugrid
@@ -125,15 +126,16 @@ def test_silence_of_vehicles_that_state_nothing_leaves_values() -> None:
 
 
 def test_only_a_slope_above_the_grip_used_states_more_grip() -> None:
-    used = np.array([0.5, 0.5, 0.5, 0.5])
+    used = np.full(5, 0.5)
     step = at_least([0.5])[0]
     gentle = step + 0.4 * (mugrid.CENTRES - mugrid.UPPER)
-    steep = step + np.where(mugrid.CENTRES < 0.6, -0.6, 0.0)
+    steep = step + np.where(mugrid.CENTRES < 0.6, -0.8, 0.0)
     low = value([0.3], 0.05)[0]
-    sent = mugrid.encode_log_likelihood(np.stack([step, gentle, steep, low]))
-    columns = {"log_likelihood": sent, "with_likelihood": np.ones(4, np.bool_)}
-    assert states_more_grip(columns, used).tolist() == [False, False, True, False]
-    columns["with_likelihood"] = np.zeros(4, np.bool_)
+    plain = normal_bound(np.array([0.5]))[0]
+    sent = mugrid.encode_log_likelihood(np.stack([step, gentle, steep, low, plain]))
+    columns = {"log_likelihood": sent, "with_likelihood": np.ones(5, np.bool_)}
+    assert states_more_grip(columns, used).tolist() == [False, False, True, False, False]
+    columns["with_likelihood"] = np.zeros(5, np.bool_)
     assert not states_more_grip(columns, used).any()
 
 
