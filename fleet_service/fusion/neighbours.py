@@ -32,8 +32,8 @@ without a value does not show grip, so q never lowers P(slippery) below UNSURE. 
 with time, so that values from before a change of the road count little.
 
 A *measured* cell also hears the measured cells next to it on its three sides, grip included,
-because somebody tested both. Measured means that vehicles gave values, and that some friction is
-HEARD_MOST times as probable as in the prior, so that the values have not faded:
+because somebody tested both. A cell is measured if vehicles gave values there, and if some friction
+is HEARD_MOST times as probable as in the prior; otherwise its values have faded. The message is
 
     h_i = min(1 + SAME_SURFACE·(n_i/p₀_i - 1), HEARD_MOST)
 
