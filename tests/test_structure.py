@@ -161,6 +161,7 @@ IMPURE_CALLS = {"open", "print", "input"}
 PURE_SCHEMAS = {
     "config",
     "errors",
+    "excitation",
     "grid",
     "mugrid",
     "numeric",

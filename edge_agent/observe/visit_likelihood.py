@@ -2,24 +2,15 @@
 (passage of a map cell), weighed by how often visits give a value. Pure (no I/O).
 
 A visit gives a *value* of μ if its likelihood falls towards the highest friction, and otherwise
-only a lower bound. Whether it gives a value depends on the share u/μ of the road's grip that the
-vehicle used. In ten simulated drives with the default estimator (20 cars, half of them with the
-sensor errors of real cars; 296,000 visits to cells of one surface), the share of visits with a
-value was:
+only a lower bound. Giving a value, or none, is evidence about the share u/μ of the road's grip that
+the vehicle used (`schemas.excitation`), which the estimator's likelihood ℓ does not contain.
+Without it, values of gentle drivers, most of them wrong, count as much as those of drivers at the
+limit. The report's probability given the friction is therefore
 
-    share of the grip used   < .5   .5–.6   .6–.7   .7–.8   .8–.9   .9–.95   > .95
-    visits with a value      .003   .025    .045    .09     .27     .55      .83
+    ln p(report | μ) = ℓ(μ) + ln clip(u/μ, EXCITED_SHARE, 1)     for a value
+                       ℓ(μ) + ln(1 - P(value | u/μ))             for a bound
 
-So a value is itself evidence that the vehicle used almost all of the grip, and a visit without a
-value is evidence that it did not. The estimator's likelihood ℓ contains neither. Without them,
-values of gentle drivers, most of them wrong, count as much as those of drivers at the limit. The
-report's probability given the friction is therefore
-
-    ln p(report | μ) = ℓ(μ) + ln clip(u/μ, EXCITED_SHARE, 1)              for a value
-                       ℓ(μ) + ln(1 - LIMIT_TOLD·P(μ))                     for a bound
-    P(μ) = clip((u/μ - EXCITED_SHARE)/(1 - EXCITED_SHARE), 0, 1)³
-
-P fits the table. A visit in which the friction changed keeps ℓ, because its parts used different
+A visit in which the friction changed keeps ℓ, because its parts used different
 shares, and so does a likelihood that excludes nothing. The factor of a value changes the ratio of
 two frictions by 1/EXCITED_SHARE at most, much less than the table shows, because visits to one
 place share their errors.
@@ -31,19 +22,14 @@ Legend
 
 from __future__ import annotations
 
-import math
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas import mugrid
+from schemas.excitation import value_probability
 from schemas.numeric import FloatArray
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import EXCITED_SHARE, VALUE_NATS
-
-# share of the visits at the limit of the road's grip that are taken to give a value: two nats, .86
-LIMIT_TOLD: Final = 1.0 - math.exp(-2.0 * VALUE_NATS)
 
 
 def encode_likelihoods(
@@ -77,9 +63,9 @@ def weigh_by_use(log_likelihood: FloatArray, used: FloatArray) -> FloatArray:
     most = log_likelihood.max(axis=1, initial=-np.inf)
     value = log_likelihood[:, -1] <= most - VALUE_NATS
     bound = ~value & (log_likelihood.min(axis=1, initial=np.inf) <= most - VALUE_NATS)
-    share = np.clip(used[:, None] / mugrid.CENTRES, EXCITED_SHARE, 1.0)
-    probability = ((share - EXCITED_SHARE) / (1.0 - EXCITED_SHARE)) ** 3
+    share = used[:, None] / mugrid.CENTRES
     added = np.select(
-        [value[:, None], bound[:, None]], [np.log(share), np.log(1.0 - LIMIT_TOLD * probability)]
+        [value[:, None], bound[:, None]],
+        [np.log(np.clip(share, EXCITED_SHARE, 1.0)), np.log(1.0 - value_probability(share))],
     )
     return log_likelihood + np.where(np.isfinite(used)[:, None], added, 0.0)

@@ -29,12 +29,12 @@ from fleet_service.fusion.belief import (
     unpack_belief,
 )
 from fleet_service.fusion.shared import UNKNOWN_SHAPE, fade_weights, note_value
+from fleet_service.fusion.sources import note_source
 from fleet_service.fusion.store.records import (
     AGED,
     FINE,
     HEEDED,
     NONE,
-    SOURCES,
     UNLIMITED,
     UNTRUSTED,
     USED,
@@ -44,8 +44,9 @@ from fleet_service.fusion.store.records import (
 from fleet_service.fusion.store.settled import oldest_remembered, returning_bit
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import mugrid
+from schemas.excitation import value_probability
 from schemas.numeric import Float32Array
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free_inlined
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
@@ -66,6 +67,10 @@ class ScratchRow(IntEnum):
 _GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first bin above SLIPPERY_MU
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
+# probability of a value by grip used, in units of 1/USED, and friction bin (256, 32)
+_VALUE_PROBABILITY: Final = value_probability(
+    np.arange(np.iinfo(np.uint8).max + 1)[:, None] / USED / mugrid.CENTRES
+)
 
 
 @refcount_free_inlined
@@ -277,7 +282,7 @@ def update(
             note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
             if entries[entry].limited == UNLIMITED:
                 doubted = (1.0 - c.BOUND_CONTAMINATION) * min(float(cells[row].values), 1.0)
-                note_silent_use(p, entries[entry].used / USED, doubted * min(strength, 1.0))
+                note_silent_use(p, int(entries[entry].used), doubted * min(strength, 1.0))
     pack_belief(p, belief, row)
     cells[row].time = time
     _count_visit(cells, row, entries, entry)
@@ -287,9 +292,9 @@ def update(
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
         if is_ice_source(entries, entry):
-            _note_source(rows.reporters, sources, Side.ICE, entries[entry].vehicle, time)
+            note_source(rows.reporters, sources, Side.ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
-            _note_source(rows.reporters, sources, Side.GRIP, entries[entry].vehicle, time)
+            note_source(rows.reporters, sources, Side.GRIP, entries[entry].vehicle, time)
 
 
 @refcount_free_inlined
@@ -321,42 +326,32 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
 
 
 @refcount_free_inlined
-def note_silent_use(p: Bins, used: float, strength: float) -> None:
-    """Lower, in a belief `p` (32,) in place, the probability of roads on which the grip `used` is
-    almost all of the grip, after a visit without a value to a cell with values. `strength` in [0,
-    1) is the weight of the visit's evidence. Only visits of vehicles that state this count
-    (UNLIMITED), because other vehicles may be unable to give a value.
+def note_silent_use(p: Bins, used: int, strength: float) -> None:
+    """Lower, in a belief `p` (32,) in place, the probability of roads on which the grip `used`, in
+    units of 1/USED, is almost all of the grip, after a visit without a value to a cell with values
+    (`schemas.excitation`). `strength` in [0, 1) is the weight of the visit's evidence. Only visits
+    of vehicles that state this count (UNLIMITED), because other vehicles may be unable to give a
+    value.
 
-    With the default estimator, .09 of the visits that used .7 to .8 of a road's grip gave a value,
-    .55 of those that used .9 to .95, and .83 of those that used more (ten tuning drives, cells of
-    one surface). So the probability of no value is taken as 1 up to the share SHARED_SHARE, and as
-    0 at the whole grip. Without this evidence, the few values that gentle drivers give of a dry
-    road count more than the many visits that used as much grip and gave none.
+    Without this evidence, the few values that gentle drivers give of a dry road count more than the
+    many visits that used as much grip and gave none.
 
     Only the probabilities of grip change among each other. P(slippery) does not change, because a
     visit without a value does not show grip (see `note_silence`). Cells without values do not
     change, so that bounds alone never raise the lower end of an interval above the grip used.
     """
-    if strength <= 0.0 or used <= c.SHARED_SHARE * SLIPPERY_MU:
+    if strength <= 0.0:
         return
+    told = _VALUE_PROBABILITY[used]
     whole = 0.0
     kept = 0.0
     for i in range(_GRIP_BIN, mugrid.BINS):
         whole += p[i]
-        kept += p[i] * (1.0 - strength * _limit_share(used, i))
-    if kept <= 0.0:
+        kept += p[i] * (1.0 - strength * told[i])
+    if kept == whole:
         return
     for i in range(_GRIP_BIN, mugrid.BINS):
-        p[i] *= (1.0 - strength * _limit_share(used, i)) * whole / kept
-
-
-@refcount_free_inlined
-def _limit_share(used: float, place: int) -> float:
-    """Return the assumed probability that a visit that used the grip `used` gives a value on a road
-    of the friction of bin `place`: 0 up to the share SHARED_SHARE of the grip, 1 at all of it.
-    """
-    over = used / mugrid.CENTRES[place] - c.SHARED_SHARE
-    return float(min(max(over / (1.0 - c.SHARED_SHARE), 0.0), 1.0))
+        p[i] *= (1.0 - strength * told[i]) * whole / kept
 
 
 @refcount_free_inlined
@@ -462,21 +457,3 @@ def _untrusted_weight(
     others = np.float32(cells[row].untrusted[kind] / UNTRUSTED)
     cells[row].untrusted[kind] = np.uint16(min(float(others + power) * UNTRUSTED + 0.5, 65535.0))
     return weight / float((np.float32(1.0) + others) ** 2)
-
-
-@refcount_free
-def _note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time: int) -> None:
-    """Record that a vehicle reported ice or grip (`side`) in a cell at the time `time` [ns]. The
-    record replaces the vehicle's earlier one, or else the oldest one in the cell's list.
-    """
-    source = reporters[row].source
-    source_time = reporters[row].source_time
-    place = 0
-    for k in range(SOURCES):
-        if source[side, k] == vehicle:
-            place = k
-            break
-        if source_time[side, k] < source_time[side, place]:
-            place = k
-    source[side, place] = vehicle
-    source_time[side, place] = time // NS

@@ -14,6 +14,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.likelihoods import at_least as normal_bound
 from fleet_service.fusion.likelihoods import states_more_grip
+from fleet_service.fusion.store.records import USED
 from fleet_service.fusion.votes import note_silent_use
 from schemas import mugrid
 from schemas.numeric import FloatArray
@@ -110,7 +111,7 @@ def test_silent_use_never_changes_the_probability_of_slippery_road(used: float) 
     rng = np.random.default_rng(3)
     for p in rng.dirichlet(np.ones(mugrid.BINS), 20):
         noted = p.copy()
-        note_silent_use(noted, used, 0.7)
+        note_silent_use(noted, round(used * USED), 0.7)
         assert np.all(noted >= 0.0)
         assert slippery(noted) == pytest.approx(slippery(p), abs=1e-12)
 

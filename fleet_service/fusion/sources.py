@@ -1,0 +1,55 @@
+"""Sources of a cell: the vehicles that recently reported ice or grip in it. Alerts need them, and
+they show where a slippery stretch of road ends. Compiled.
+"""
+
+from __future__ import annotations
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.store.records import NONE, SOURCES, Rows, Side
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
+
+
+@refcount_free
+def note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time: int) -> None:
+    """Record that a vehicle reported ice or grip (`side`) in a cell at the time `time` [ns]. The
+    record replaces the vehicle's earlier one, or else the oldest one in the cell's list.
+    """
+    source = reporters[row].source
+    source_time = reporters[row].source_time
+    place = 0
+    for k in range(SOURCES):
+        if source[side, k] == vehicle:
+            place = k
+            break
+        if source_time[side, k] < source_time[side, place]:
+            place = k
+    source[side, place] = vehicle
+    source_time[side, place] = time // NS
+
+
+@refcount_free_inlined
+def is_border(rows: Rows, row: int, neighbour: int, now: int) -> bool:
+    """Return True if the slippery stretch of the cell in row `neighbour` does not reach the cell in
+    `row`: if two vehicles reported grip in this cell after two vehicles had reported ice in the
+    other, all within the time SOURCE_NS before `now` [ns].
+    """
+    here = rows.cells[row].reporters
+    there = rows.cells[neighbour].reporters
+    if here == NONE or there == NONE:
+        return False
+    since = (now - c.SOURCE_NS) // NS
+    first = now // NS
+    second = first
+    for k in range(SOURCES):
+        time = int(rows.reporters[there].source_time[Side.ICE, k])
+        if rows.reporters[there].source[Side.ICE, k] != NONE and time >= since:
+            second = min(second, max(first, time))
+            first = min(first, time)
+    grip = 0
+    for k in range(SOURCES):
+        time = int(rows.reporters[here].source_time[Side.GRIP, k])
+        if rows.reporters[here].source[Side.GRIP, k] != NONE and time > second:
+            grip += 1
+    return grip >= 2
