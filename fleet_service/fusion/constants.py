@@ -110,8 +110,7 @@ PEER_STD: Final = 0.25
 # --- Error that all vehicles in a place share (same manoeuvre, tyre model, ruts) ---
 
 # If a vehicle uses less than this share of a road's grip, its value may be too low, because it
-# depends on the assumed tyre curve. This error widens intervals upwards and corrects no value. Up
-# to the same share, a visit is not expected to give a value (`votes.note_silent_use`).
+# depends on the assumed tyre curve. This error widens intervals upwards and corrects no value.
 SHARED_SHARE: Final = 0.8
 # A comparison weighs as much as its squared difference in grip used, divided by its variance. When
 # a vehicle's weights exceed this sum, all its comparisons so far count half. The sum is almost
@@ -242,9 +241,9 @@ SHARED_LEAST: Final = 0.25
 
 # Largest factor by which a measured neighbour raises the probability of a friction, and least
 # factor by which a measured belief exceeds its prior. What a cell's own visitors measured is
-# refined and never replaced. With 1 (no message), 2, 2.5 and 3, known road-hours in three tuning
-# towns with 20 cars an hour were .415, .493, .502 and .507, the error in six tuning drives was
-# .0965, .0922, .0916 and .0921, and coverage on winter tyres was .846, .825, .823 and .822.
+# refined and never replaced. With no message, 2, and 2.5, known road-hours in three tuning towns
+# with 20 cars an hour were .416, .510 and .517, the error in six tuning drives was .0955, .0892 and
+# .0888, and coverage on winter tyres was .846, .801 and .800.
 HEARD_MOST: Final = 2.5
 # A cell whose P(slippery) is this close to 0 or 1 gets no messages. The reports of its own visitors
 # decide, and reading the map takes less time.

@@ -22,8 +22,11 @@ Only slippery neighbours send these messages, because dry neighbours do not show
 cell is dry. A cell without information sends no message, because its s is below s₀. The least value
 of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell
 with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
-ended there. A cell sends no message if no vehicle was in it with a probability of at least
-HERE_SHARE (positions are inaccurate, see `space`).
+ended there. So does a border: two vehicles reported grip in the cell after two had reported ice in
+the neighbour (`sources.is_border`). Otherwise a single report from the wrong cell, which makes the
+cell doubtful, would be confirmed by the ice on the other side of the border. A cell sends no
+message if no vehicle was in it with a probability of at least HERE_SHARE (positions are inaccurate,
+see `space`).
 
 The factor q weakens a message if few visits to the cell itself gave a friction value. On the same
 slippery surface, about as many visits would give a value as in the neighbouring cell: v_n, or
@@ -39,8 +42,7 @@ is HEARD_MOST times as probable as in the prior; otherwise its values have faded
 
 A reader gets K·(b·h₁·h₂·h₃), but P(slippery) stays that of K·(b·m₁·m₂·m₃): measured neighbours
 narrow the interval of μ and never decide whether a road is slippery, so alerts do not depend on
-them. Errors of neighbouring cells are partly alike, so n contains the common error of the
-neighbour, and HEARD_MOST limits the factor.
+them. Errors of neighbouring cells are partly alike, so HEARD_MOST limits the factor.
 
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4. Here a
 neighbour's message goes directly to the cell, and cells do not pass messages on.
@@ -66,6 +68,7 @@ import numpy as np
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road, read_slippery
+from fleet_service.fusion.sources import is_border
 from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
 from fleet_service.fusion.store.table import find_row
 from fleet_service.fusion.votes import ScratchRow
@@ -154,24 +157,25 @@ class MapParts(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Slot (cell and heading sector) whose belief is read, the time of reading [ns], the row of the
-    prior of its region, and P(slippery) of that prior.
+    """Slot (cell and heading sector) whose belief is read, the time of reading [ns], and the row of
+    the prior of its region.
     """
 
     slot: int
     now: int
     prior: int
-    unknown: float
 
 
 class Buffers(NamedTuple):
-    """Memory for intermediate results. `scratch` serves to age a belief. `product` (32) is the
-    product of the cell's own belief and all messages (factors from neighbours). `quiet` (32) is the
-    same product with messages that are weaker because visits gave no friction value. `message` (32)
-    is one message, and `road` (32) the belief about the road of a neighbour.
+    """Memory for intermediate results. `scratch` serves to age a belief. `own` (32) is the aged
+    belief about the cell from its own reports, and `product` (32) the product of this belief and
+    all messages (factors from neighbours). `quiet` (32) is the same product with messages that are
+    weaker because visits gave no friction value. `message` (32) is one message, and `road` (32) the
+    belief about the road of a neighbour.
     """
 
     scratch: FloatArray
+    own: FloatArray
     product: FloatArray
     quiet: FloatArray
     message: FloatArray
@@ -197,6 +201,7 @@ def road_beliefs(
         np.empty(_BINS),
         np.empty(_BINS),
         np.empty(_BINS),
+        np.empty(_BINS),
     )
     _read_beliefs(parts, slots, now, buffers, out)
     return out
@@ -215,28 +220,24 @@ def _read_beliefs(
     for k in range(len(slots)):
         prior = _age_belief(live, weather, slots[k], now[k], buffers.scratch)
         for i in range(_BINS):
-            buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
-            buffers.quiet[i] = buffers.product[i]
-        unknown = _slippery_probability(weather.prior[prior])
-        asked = Asked(slots[k], now[k], prior, unknown)
-        measured = rule.narrow and _is_measured(parts, asked, slots[k], buffers)
-        slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.product)
+            buffers.own[i] = buffers.scratch[ScratchRow.BELIEF, i]
+        asked = Asked(slots[k], now[k], prior)
+        slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.own)
         if c.DECIDED <= slippery <= 1.0 - c.DECIDED:
             _multiply_messages(parts, asked, buffers, out[k])
         else:
-            read_road(rule.kernels, live.cells, slots[k], buffers.product, out[k])
-        if measured:
+            read_road(rule.kernels, live.cells, slots[k], buffers.own, out[k])
+        if rule.narrow and _is_measured(parts, asked, slots[k], buffers.own):
             _narrow(parts, asked, buffers, out[k])
 
 
 @refcount_free_inlined
-def _is_measured(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> bool:
-    """Return True if vehicles gave values in the cell in row `row`, and if its aged belief, which
-    is in `buffers.scratch`, is still firmer than the prior by the factor HEARD_MOST.
+def _is_measured(parts: MapParts, asked: Asked, row: int, belief: Bins) -> bool:
+    """Return True if vehicles gave values in the cell in row `row`, and if its aged `belief` (32,)
+    is still firmer than the prior by the factor HEARD_MOST.
     """
     if parts.live.cells[row].values <= 0.0:
         return False
-    belief = buffers.scratch[ScratchRow.BELIEF]
     prior = parts.weather.prior[asked.prior]
     firmest = 0.0
     for i in range(_BINS):
@@ -250,18 +251,18 @@ def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) ->
     the resulting belief about the road to `out` (32). On entry, `out` is the belief without them;
     its P(slippery) does not change.
     """
-    live = parts.live
-    _age_belief(live, parts.weather, asked.slot, asked.now, buffers.scratch)
     for i in range(_BINS):
-        buffers.product[i] = buffers.scratch[ScratchRow.BELIEF, i]
+        buffers.product[i] = buffers.own[i]
     heard = False
     for side in (_BEFORE, _BEHIND, _ACROSS):
         row = _measured_neighbour(parts, asked, side, buffers)
         if row != NONE:
             heard = True
-            _multiply_limited(parts, asked, row, buffers)
+            neighbour = buffers.scratch[ScratchRow.BELIEF]
+            _multiply_limited(buffers.product, neighbour, parts.weather.prior[asked.prior])
     if heard:
-        read_road(parts.rule.kernels, live.cells, asked.slot, buffers.product, buffers.road)
+        cells = parts.live.cells
+        read_road(parts.rule.kernels, cells, asked.slot, buffers.product, buffers.road)
         if _set_slippery(buffers.road, _slippery_probability(out)):
             for i in range(_BINS):
                 out[i] = buffers.road[i]
@@ -283,23 +284,17 @@ def _measured_neighbour(parts: MapParts, asked: Asked, side: int, buffers: Buffe
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
         if row != NONE and cells[row].values > 0.0:
             _age_belief(parts.live, parts.weather, row, asked.now, buffers.scratch)
-            if _is_measured(parts, asked, row, buffers):
+            if _is_measured(parts, asked, row, buffers.scratch[ScratchRow.BELIEF]):
                 return int(row)
     return NONE
 
 
 @refcount_free_inlined
-def _multiply_limited(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> None:
-    """Multiply `buffers.product` (32,) by the message h of the measured cell in row `row`, whose
-    aged belief is in `buffers.scratch`.
-    """
-    prior = parts.weather.prior[asked.prior]
+def _multiply_limited(product: Bins, road: Bins, prior: Bins) -> None:
+    """Multiply `product` (32,) by the message h of a measured cell with the belief `road` (32,)."""
     for i in range(_BINS):
-        buffers.message[i] = buffers.scratch[ScratchRow.BELIEF, i]
-    read_road(parts.rule.kernels, parts.live.cells, row, buffers.message, buffers.road)
-    for i in range(_BINS):
-        factor = 1.0 + c.SAME_SURFACE * (buffers.road[i] / prior[i] - 1.0)
-        buffers.product[i] *= min(factor, c.HEARD_MOST)
+        factor = 1.0 + c.SAME_SURFACE * (road[i] / prior[i] - 1.0)
+        product[i] *= min(factor, c.HEARD_MOST)
 
 
 @refcount_free_inlined
@@ -328,9 +323,13 @@ def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: Flo
     """
     kernels = parts.rule.kernels
     cells = parts.live.cells
+    for i in range(_BINS):
+        buffers.product[i] = buffers.own[i]
+        buffers.quiet[i] = buffers.own[i]
+    unknown = _slippery_probability(parts.weather.prior[asked.prior])
     weakened = False
     for side in (_BEFORE, _BEHIND, _ACROSS):
-        weight, heard = _choose_message(parts, asked, side, buffers)
+        weight, heard = _choose_message(parts, asked, side, unknown, buffers)
         if weight > 0.0:
             weakened = weakened or heard < 1.0
             for i in range(_BINS):
@@ -344,11 +343,11 @@ def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: Flo
 
 @refcount_free_inlined
 def _choose_message(
-    parts: MapParts, asked: Asked, side: int, buffers: Buffers
+    parts: MapParts, asked: Asked, side: int, unknown: float, buffers: Buffers
 ) -> tuple[float, float]:
     """Write the message (factors on a belief) of the most informative neighbour on one side of a
     cell to `buffers.message`. Return the message's weight w, which is 0 if no neighbour on this
-    side sends a message.
+    side sends a message. `unknown` is P(slippery) of an unmeasured road.
 
     Also return the factor q in (0, 1], by which the caller weakens the message: 1 + q·(m - 1)
     replaces each factor m. It is below 1 if few visits to the cell itself gave friction values.
@@ -366,8 +365,8 @@ def _choose_message(
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
         if row == NONE or cells[row].vehicles == 0:
             continue
-        kept = _stored_slippery(live, row)
-        if kept < c.NEIGHBOUR_GRIP:
+        ended = _stored_slippery(live, row) < c.NEIGHBOUR_GRIP
+        if ended or is_border(live, asked.slot, row, asked.now):
             if side == _ACROSS:
                 continue
             break
@@ -375,7 +374,7 @@ def _choose_message(
         belief = buffers.scratch[ScratchRow.BELIEF]
         slippery = read_slippery(parts.rule.slippery, cells, row, belief)
         kept_surface = _KEPT[1 if side == _ACROSS else step]
-        weight = kept_surface * (slippery - asked.unknown) / (1.0 - asked.unknown)
+        weight = kept_surface * (slippery - unknown) / (1.0 - unknown)
         if weight > most:
             most = weight
             best = row

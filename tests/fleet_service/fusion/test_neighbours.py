@@ -125,6 +125,31 @@ def test_a_cell_whose_own_visitors_found_grip_keeps_it() -> None:
     assert interval(between)[0] > 0.6
 
 
+def one_report_of_ice(grip_s: float, ice_s: float) -> float:
+    """Return P(slippery) of a cell next to ice after one vehicle reported ice in this cell too.
+    Before this, four vehicles reported grip there from `grip_s` [s] on, and four vehicles reported
+    ice in the next cell from `ice_s` [s] on.
+    """
+    fusion = Fusion(120.0)
+    four = 20.0 * np.arange(4)
+    told = value([0.85] * 4 + [0.15] * 5, 0.03)
+    seconds = np.concatenate([grip_s + four, ice_s + four, [900.0]])
+    cells = np.array([CELL] * 4 + [east(1)] * 4 + [CELL])
+    order = np.argsort(seconds)
+    o = observations(seconds[order], np.arange(9)[order], told[order])
+    o.cell[:] = cells[order]
+    fusion.update(o)
+    return slippery(belief(fusion))
+
+
+def test_ice_beyond_a_known_border_does_not_confirm_a_report() -> None:
+    assert one_report_of_ice(grip_s=500.0, ice_s=0.0) < 0.3
+
+
+def test_ice_that_is_newer_than_the_grip_confirms_a_report() -> None:
+    assert one_report_of_ice(grip_s=0.0, ice_s=500.0) > 0.8
+
+
 def test_grip_ends_a_stretch() -> None:
     past = slippery(belief(road({0: UNTESTED, 1: dry(), 2: snow()})))
     assert past == slippery(belief(road({0: UNTESTED})))
