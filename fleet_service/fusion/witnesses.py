@@ -24,53 +24,49 @@ def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
 
 
 class StretchSources(NamedTuple):
-    """Vehicles that reported ice on the slippery stretches around k slots (one per cell and heading
-    sector), the newest first.
+    """Reports of ice on the slippery stretches around k slots (one per cell and heading sector).
 
     Attributes:
-        who: index of each of at most n vehicles per slot, (k, n).
-        when: time of the vehicle's newest report [ns], (k, n); 0 for no vehicle.
-        around: mask (k,): True if such vehicles reported ice both before and behind the slot, in
-            the slot's own direction of the road.
+        second: time by which two vehicles had reported [ns], that is, of the newest report of a
+            vehicle other than the one with the newest report, (k,); 0 if only one reported.
+        around: mask (k,): True if vehicles reported ice both before and behind the slot, in the
+            slot's own direction of the road.
     """
 
-    who: IntArray
-    when: IntArray
+    second: IntArray
     around: BoolArray
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return the vehicles that reported ice on the slippery stretches of road around the slots (one
-    per cell and heading sector) after the times `since` (k,) [ns]. Each vehicle occurs once per
-    stretch.
+    """Return who reported ice on the slippery stretches of road around the slots (one per cell and
+    heading sector) after the times `since` (k,) [ns].
     """
-    along = stretch_slots(fusion, slots)
-    places = along.shape[1]
-    who, when = fusion.find_sources(
-        np.maximum(along, 0).ravel(), Side.ICE, np.repeat(since, places)
-    )
-    when = np.where(along.reshape(-1, 1) == NONE, 0, when).reshape(-1, places, SOURCES)
-    found = when.max(axis=2) > 0
-    middle = 1 + NEIGHBOURS
-    end = middle + NEIGHBOURS
-    around = found[:, 1:middle].any(axis=1) & found[:, middle:end].any(axis=1)
-    who, when = _newest_first(who.reshape(-1, places * SOURCES), when.reshape(-1, places * SOURCES))
-    # Compare only as many vehicles as the stretch with the most has; callers read two.
-    most = max(int((when > 0).sum(axis=1).max(initial=0)), 2)
-    who = who[:, :most]
-    when = when[:, :most]
-    again = np.tril(who[:, :, None] == who[:, None, :], -1).any(axis=2)
-    return StretchSources(*_newest_first(who, np.where(again, 0, when)), around)
+    who, when = _reports_of_ice(fusion, slots, since)
+    first, middle, end = (SOURCES * place for place in (1, 1 + NEIGHBOURS, 1 + 2 * NEIGHBOURS))
+    found = when > 0
+    before = np.asarray(found[:, first:middle].any(axis=1))
+    behind = np.asarray(found[:, middle:end].any(axis=1))
+    newest = np.take_along_axis(who, when.argmax(axis=1)[:, None], axis=1)
+    return StretchSources(np.where(who == newest, 0, when).max(axis=1), before & behind)
 
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
     """Return the numbers of the vehicles that reported ice on the slippery stretch of road around a
     slot (cell and heading sector) after `since` [ns].
     """
-    who, when, _ = stretch_sources(fusion, np.array([slot]), np.array([since]))
-    return [int(fusion.store.names["key"][index]) for index in who[0][when[0] > 0].tolist()]
+    who, when = _reports_of_ice(fusion, np.array([slot]), np.array([since]))
+    return [int(fusion.store.names["key"][index]) for index in np.unique(who[when > 0]).tolist()]
 
 
-def _newest_first(who: IntArray, when: IntArray) -> tuple[IntArray, IntArray]:
-    newest = np.argsort(-when, axis=1, kind="stable")
-    return np.take_along_axis(who, newest, axis=1), np.take_along_axis(when, newest, axis=1)
+def _reports_of_ice(fusion: Fusion, slots: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the reports of ice on the slippery stretches of road around k slots after the times
+    `since` (k,) [ns], as two arrays (k, n): index of the vehicle, and time [ns]; 0 for no report.
+    They are in the order of `stretch_slots`, with SOURCES reports per slot.
+    """
+    along = stretch_slots(fusion, slots)
+    shape = (len(slots), along.shape[1] * SOURCES)
+    who, when = fusion.find_sources(
+        np.maximum(along, 0).ravel(), Side.ICE, np.repeat(since, along.shape[1])
+    )
+    when = np.where(along.reshape(-1, 1) == NONE, 0, when)
+    return who.reshape(shape), when.reshape(shape)

@@ -163,8 +163,7 @@ class Alerts:
         needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
         enough = (own > 0).sum(axis=1) >= needed
         along = stretch_sources(fusion, near, fusion.live.time[near] - c.SOURCE_NS)
-        second = along.when[:, 1]
-        enough |= (second > 0) & (against[:, 0] <= second - FRESH_NS)
+        enough |= (along.second > 0) & (against[:, 0] <= along.second - FRESH_NS)
         accused = (own[:, 0] > 0) & (fusion.slippery(near) > LIKELY)
         return np.asarray(near[enough & (accused | along.around)])
 
