@@ -6,18 +6,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.historical_maps import HistoricalMaps, PastQuery
-from fleet_service.app.state import SLOTS, SharedState
+from fleet_service.app.state import SharedState
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer_query, size_asked
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
 from schemas.query import MapQuery
 from schemas.tables import MAP_SCHEMA
+
+# Number of slots that are read at once. The lock is then held for 40 ms, and memory stays small.
+SLOTS: Final = 20_000
 
 
 class Queries:

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -44,9 +43,6 @@ KEPT_NS: Final = 7 * DAY_NS
 # Smallest share of the cells that is worth dropping, because all other cells must be copied.
 LEAST_DROPPED: Final = 0.01
 VISITORS: Final = "visitors"  # name of a table in checkpoints
-# Number of slots that are processed at once. The lock is then held for 40 ms, and memory stays
-# small.
-SLOTS: Final = 20_000
 
 
 class ServiceState(NamedTuple):
@@ -168,7 +164,7 @@ def load_state(
     fusion.update_weather(
         archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
     )
-    restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
+    shown.mark_changed(np.arange(fusion.size))
     matters = Begin(first_day(root), begin.cut, until)
     heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
@@ -180,9 +176,9 @@ def load_state(
             if begin.cut
             else partial(restore_streams, root, streams, matters, damaged)
         )
-        for slots in chain(restored, (updated.slots for updated in rest)):
-            alerts.update(slots)
-            shown.mark_changed(slots)
+        for updated in rest:
+            alerts.update(updated.slots)
+            shown.mark_changed(updated.slots)
         for kind, rows in noting.result() or []:
             streams.restore(kind, rows)
     pa.default_memory_pool().release_unused()  # memory from reading the archive
