@@ -34,15 +34,16 @@ v_n·k/k_n if the cell had fewer visits. q falls below 1 if the cell has less th
 without a value does not show grip, so q never lowers P(slippery) below UNSURE. The weights v fade
 with time, so that values from before a change of the road count little.
 
-A *measured* cell also hears the measured cells next to it on its three sides, grip included,
-because somebody tested both. A cell is measured if vehicles gave values there, and if some friction
-is HEARD_MOST times as probable as in the prior; otherwise its values have faded. The message is
+A *measured* cell also hears measured cells near it, grip included, because somebody tested both: up
+to HEARD_CELLS consecutive cells before it, as many behind it, and one of the other direction. A
+cell is measured if vehicles gave values there, and if some friction is HEARD_MOST times as probable
+as in the prior; otherwise its values have faded. The message is
 
-    h_i = min(1 + SAME_SURFACE·(n_i/p₀_i - 1), HEARD_MOST)
+    h_i = clip(1 + SAME_SURFACE^d·(n_i/p₀_i - 1), 1/HEARD_MOST, HEARD_MOST)
 
-A reader gets K·(b·h₁·h₂·h₃), but P(slippery) stays that of K·(b·m₁·m₂·m₃): measured neighbours
+A reader gets K·(b·h₁·h₂·…), but P(slippery) stays that of K·(b·m₁·m₂·m₃): measured neighbours
 narrow the interval of μ and never decide whether a road is slippery, so alerts do not depend on
-them. Errors of neighbouring cells are partly alike, so HEARD_MOST limits the factor.
+them. Errors of neighbouring cells are partly alike, so HEARD_MOST limits the message.
 
 Source of the method: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4. Here a
 neighbour's message goes directly to the cell, and cells do not pass messages on.
@@ -255,11 +256,7 @@ def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) ->
         buffers.product[i] = buffers.own[i]
     heard = False
     for side in (_BEFORE, _BEHIND, _ACROSS):
-        row = _measured_neighbour(parts, asked, side, buffers)
-        if row != NONE:
-            heard = True
-            neighbour = buffers.scratch[ScratchRow.BELIEF]
-            _multiply_limited(buffers.product, neighbour, parts.weather.prior[asked.prior])
+        heard = _hear_side(parts, asked, side, buffers) or heard
     if heard:
         cells = parts.live.cells
         read_road(parts.rule.kernels, cells, asked.slot, buffers.product, buffers.road)
@@ -269,32 +266,46 @@ def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) ->
 
 
 @refcount_free_inlined
-def _measured_neighbour(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> int:
-    """Return the row of the next cell on one side if it is measured, and write its aged belief to
-    `buffers.scratch`; else return NONE. In the opposite direction of the road, take the first cell
-    that is measured.
+def _hear_side(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> bool:
+    """Multiply `buffers.product` (32,) by the messages h of the measured cells on one side of a
+    cell. Return False if there are none.
+
+    Before and behind the cell, these are up to HEARD_CELLS consecutive cells. In the opposite
+    direction of the road, it is the first cell that is measured.
     """
     cells = parts.live.cells
     key = cells[asked.slot].key
     cell = key // grid.SECTORS
     sector = key % grid.SECTORS
-    towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
-    for step in range(1, (ACROSS if side == _ACROSS else 1) + 1):
-        there = _step_to(cell, cell, sector, side, step)
+    across = side == _ACROSS
+    towards = (sector + 2) % grid.SECTORS if across else sector
+    heard = False
+    there = cell
+    for step in range(1, (ACROSS if across else c.HEARD_CELLS) + 1):
+        there = _step_to(cell, there, sector, side, step)
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
-        if row != NONE and cells[row].values > 0.0:
+        measured = row != NONE and cells[row].values > 0.0
+        if measured:
             _age_belief(parts.live, parts.weather, row, asked.now, buffers.scratch)
-            if _is_measured(parts, asked, row, buffers.scratch[ScratchRow.BELIEF]):
-                return int(row)
-    return NONE
+            road = buffers.scratch[ScratchRow.BELIEF]
+            measured = _is_measured(parts, asked, row, road)
+            if measured:
+                kept = _KEPT[1 if across else step]
+                _multiply_limited(buffers.product, road, parts.weather.prior[asked.prior], kept)
+                heard = True
+        if measured == across:
+            break
+    return heard
 
 
 @refcount_free_inlined
-def _multiply_limited(product: Bins, road: Bins, prior: Bins) -> None:
-    """Multiply `product` (32,) by the message h of a measured cell with the belief `road` (32,)."""
+def _multiply_limited(product: Bins, road: Bins, prior: Bins, kept: float) -> None:
+    """Multiply `product` (32,) by the message h of a measured cell with the belief `road` (32,).
+    `kept` is the probability that both cells have the same surface.
+    """
     for i in range(_BINS):
-        factor = 1.0 + c.SAME_SURFACE * (road[i] / prior[i] - 1.0)
-        product[i] *= min(factor, c.HEARD_MOST)
+        factor = 1.0 + kept * (road[i] / prior[i] - 1.0)
+        product[i] *= min(max(factor, 1.0 / c.HEARD_MOST), c.HEARD_MOST)
 
 
 @refcount_free_inlined
