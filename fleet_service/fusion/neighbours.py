@@ -22,8 +22,8 @@ Only slippery neighbours send these messages, because dry neighbours do not show
 cell is dry. A cell without information sends no message, because its s is below s₀. The least value
 of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors found grip stays a cell
 with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
-ended there. So does a border: two vehicles reported grip in the cell after two had reported ice in
-the neighbour (`sources.is_border`). Otherwise a single report from the wrong cell, which makes the
+ended there. So does a border: two vehicles reported grip in one cell after two had reported ice in
+the other (`sources.is_border`). Otherwise a single report from the wrong cell, which makes the
 cell doubtful, would be confirmed by the ice on the other side of the border. A cell sends no
 message if no vehicle was in it with a probability of at least HERE_SHARE (positions are inaccurate,
 see `space`).
@@ -35,9 +35,9 @@ without a value does not show grip, so q never lowers P(slippery) below UNSURE. 
 with time, so that values from before a change of the road count little.
 
 A *measured* cell also hears measured cells near it, grip included, because somebody tested both: up
-to HEARD_CELLS consecutive cells before it, as many behind it, and one of the other direction. A
-cell is measured if vehicles gave values there, and if some friction is HEARD_MOST times as probable
-as in the prior; otherwise its values have faded. The message is
+to HEARD_CELLS consecutive cells before it, as many behind it, and one of the other direction, but
+none beyond a border. A cell is measured if vehicles gave values there, and if some friction is
+HEARD_MOST times as probable as in the prior; otherwise its values have faded. The message is
 
     h_i = clip(1 + SAME_SURFACE^d·(n_i/p₀_i - 1), 1/HEARD_MOST, HEARD_MOST)
 
@@ -67,6 +67,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.adjacent import ACROSS, ACROSS_CELLS, BEFORE, BEHIND, next_cell, step_to
 from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road, read_slippery
 from fleet_service.fusion.sources import is_border
@@ -83,32 +84,6 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
-_WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell number
-_X: Final = 0x5555555555555555 & _WHOLE  # bits of the column number; `_Y`: of the row number
-_Y: Final = _WHOLE - _X
-_EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
-# sides of a cell; across: the opposite direction of the road
-_BEFORE, _BEHIND, _ACROSS = range(3)
-# [quarter turns] from the heading of a sector to its left and right
-_SIDEWAYS: Final = (1, 3)
-# Number of cells in which the other direction of the road may lie: the same cell, left and right.
-ACROSS: Final = 1 + len(_SIDEWAYS)
-
-
-@refcount_free_inlined
-def next_cell(cell: int, heading: int) -> int:
-    """Return the next cell in the direction of a sector `heading`, also across the date line."""
-    x = cell & _X
-    y = cell & _Y
-    if heading == _EAST:
-        x = ((x | _Y) + 1) & _X
-    elif heading == _WEST:
-        x = (x - 1) & _X
-    elif heading == _SOUTH:
-        y = ((y | _X) + 2) & _Y
-    else:
-        y = (y - 2) & _Y
-    return x | y
 
 
 @refcount_free_inlined
@@ -255,7 +230,7 @@ def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) ->
     for i in range(_BINS):
         buffers.product[i] = buffers.own[i]
     heard = False
-    for side in (_BEFORE, _BEHIND, _ACROSS):
+    for side in (BEFORE, BEHIND, ACROSS):
         heard = _hear_side(parts, asked, side, buffers) or heard
     if heard:
         cells = parts.live.cells
@@ -277,14 +252,15 @@ def _hear_side(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> bo
     key = cells[asked.slot].key
     cell = key // grid.SECTORS
     sector = key % grid.SECTORS
-    across = side == _ACROSS
+    across = side == ACROSS
     towards = (sector + 2) % grid.SECTORS if across else sector
     heard = False
     there = cell
-    for step in range(1, (ACROSS if across else c.HEARD_CELLS) + 1):
-        there = _step_to(cell, there, sector, side, step)
+    for step in range(1, (ACROSS_CELLS if across else c.HEARD_CELLS) + 1):
+        there = step_to(cell, there, sector, side, step)
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
         measured = row != NONE and cells[row].values > 0.0
+        measured = measured and not is_border(parts.live, asked.slot, row, asked.now)
         if measured:
             _age_belief(parts.live, parts.weather, row, asked.now, buffers.scratch)
             road = buffers.scratch[ScratchRow.BELIEF]
@@ -339,7 +315,7 @@ def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: Flo
         buffers.quiet[i] = buffers.own[i]
     unknown = _slippery_probability(parts.weather.prior[asked.prior])
     weakened = False
-    for side in (_BEFORE, _BEHIND, _ACROSS):
+    for side in (BEFORE, BEHIND, ACROSS):
         weight, heard = _choose_message(parts, asked, side, unknown, buffers)
         if weight > 0.0:
             weakened = weakened or heard < 1.0
@@ -369,22 +345,22 @@ def _choose_message(
     best = NONE
     key = cells[asked.slot].key
     sector = key % grid.SECTORS
-    towards = (sector + 2) % grid.SECTORS if side == _ACROSS else sector
+    towards = (sector + 2) % grid.SECTORS if side == ACROSS else sector
     there = key // grid.SECTORS
-    for step in range(1, (ACROSS if side == _ACROSS else c.NEIGHBOURS) + 1):
-        there = _step_to(key // grid.SECTORS, there, sector, side, step)
+    for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
+        there = step_to(key // grid.SECTORS, there, sector, side, step)
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
         if row == NONE or cells[row].vehicles == 0:
             continue
         ended = _stored_slippery(live, row) < c.NEIGHBOUR_GRIP
         if ended or is_border(live, asked.slot, row, asked.now):
-            if side == _ACROSS:
+            if side == ACROSS:
                 continue
             break
         _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
         belief = buffers.scratch[ScratchRow.BELIEF]
         slippery = read_slippery(parts.rule.slippery, cells, row, belief)
-        kept_surface = _KEPT[1 if side == _ACROSS else step]
+        kept_surface = _KEPT[1 if side == ACROSS else step]
         weight = kept_surface * (slippery - unknown) / (1.0 - unknown)
         if weight > most:
             most = weight
@@ -398,32 +374,15 @@ def _choose_message(
     return most, _silence_factor(cells, asked.slot, best, parts.rule.silence)
 
 
-@refcount_free_inlined
-def _step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
-    """Return the cell of a neighbour of `cell` on one side. `step` is the number of the neighbour,
-    counted from 1, and `sector` is the heading sector.
-
-    Before and behind the cell, neighbour k is k cells away. It is found from `there`, the cell of
-    neighbour `step` - 1 (at first `cell` itself). For the opposite direction of the road, neighbour
-    1 is in `cell` itself, because both directions may share a cell. Neighbours 2 and 3 are in the
-    cells to its left and right.
-    """
-    if side != _ACROSS:
-        return next_cell(there, (sector + 2 * side) % grid.SECTORS)
-    if step == 1:
-        return cell
-    return next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)
-
-
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
     """Return each slot (cell and heading sector), and the other slots that may belong to the same
-    slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS + ACROSS). First comes the slot
-    itself, then those before it, those behind it, and those of the other direction of the road.
-    Positions without such a slot are NONE.
+    slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS + ACROSS_CELLS). First comes the
+    slot itself, then those before it, those behind it, and those of the other direction of the
+    road. Positions without such a slot are NONE.
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
-    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS + ACROSS), NONE)
+    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS + ACROSS_CELLS), NONE)
     _find_stretches(live, table, slots, out)
     return out
 
@@ -446,8 +405,8 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
                 out[k, 1 + side * c.NEIGHBOURS + step] = row
         cell = key // grid.SECTORS
         towards = (sector + 2) % grid.SECTORS
-        for step in range(ACROSS):
-            there = _step_to(cell, cell, sector, _ACROSS, step + 1)
+        for step in range(ACROSS_CELLS):
+            there = step_to(cell, cell, sector, ACROSS, step + 1)
             row = find_row(table, live.cells, there * grid.SECTORS + towards)
             if row == NONE or live.cells[row].vehicles == 0:
                 continue

@@ -30,13 +30,18 @@ def note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time
 
 
 @refcount_free_inlined
-def is_border(rows: Rows, row: int, neighbour: int, now: int) -> bool:
-    """Return True if the slippery stretch of the cell in row `neighbour` does not reach the cell in
-    `row`: if two vehicles reported grip in this cell after two vehicles had reported ice in the
+def is_border(rows: Rows, row: int, other: int, now: int) -> bool:
+    """Return True if a slippery stretch of road is known to end between the cells in rows `row` and
+    `other`: if two vehicles reported grip in one of them after two vehicles had reported ice in the
     other, all within the time SOURCE_NS before `now` [ns].
     """
-    here = rows.cells[row].reporters
-    there = rows.cells[neighbour].reporters
+    return _grip_beside_ice(rows, row, other, now) or _grip_beside_ice(rows, other, row, now)
+
+
+@refcount_free_inlined
+def _grip_beside_ice(rows: Rows, grip: int, ice: int, now: int) -> bool:
+    here = rows.cells[grip].reporters
+    there = rows.cells[ice].reporters
     if here == NONE or there == NONE:
         return False
     since = (now - c.SOURCE_NS) // NS
@@ -47,9 +52,9 @@ def is_border(rows: Rows, row: int, neighbour: int, now: int) -> bool:
         if rows.reporters[there].source[Side.ICE, k] != NONE and time >= since:
             second = min(second, max(first, time))
             first = min(first, time)
-    grip = 0
+    vehicles = 0
     for k in range(SOURCES):
         time = int(rows.reporters[here].source_time[Side.GRIP, k])
         if rows.reporters[here].source[Side.GRIP, k] != NONE and time > second:
-            grip += 1
-    return grip >= 2
+            vehicles += 1
+    return vehicles >= 2

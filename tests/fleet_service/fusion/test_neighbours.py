@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion
+from fleet_service.fusion.adjacent import next_cell
 from fleet_service.fusion.constants import NEIGHBOURS, UNSURE
-from fleet_service.fusion.neighbours import next_cell
 from fleet_service.fusion.weather import Reports
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray
