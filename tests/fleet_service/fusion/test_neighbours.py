@@ -142,6 +142,18 @@ def one_report_of_ice(grip_s: float, ice_s: float) -> float:
     return slippery(belief(fusion))
 
 
+@pytest.mark.parametrize(("grip_s", "is_known"), [(500.0, True), (0.0, False)])
+def test_no_message_crosses_a_known_border(grip_s: float, *, is_known: bool) -> None:
+    seconds = np.append(500.0 - grip_s + 20.0 * np.arange(4), grip_s + 20.0 * np.arange(4))
+    o = observations(seconds, np.arange(8), value([0.15] * 4 + [0.75] * 4, 0.05))
+    o.cell[:4] = east(1)
+    order = np.argsort(seconds)
+    among, alone = Fusion(120.0), Fusion(120.0)
+    among.update(o.take(order))
+    alone.update(o.take(order[order >= 4]))
+    assert np.array_equal(belief(among), belief(alone)) == is_known
+
+
 def test_ice_beyond_a_known_border_does_not_confirm_a_report() -> None:
     assert one_report_of_ice(grip_s=500.0, ice_s=0.0) < 0.3
 
