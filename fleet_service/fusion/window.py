@@ -135,9 +135,11 @@ def _absorb_votes(
     entries = state.entries
     pairs = state.pairs
     waiting = 0
-    for k in range(len(votes.row)):
-        if k % AHEAD == 0:
-            _prefetch_votes(state, arrivals, votes, k, min(k + AHEAD, len(votes.row)))
+    for step in range(len(votes.row) + 3 * AHEAD):
+        k = step - 3 * AHEAD
+        _prefetch_votes(state, arrivals, votes, step, step - max(k, 0))
+        if k < 0:
+            continue
         row = votes.row[k]
         slot = votes.slot[k]
         if marks.left_out[row]:
@@ -196,33 +198,37 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
 
 
 @refcount_free_inlined
-def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, end: int) -> None:
-    """Prefetch the memory that the votes in rows `begin` to `end` of `votes` will access. Records
-    whose row number must first be read from memory come last.
+def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, ahead: int) -> None:
+    """Prefetch the memory that later votes will access: first the rows whose numbers are known, for
+    the vote in row `step` of `votes`. Rows whose numbers must be read from memory follow for the
+    vote AHEAD rows before it, and the last entry of its window for the vote 2·AHEAD rows before it.
+    `ahead` is the number of votes between the present one and the vote in row `step`.
 
-    The code uses `max` and `min` instead of branches on the values that it loads. A processor that
-    mispredicts a branch would discard its prefetches.
+    The memory accesses of later votes then overlap with the work on the present vote. The code uses
+    `max` and `min` instead of branches on the values that it loads. A processor that mispredicts a
+    branch would discard its prefetches.
     """
     live = state.live
     base = state.base
     windows = state.windows
     used = state.used
-    for k in range(begin, end):
-        slot = votes.slot[k]
+    if step < len(votes.row):
+        slot = votes.slot[step]
         prefetch(live.cells, slot, 0)
         prefetch(live.belief, slot, 0)
-        pair = first_place(state.pairs, slot, arrivals.vehicle[votes.row[k]])
+        pair = first_place(state.pairs, slot, arrivals.vehicle[votes.row[step]])
         prefetch(state.pairs, pair, 0)
         prefetch(state.pairs, pair, 1)
-        entry = state.free_entries[used[FREE_ENTRIES] - 1 - (k - begin)]
+        entry = state.free_entries[used[FREE_ENTRIES] - 1 - ahead]
         prefetch(state.entries, entry, 0)
         prefetch(state.entries, entry, 1)
         prefetch(state.settled_begin, slot, 0)
-        window = state.free_windows[used[FREE_WINDOWS] - 1 - (k - begin)]
+        window = state.free_windows[used[FREE_WINDOWS] - 1 - ahead]
         prefetch(base.cells, window, 0)
         prefetch(base.belief, window, 0)
         prefetch(windows, window, 0)
-    for k in range(begin, end):
+    k = step - AHEAD
+    if 0 <= k < len(votes.row):
         prefetch(windows, max(live.cells[votes.slot[k]].window, 0), 0)
         reporters = max(live.cells[votes.slot[k]].reporters, 0)
         prefetch(live.reporters, reporters, 1)
@@ -232,7 +238,8 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, begin: int, 
             row = guess_row(state, slot, arrivals.vehicle[votes.row[k]])
             prefetch(state.settled_keys, row - 8, 0)
             prefetch(state.settled_keys, row + 8, 0)
-    for k in range(begin, end):
+    k = step - 2 * AHEAD
+    if 0 <= k < len(votes.row):
         prefetch(state.entries, windows[max(live.cells[votes.slot[k]].window, 0)].tail, 0)
 
 
@@ -317,23 +324,25 @@ def commit_windows(
 
 
 @refcount_free_inlined
-def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> None:
-    """Prefetch the memory that `commit_windows` will access for the lateness windows (recent
-    observations of cells) in rows `begin` to `end` of `due_windows`. Records whose row number must
-    first be read from memory come last.
+def _prefetch_due(state: State, due_windows: IntArray, step: int) -> None:
+    """Prefetch the memory that `commit_windows` will access for later lateness windows (recent
+    observations of cells): for row `step` of `due_windows` the window, and for the rows AHEAD,
+    2·AHEAD and 3·AHEAD before it the records whose row numbers were prefetched before.
     """
     live = state.live
     base = state.base
     windows = state.windows
     entries = state.entries
-    for k in range(begin, end):
-        prefetch(windows, due_windows[k], 0)
-    for k in range(begin, end):
-        prefetch(entries, windows[due_windows[k]].head, 0)
-        prefetch(entries, windows[due_windows[k]].tail, 0)
-        prefetch(live.cells, windows[due_windows[k]].slot, 0)
-    for k in range(begin, end):
-        window = due_windows[k]
+    count = len(due_windows)
+    if step < count:
+        prefetch(windows, due_windows[step], 0)
+    if 0 <= step - AHEAD < count:
+        window = due_windows[step - AHEAD]
+        prefetch(entries, windows[window].head, 0)
+        prefetch(entries, windows[window].tail, 0)
+        prefetch(live.cells, windows[window].slot, 0)
+    if 0 <= step - 2 * AHEAD < count:
+        window = due_windows[step - 2 * AHEAD]
         prefetch(state.pairs, entries[windows[window].head].pair, 0)
         if windows[window].values:
             prefetch(live.reporters, live.cells[windows[window].slot].reporters, 0)
@@ -343,8 +352,8 @@ def _prefetch_due(state: State, due_windows: IntArray, begin: int, end: int) -> 
             prefetch(entries, entries[windows[window].head].following, 0)
             prefetch(base.cells, window, 0)
             prefetch(base.belief, window, 0)
-    for k in range(begin, end):
-        window = due_windows[k]
+    if 0 <= step - 3 * AHEAD < count:
+        window = due_windows[step - 3 * AHEAD]
         if windows[window].tail != windows[window].head:
             prefetch(state.pairs, entries[entries[windows[window].head].following].pair, 0)
 
@@ -362,10 +371,11 @@ def _commit_windows(
     live = state.live
     windows = state.windows
     entries = state.entries
-    for k in range(len(due_windows)):
-        if k % AHEAD == 0:
-            _prefetch_due(state, due_windows, k, min(k + AHEAD, len(due_windows)))
-        window = due_windows[k]
+    for step in range(len(due_windows) + 4 * AHEAD):
+        _prefetch_due(state, due_windows, step)
+        if step < 4 * AHEAD:
+            continue
+        window = due_windows[step - 4 * AHEAD]
         slot = int(windows[window].slot)
         whole = entries[windows[window].tail].time < before
         entry = int(windows[window].head)

@@ -100,19 +100,17 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_wa
     yet final. Return the number of moved records.
     """
     count = 0
-    for begin in range(0, len(old), AHEAD):
-        end = min(begin + AHEAD, len(old))
-        for place in range(begin, end):
-            if old[place].slot != NONE and old[place].last != NONE:
-                prefetch(entries, old[place].last, 0)
-        for place in range(begin, end):
-            if old[place].slot == NONE or (only_waiting and old[place].last == NONE):
-                continue
-            count += 1
-            to = pair_place(new, old[place].slot, old[place].vehicle)
-            new[to] = old[place]
-            entry = int(old[place].last)
-            while entry != NONE:
-                entries[entry].pair = to
-                entry = int(entries[entry].before)
+    for step in range(len(old) + AHEAD):
+        if step < len(old) and old[step].slot != NONE:
+            prefetch(entries, old[step].last, 0)
+        place = step - AHEAD
+        if place < 0 or old[place].slot == NONE or (only_waiting and old[place].last == NONE):
+            continue
+        count += 1
+        to = pair_place(new, old[place].slot, old[place].vehicle)
+        new[to] = old[place]
+        entry = int(old[place].last)
+        while entry != NONE:
+            entries[entry].pair = to
+            entry = int(entries[entry].before)
     return count

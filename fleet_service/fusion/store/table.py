@@ -33,9 +33,9 @@ PLACES_MOST: Final = 0.7
 # Bits of a place: the lower half, and the non-negative numbers that fit into the upper half.
 _LOWER: Final = np.iinfo(np.uint32).max
 _TAG: Final = np.iinfo(np.int32).max
-# Number of rows for which memory is prefetched before the work on them, so that the memory accesses
-# overlap.
-AHEAD: Final = 128
+# Number of rows by which a prefetch is ahead of the work on a row, so that memory accesses overlap
+# with this work.
+AHEAD: Final = 16
 
 
 @refcount_free_inlined
@@ -107,15 +107,14 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
 
 @refcount_free_locked
 def _find_rows(table: IntArray, rows: RecordArray, wanted: IntArray, out: IntArray) -> None:
-    for group in range(0, len(wanted), AHEAD):
-        end = min(group + AHEAD, len(wanted))
-        for i in range(group, end):
-            out[i] = _first_place(_hash_key(wanted[i]), len(table))
-            prefetch(table, out[i], 0)
-        for i in range(group, end):
-            prefetch(rows, _row_at(table[out[i]]), 0)
-        for i in range(group, end):
-            out[i] = find_row(table, rows, wanted[i])
+    for step in range(len(wanted) + 2 * AHEAD):
+        if step < len(wanted):
+            out[step] = _first_place(_hash_key(wanted[step]), len(table))
+            prefetch(table, out[step], 0)
+        if 0 <= step - AHEAD < len(wanted):
+            prefetch(rows, _row_at(table[out[step - AHEAD]]), 0)
+        if step >= 2 * AHEAD:
+            out[step - 2 * AHEAD] = find_row(table, rows, wanted[step - 2 * AHEAD])
 
 
 @refcount_free_locked
