@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.cells import rows_of_lines
 from fleet_service.fusion.store.pairs import move_pairs
 from fleet_service.fusion.store.records import (
@@ -27,10 +28,9 @@ from fleet_service.fusion.store.records import (
     State,
 )
 from fleet_service.fusion.store.settled import (
-    count_settling,
     drop_reports,
-    find_resting,
     insert_reports,
+    take_resting,
 )
 from fleet_service.fusion.store.table import places_for
 from schemas.numeric import IntArray
@@ -67,7 +67,9 @@ def grow_pairs(state: State, most: int) -> State:
     `State.pairs`. A pair is the record of one vehicle in one slot (cell and heading sector) in
     which the vehicle has reported recently.
     """
-    return _move_pairs(state, max(int(state.used[PAIRS]), most), only_waiting=False)
+    new = no_pairs(places_for(max(int(state.used[PAIRS]), most)))
+    move_pairs(state.entries, state.pairs, new)
+    return state._replace(pairs=new)
 
 
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
@@ -80,26 +82,21 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
 
     `names` (V,) are the records of the vehicles, and `size` is the number of slots in use.
     """
-    most = int(state.used[PAIRS])  # the table keeps its size, because as many pairs will follow
+    most = int(state.used[PAIRS])
     reports, values = drop_reports(state, names, now)
     begins = np.empty((size + 1, 2), np.uint32)
     begins[: len(state.settled_begin)] = state.settled_begin
     begins[len(state.settled_begin) :] = reports, values
     state = state._replace(settled_begin=begins)
-    resting = find_resting(state, size, len(names))
-    more, more_values = count_settling(state, names, resting, now)
+    resting = take_resting(state, names, size, now)
     # in place, because a copy would take as much memory again
+    more, more_values = int(resting.kinds.sum()), int(resting.kinds[ReportKind.VALUE])
     state.settled.resize(reports + more, refcheck=False)
     state.settled_keys.resize(reports + more, refcheck=False)
     state.settled_std.resize(values + more_values, refcheck=False)
     insert_reports(state, resting, now, reports, values, len(names))
-    return _move_pairs(state, most, only_waiting=True)
-
-
-def _move_pairs(state: State, most: int, *, only_waiting: bool) -> State:
-    new = no_pairs(places_for(most))
-    state.used[PAIRS] = move_pairs(state.entries, state.pairs, new, int(only_waiting))
-    return state._replace(pairs=new)
+    # The table usually keeps its size, because as many pairs will follow.
+    return grow_pairs(state, most) if 2 * places_for(most) < len(state.pairs) else state
 
 
 def rebuild_reporters(state: State, size: int, least: int) -> State:

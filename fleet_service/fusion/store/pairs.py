@@ -94,23 +94,19 @@ def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
 
 
 @refcount_free_locked
-def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, only_waiting: int) -> int:
+def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray) -> None:
     """Move the records of active pairs (one vehicle in one slot each) from the hash table `old` to
-    the hash table `new`. If `only_waiting` is 1, move only pairs with an observation that is not
-    yet final. Return the number of moved records.
+    the hash table `new`.
     """
-    count = 0
     for step in range(len(old) + AHEAD):
         if step < len(old) and old[step].slot != NONE:
             prefetch(entries, old[step].last, 0)
         place = step - AHEAD
-        if place < 0 or old[place].slot == NONE or (only_waiting and old[place].last == NONE):
+        if place < 0 or old[place].slot == NONE:
             continue
-        count += 1
         to = pair_place(new, old[place].slot, old[place].vehicle)
         new[to] = old[place]
         entry = int(old[place].last)
         while entry != NONE:
             entries[entry].pair = to
             entry = int(entries[entry].before)
-    return count

@@ -9,7 +9,7 @@ the vehicle reports in the slot again, its reports are copied back to the table 
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -17,13 +17,14 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import (
     NONE,
+    PAIR,
     PAIRS,
     SETTLED_SINCE,
     SETTLED_VEHICLES,
     Int32Array,
     State,
 )
-from fleet_service.fusion.store.table import AHEAD
+from fleet_service.fusion.store.table import AHEAD, first_place
 from schemas.numeric import IntArray
 from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.runtime.prefetch import prefetch
@@ -205,35 +206,124 @@ def _drop_reports(state: State, names: RecordArray, now: int) -> int:
     return reports
 
 
-def find_resting(state: State, slots: int, vehicles: int) -> IntArray:
-    """Return the rows (k,) of the pair records (one vehicle in one slot each) without an
-    observation that is still waiting to become final, sorted by slot and vehicle. These pairs can
-    be settled, that is, moved to compact storage. `slots` and `vehicles` are the numbers in use.
+class Resting(NamedTuple):
+    """Pairs (one vehicle in one slot each) that settle.
+
+    Attributes:
+        records: `PairRecord` of each pair, (k,).
+        order: (k,) rows of `records`, sorted by slot and vehicle.
+        kinds: (2,) number of their bounds, and of their values, that are still remembered.
     """
-    found = np.empty((2, int(state.used[PAIRS])), np.int64)
-    slot_rows = np.zeros(slots + 1, np.int32)
-    vehicle_rows = np.zeros(vehicles + 1, np.int32)
-    count = _list_resting(state.pairs, slot_rows, vehicle_rows, found[0])
-    rows = found[0, :count]
-    _sort_resting(state.pairs, np.cumsum(slot_rows), np.cumsum(vehicle_rows), rows, found[1])
-    return rows
+
+    records: RecordArray
+    order: IntArray
+    kinds: IntArray
+
+
+class _Tally(NamedTuple):
+    """Numbers of pairs that settle. The number of slot k is in `slots[k + 1]`, and the number of
+    vehicle k in `vehicles[k + 1]`. `kinds` (2,) are the numbers of their bounds and of their values
+    that are still remembered.
+    """
+
+    slots: Int32Array
+    vehicles: Int32Array
+    kinds: IntArray
+
+
+def take_resting(state: State, names: RecordArray, slots: int, now: int) -> Resting:
+    """Remove the pairs without an observation that is still waiting to become final from the hash
+    table `State.pairs`, and return them. These pairs can be settled, that is, moved to compact
+    storage.
+
+    If no report of a pair is still remembered at `now` [s], record in the cell that the vehicle was
+    already counted there. `names` are the records of the vehicles, and `slots` is the number of
+    slots in use.
+    """
+    records = np.empty(int(state.used[PAIRS]), PAIR)
+    tally = _Tally(
+        np.zeros(slots + 1, np.int32),
+        np.zeros(len(names) + 1, np.int32),
+        np.zeros(len(ReportKind), np.int64),
+    )
+    count = _take_resting(state, names, now, tally, records)
+    records = records[:count]
+    order = np.empty((2, count), np.int64)
+    _sort_resting(records, np.cumsum(tally.slots), np.cumsum(tally.vehicles), order[0], order[1])
+    return Resting(records, order[0], tally.kinds)
 
 
 @refcount_free_locked
-def _list_resting(
-    pairs: RecordArray, slot_rows: Int32Array, vehicle_rows: Int32Array, out: IntArray
+def _take_resting(
+    state: State, names: RecordArray, now: int, tally: _Tally, out: RecordArray
 ) -> int:
-    """Write the rows of the pairs without a waiting observation to `out`, and return their number.
-    Count them per slot and per vehicle; the number of slot k is added to `slot_rows[k + 1]`.
+    """Move the records of the pairs without a waiting observation from the hash table to `out`,
+    count them in `tally`, and return their number. Each other pair moves to the first free place
+    from its first place on, so that a search still finds it. The scan begins after a free place, so
+    that it meets the pairs in the order in which a search would meet them.
     """
+    pairs = state.pairs
     count = 0
-    for row in range(len(pairs)):
-        if pairs[row].slot != NONE and pairs[row].last == NONE:
-            out[count] = row
-            count += 1
-            slot_rows[pairs[row].slot + 1] += 1
-            vehicle_rows[pairs[row].vehicle + 1] += 1
+    free = 0
+    while pairs[free].slot != NONE:
+        free += 1
+    for step in range(free + 1, free + len(pairs)):
+        place = step if step < len(pairs) else step - len(pairs)
+        ahead = min(place + AHEAD, len(pairs) - 1)
+        prefetch(state.entries, pairs[ahead].last, 0)
+        prefetch(tally.slots, pairs[ahead].slot + 1, 0)
+        this = pairs[place]
+        if this.slot == NONE:
+            continue
+        if this.last != NONE:
+            _move_back(state, place)
+            continue
+        has_bound = this.time[ReportKind.BOUND] >= oldest_remembered(now, ReportKind.BOUND)
+        has_value = this.time[ReportKind.VALUE] >= oldest_remembered(now, ReportKind.VALUE)
+        tally.kinds[ReportKind.BOUND] += has_bound
+        tally.kinds[ReportKind.VALUE] += has_value
+        if not has_bound and not has_value:
+            _mark_returned(state, this.slot, names[this.vehicle].key)
+        tally.slots[this.slot + 1] += 1
+        tally.vehicles[this.vehicle + 1] += 1
+        out[count] = this
+        count += 1
+        _free_place(pairs, place)
+    state.used[PAIRS] -= count
     return count
+
+
+@refcount_free_inlined
+def _move_back(state: State, place: int) -> None:
+    """Move a pair record from a place of the hash table `State.pairs` to the first free place from
+    its first place on, if this is another place.
+    """
+    pairs = state.pairs
+    to = first_place(pairs, pairs[place].slot, pairs[place].vehicle)
+    while to != place and pairs[to].slot != NONE:
+        to = to + 1 if to + 1 < len(pairs) else 0
+    if to == place:
+        return
+    pairs[to] = pairs[place]
+    _free_place(pairs, place)
+    entry = int(pairs[to].last)
+    while entry != NONE:
+        state.entries[entry].pair = to
+        entry = int(state.entries[entry].before)
+
+
+@refcount_free_inlined
+def _free_place(pairs: RecordArray, place: int) -> None:
+    this = pairs[place]
+    this.slot = NONE
+    this.vehicle = 0
+    this.last = 0
+    this.waiting = 0
+    this.std = 0
+    for kind in range(2):
+        this.time[kind] = 0
+        this.mean[kind] = 0
+        this.spent[kind] = 0
 
 
 @refcount_free_locked
@@ -244,63 +334,32 @@ def _sort_resting(
     rows: IntArray,
     spare: IntArray,
 ) -> None:
-    """Sort the rows of pairs (k,) by vehicle, and then by slot. Each row is written to the next
-    free place among those of its vehicle, or slot, whose places begin at the given numbers. This
-    takes a third of the time of a sort by comparison. `spare` (k,) is scratch memory.
+    """Write the row numbers of `pairs` (k,) to `rows` (k,), sorted by slot, and then by vehicle.
+    First all rows are sorted by vehicle, then by slot: each row is written to the next free place
+    among those of its vehicle, or slot, whose places begin at the given numbers. This takes a third
+    of the time of a sort by comparison. `spare` (k,) is scratch memory.
     """
     for k in range(len(rows)):
-        this = pairs[rows[k]]
-        place = vehicle_begins[this.vehicle]
-        vehicle_begins[this.vehicle] += 1
-        spare[place] = np.int64(this.slot) << 32 | rows[k]
+        place = vehicle_begins[pairs[k].vehicle]
+        vehicle_begins[pairs[k].vehicle] += 1
+        spare[place] = np.int64(pairs[k].slot) << 32 | k
     for k in range(len(rows)):
         slot = spare[k] >> 32
         rows[slot_begins[slot]] = np.int32(spare[k])
         slot_begins[slot] += 1
 
 
-def count_settling(
-    state: State, names: RecordArray, resting: IntArray, now: int
-) -> tuple[int, int]:
-    """Return the number of reports that must be moved to the settled reports (compact storage), and
-    the number of friction values among them. `resting` (k,) are the rows of the pairs (one vehicle
-    in one slot each) that are moved.
-
-    Only reports that are still remembered at `now` [s] count. If a pair has no such report, record
-    in the cell that the vehicle was already counted there.
-    """
-    kinds = np.zeros(len(ReportKind), np.int64)
-    _count_settling(state, names, resting, now, kinds)
-    return int(kinds.sum()), int(kinds[ReportKind.VALUE])
-
-
-@refcount_free_locked
-def _count_settling(
-    state: State, names: RecordArray, resting: IntArray, now: int, kinds: IntArray
-) -> None:
-    """Count the reports of each kind that must be moved, in `kinds` (2,)."""
-    for k in range(len(resting)):
-        prefetch(state.pairs, resting[min(k + AHEAD, len(resting) - 1)], 0)
-        this = state.pairs[resting[k]]
-        has_bound = this.time[ReportKind.BOUND] >= oldest_remembered(now, ReportKind.BOUND)
-        has_value = this.time[ReportKind.VALUE] >= oldest_remembered(now, ReportKind.VALUE)
-        kinds[ReportKind.BOUND] += has_bound
-        kinds[ReportKind.VALUE] += has_value
-        if not has_bound and not has_value:
-            _mark_returned(state, this.slot, names[this.vehicle].key)
-
-
 @refcount_free_locked
 def insert_reports(
-    state: State, resting: IntArray, now: int, reports: int, values: int, vehicles: int
+    state: State, resting: Resting, now: int, reports: int, values: int, vehicles: int
 ) -> None:
     """Insert the reports of pairs (one vehicle in one slot each) into the sorted arrays of settled
     reports. Reports that are no longer remembered at `now` [s] are left out.
 
-    `resting` (k,) are the rows of the pairs, sorted by slot and vehicle. `reports` is the number of
-    settled reports before the call, and `values` the number of friction values among them. The
-    caller has lengthened the arrays by exactly the number of new reports. Therefore rows are moved
-    in place, from the last to the first. `vehicles` is the number of known vehicles.
+    `reports` is the number of settled reports before the call, and `values` the number of friction
+    values among them. The caller has lengthened the arrays by exactly the number of new reports.
+    Therefore rows are moved in place, from the last to the first. `vehicles` is the number of known
+    vehicles.
     """
     begins = state.settled_begin
     keys = state.settled_keys
@@ -308,14 +367,15 @@ def insert_reports(
     value = values
     to = len(keys)
     to_value = len(state.settled_std)
-    k = len(resting) - 1
+    records, order, _ = resting
+    k = len(order) - 1
     for slot in range(len(begins) - 2, -1, -1):
         begin = _to_int(begins[slot, 0])
         begins[slot + 1, 0] = to
         begins[slot + 1, 1] = to_value
-        while k >= 0 and state.pairs[resting[k]].slot == slot:
-            prefetch(state.pairs, resting[max(k - AHEAD, 0)], 0)
-            this = state.pairs[resting[k]]
+        while k >= 0 and records[order[k]].slot == slot:
+            prefetch(records, order[max(k - AHEAD, 0)], 0)
+            this = records[order[k]]
             k -= 1
             for kind in (ReportKind.VALUE, ReportKind.BOUND):
                 if this.time[kind] < oldest_remembered(now, kind):

@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.store import store
 from fleet_service.fusion.store.growth import settle_pairs
-from fleet_service.fusion.store.records import NONE, PAIRS, REPORTERS_USED, VEHICLE, Side
-from fleet_service.fusion.store.table import PLACES_MOST, fill_table, rows_of
+from fleet_service.fusion.store.records import (
+    ENTRY,
+    NONE,
+    PAIRS,
+    REPORTERS_USED,
+    VEHICLE,
+    Side,
+)
+from fleet_service.fusion.store.settled import take_resting
+from fleet_service.fusion.store.table import LEAST, PLACES_MOST, fill_table, pair_place, rows_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
@@ -50,6 +58,34 @@ def test_pairs_keep_their_share_and_are_found_after_every_growth() -> None:
     assert state.used[PAIRS] == vehicles <= PLACES_MOST * len(state.pairs)
     assert fusion.live.vehicles[0] == vehicles
     assert fusion.live.visits[0] == 3 * vehicles
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pairs_that_stay_are_found_after_others_settle(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(PLACES_MOST * LEAST)
+    known = rng.permutation(50 * count)[:count]
+    entries = np.zeros(count, ENTRY)
+    entries["before"] = NONE
+    state = Fusion(LATENESS_S).store.state._replace(entries=entries)
+    waits = rng.random(count) < 0.5
+    for row, (slot, vehicle) in enumerate(zip(known // count, known % count, strict=True)):
+        place = pair_place(state.pairs, slot, vehicle)
+        state.pairs[place]["slot"] = slot
+        state.pairs[place]["vehicle"] = vehicle
+        state.pairs[place]["last"] = row if waits[row] else NONE
+        entries[row]["pair"] = place
+    state.used[PAIRS] = count
+    resting = take_resting(state, np.zeros(count, VEHICLE), 50, 1)
+    settled = resting.records[resting.order]
+    np.testing.assert_array_equal(
+        np.int64(settled["slot"]) * count + settled["vehicle"], np.sort(known[~waits])
+    )
+    assert state.used[PAIRS] == waits.sum() == (state.pairs["slot"] != NONE).sum()
+    for row in np.flatnonzero(waits).tolist():
+        place = pair_place(state.pairs, known[row] // count, known[row] % count)
+        assert state.pairs[place]["last"] == row
+        assert entries[row]["pair"] == place
 
 
 def test_reporters_and_sources_of_hours_ago_are_dropped_and_reused() -> None:
