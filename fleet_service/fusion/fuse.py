@@ -150,15 +150,14 @@ class Fusion(BeliefMap):
         """
         n = len(o.time)
         used = np.zeros(n, np.float32)
-        limited = np.zeros(n, np.int8)
+        limited = np.where(o.limited < 0, np.int8(UNLIMITED), np.int8(0))
         if before is None:
             checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
             late = o.time < checkpoint
-            late_by = np.where(
-                late & (checkpoint - o.time <= LATE_MOST_NS),
-                fused_at(o.time, checkpoint) - o.time,
-                0,
-            )
+            late_by = np.zeros(n, np.int64)
+            rows = np.flatnonzero(late)
+            rows = rows[checkpoint - o.time[rows] <= LATE_MOST_NS]
+            late_by[rows] = fused_at(o.time[rows], checkpoint) - o.time[rows]
         else:
             late = before.late
             late_by = before.late_by
@@ -173,10 +172,8 @@ class Fusion(BeliefMap):
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
             votes = self._vote_weights_at(e)
-            claimed = np.where(votes.may_support_alerts(vehicle[rows]), HEEDED, CLAIMED)
-            limited[rows] = np.where(
-                o.limited[rows] > 0, claimed, UNLIMITED * (o.limited[rows] < 0)
-            )
+            flagged = rows[o.limited[rows] > 0]
+            limited[flagged] = np.where(votes.may_support_alerts(vehicle[flagged]), HEEDED, CLAIMED)
             if before is None:
                 used[rows] = votes.weights(vehicle[rows])
             else:
@@ -190,7 +187,8 @@ class Fusion(BeliefMap):
             left = left | left_out
         used[left] = 0.0
         late_by = np.where(left, 0, late_by)
-        return Updated(late, late_by, used, distinct_values(np.concatenate(touched)))
+        changed = np.concatenate(touched).astype(np.int32)  # NumPy sorts these twice as fast
+        return Updated(late, late_by, used, distinct_values(changed).astype(np.int64))
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit

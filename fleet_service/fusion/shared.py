@@ -87,11 +87,14 @@ def shared_parts(reported: Float32Array) -> ByteArray:
     value (n, 3: mean, standard deviation, P(slippery)). The result (n,) is in units of 1/SHARED; 0
     for a report that is only a lower bound of friction.
     """
-    mean = np.nan_to_num(reported[:, 0], nan=1.0)
-    std = np.nan_to_num(reported[:, 1])
+    out = np.zeros(len(reported), np.uint8)
+    rows = np.flatnonzero(~np.isnan(reported[:, 1]))
+    mean = np.nan_to_num(reported[rows, 0], nan=1.0)
+    std = np.nan_to_num(reported[rows, 1])
     stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
     hidden = c.SHARED_PART * np.clip(stated, 0.0, 0.25)
-    return np.asarray((np.clip(np.sqrt(hidden), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
+    out[rows] = np.clip(np.sqrt(hidden), 0.0, STATED[-1]) * SHARED
+    return out
 
 
 class Shape(NamedTuple):
