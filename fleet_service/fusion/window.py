@@ -218,7 +218,7 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, a
         prefetch(live.belief, slot, 0)
         pair = first_place(state.pairs, slot, arrivals.vehicle[votes.row[step]])
         prefetch(state.pairs, pair, 0)
-        prefetch(state.pairs, pair, 1)
+        prefetch(state.pairs, pair + 1, 0)
         entry = state.free_entries[used[FREE_ENTRIES] - 1 - ahead]
         prefetch(state.entries, entry, 0)
         prefetch(state.entries, entry, 1)
@@ -339,6 +339,7 @@ def _prefetch_due(state: State, due_windows: IntArray, step: int) -> None:
     if 0 <= step - AHEAD < count:
         window = due_windows[step - AHEAD]
         prefetch(entries, windows[window].head, 0)
+        prefetch(entries, windows[window].head, 1)
         prefetch(entries, windows[window].tail, 0)
         prefetch(live.cells, windows[window].slot, 0)
     if 0 <= step - 2 * AHEAD < count:
@@ -348,7 +349,6 @@ def _prefetch_due(state: State, due_windows: IntArray, step: int) -> None:
             prefetch(live.reporters, live.cells[windows[window].slot].reporters, 0)
             prefetch(live.reporters, live.cells[windows[window].slot].reporters, 1)
         if windows[window].tail != windows[window].head:
-            prefetch(entries, windows[window].head, 1)
             prefetch(entries, entries[windows[window].head].following, 0)
             prefetch(base.cells, window, 0)
             prefetch(base.belief, window, 0)
@@ -356,6 +356,17 @@ def _prefetch_due(state: State, due_windows: IntArray, step: int) -> None:
         window = due_windows[step - 3 * AHEAD]
         if windows[window].tail != windows[window].head:
             prefetch(state.pairs, entries[entries[windows[window].head].following].pair, 0)
+
+
+@refcount_free_inlined
+def _prefetch_following(state: State, entry: int) -> None:
+    """Prefetch the memory that `commit_windows` will access for the observation in row `entry`, and
+    for the one that follows in its window.
+    """
+    entries = state.entries
+    prefetch(state.pairs, entries[entry].pair, 0)
+    prefetch(entries, entries[entry].following, 0)
+    prefetch(entries, entries[entry].following, 1)
 
 
 @refcount_free
@@ -380,6 +391,9 @@ def _commit_windows(
         whole = entries[windows[window].tail].time < before
         entry = int(windows[window].head)
         while entry != NONE and entries[entry].time < before:
+            following = int(entries[entry].following)
+            if following != NONE:
+                _prefetch_following(state, following)
             if not whole:
                 load_likelihood(entries, entry, scratch)
                 place = CellPlace(window, window)
@@ -394,7 +408,7 @@ def _commit_windows(
             commit_pair(entries, state.pairs, entry)
             state.free_entries[state.used[FREE_ENTRIES]] = entry
             state.used[FREE_ENTRIES] += 1
-            entry = int(entries[entry].following)
+            entry = following
         _shorten_window(state, slot, window, entry)
 
 
