@@ -156,8 +156,9 @@ class Fusion(BeliefMap):
             late = o.time < checkpoint
             late_by = np.zeros(n, np.int64)
             rows = np.flatnonzero(late)
-            rows = rows[checkpoint - o.time[rows] <= LATE_MOST_NS]
-            late_by[rows] = fused_at(o.time[rows], checkpoint) - o.time[rows]
+            if len(rows):
+                rows = rows[checkpoint - o.time[rows] <= LATE_MOST_NS]
+                late_by[rows] = fused_at(o.time[rows], checkpoint) - o.time[rows]
         else:
             late = before.late
             late_by = before.late_by
@@ -286,7 +287,7 @@ def _make_arrivals(
         weight=weight,
         evidence=o.evidence,
         reported=o.reported,
-        used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
+        used=(np.minimum(np.maximum(o.used, 0.0), 2.5) * USED).astype(np.uint8),
         shared=shared_parts(o.reported),
         manoeuvre=o.manoeuvre,
         late=old,

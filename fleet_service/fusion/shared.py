@@ -35,6 +35,7 @@ Legend
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -52,7 +53,7 @@ from fleet_service.fusion.store.records import (
 )
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
-from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.jit import refcount_free, refcount_free_inlined, refcount_free_locked
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS, Z_95
 
@@ -87,14 +88,26 @@ def shared_parts(reported: Float32Array) -> ByteArray:
     value (n, 3: mean, standard deviation, P(slippery)). The result (n,) is in units of 1/SHARED; 0
     for a report that is only a lower bound of friction.
     """
-    out = np.zeros(len(reported), np.uint8)
-    rows = np.flatnonzero(~np.isnan(reported[:, 1]))
-    mean = np.nan_to_num(reported[rows, 0], nan=1.0)
-    std = np.nan_to_num(reported[rows, 1])
-    stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
-    hidden = c.SHARED_PART * np.clip(stated, 0.0, 0.25)
-    out[rows] = np.clip(np.sqrt(hidden), 0.0, STATED[-1]) * SHARED
+    out = np.empty(len(reported), np.uint8)
+    _write_shared_parts(reported, out)
     return out
+
+
+@refcount_free_locked
+def _write_shared_parts(reported: Float32Array, out: ByteArray) -> None:
+    for row in range(len(reported)):
+        mean = reported[row, 0]
+        std = reported[row, 1]
+        if math.isnan(std):
+            out[row] = 0
+            continue
+        if math.isnan(mean):
+            mean = np.float32(1.0)
+        relative = std / max(mean, np.float32(mugrid.LOWER))
+        stated = relative * relative - np.float32(c.BIAS_RELATIVE**2)
+        hidden = np.float32(c.SHARED_PART) * min(max(stated, np.float32(0.0)), np.float32(0.25))
+        share = min(np.float32(math.sqrt(hidden)), np.float32(STATED[-1]))
+        out[row] = np.uint8(share * np.float32(SHARED))
 
 
 class Shape(NamedTuple):

@@ -4,9 +4,10 @@ tables and pools that grow. Compiled code receives all arrays as one `State`.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
@@ -314,7 +315,7 @@ def no_peers(vehicles: int) -> RecordArray:
     return peers
 
 
-def distinct_values(values: IntArray) -> IntArray:
+def distinct_values(values: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
     """Return the distinct values of an array (n,) in ascending order. Sorting is several times
     faster than a set here.
     """
