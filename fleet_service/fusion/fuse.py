@@ -287,7 +287,7 @@ def _make_arrivals(
         weight=weight,
         evidence=o.evidence,
         reported=o.reported,
-        used=(np.minimum(np.maximum(o.used, 0.0), 2.5) * USED).astype(np.uint8),
+        used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
         shared=shared_parts(o.reported),
         manoeuvre=o.manoeuvre,
         late=old,
