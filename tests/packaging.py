@@ -2,7 +2,8 @@
 outside the source tree.
 
 The wheel is tried with each Python version of VERSIONS that this machine has, on the PATH or in
-pyenv. Missing versions are printed. `--python` adds interpreters.
+pyenv, with as many at the same time as there are cores. Missing versions are printed. `--python`
+adds interpreters.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tests.platform_wheel import build_packages
@@ -120,8 +122,9 @@ def main() -> int:
         raise SystemExit(f"none of {', '.join(VERSIONS)} works here")
     with tempfile.TemporaryDirectory() as folder:
         wheel = build_packages(Path(folder) / "dist")
-        for number, python in enumerate(pythons):
-            install_and_use(python, wheel, Path(folder) / f"use{number}")
+        places = [Path(folder) / f"use{number}" for number in range(len(pythons))]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(install_and_use, pythons, [wheel] * len(pythons), places))
     return 0
 
 
@@ -198,7 +201,7 @@ def run_command(command: list[str | Path], folder: Path) -> None:
     line = " ".join(
         Path(str(part)).name if "/" in str(part) else str(part) for part in command
     ).split("\n")[0]
-    print(f"{time.monotonic() - began:6.1f} s  {line[:100]}", flush=True)
+    print(f"{time.monotonic() - began:6.1f} s  {folder.name}: {line[:100]}", flush=True)
     if done.returncode != 0:
         raise SystemExit(f"{done.stdout}\n{done.stderr}")
 

@@ -14,10 +14,12 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from edge_agent.app.native_library import LIBRARY as AGENT
 from fleet_service.app.native_library import LIBRARY as SERVICE
+from schemas.runtime.kernel_library import KernelLibrary
 from tests.structure import ROOT
 
 
@@ -37,9 +39,13 @@ def build_packages(out: Path) -> Path:
             packed.extractall(folder, filter="data")
         (source,) = Path(folder).iterdir()
         own = os.environ | {"PYTHONPATH": str(source)}
-        for library in (AGENT, SERVICE):
-            build_kernels = [sys.executable, "-m", library.builder]
-            subprocess.run(build_kernels, cwd=source, env=own, check=True)
+
+        def build_kernels(library: KernelLibrary) -> None:
+            command = [sys.executable, "-m", library.builder]
+            subprocess.run(command, cwd=source, env=own, check=True)
+
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(build_kernels, (AGENT, SERVICE)))
         tag = platform_tag(b"".join(path.read_bytes() for path in source.rglob("*.so")))
         option = f"--config-setting=--build-option=--plat-name={tag}"
         subprocess.run([*build, "--wheel", option, str(source)], cwd=source, check=True)
