@@ -10,10 +10,10 @@ limit. The report's probability given the friction is therefore
     ln p(report | μ) = ℓ(μ) + ln clip(u/μ, EXCITED_SHARE, 1)     for a value
                        ℓ(μ) + ln(1 - P(value | u/μ))             for a bound
 
-A visit in which the friction changed keeps ℓ, because its parts used different
-shares, and so does a likelihood that excludes nothing. The factor of a value changes the ratio of
-two frictions by 1/EXCITED_SHARE at most, much less than the table shows, because visits to one
-place share their errors.
+A visit in which the friction changed keeps ℓ, because its parts used different shares, and so does
+a likelihood that excludes nothing. The factor of a value changes the ratio of two frictions by at
+most 1/EXCITED_SHARE, much less than the measured shares, because visits to one place share their
+errors.
 
 Legend
     ℓ   log-likelihood of the estimator, at the friction values `mugrid.CENTRES`   (n, 32) [nat]

@@ -36,6 +36,12 @@ def next_cell(cell: int, heading: int) -> int:
 
 
 @refcount_free_inlined
+def heading_on(side: int, sector: int) -> int:
+    """Return the heading sector of the neighbours on one side of a cell; `sector` is its own."""
+    return (sector + 2) % grid.SECTORS if side == ACROSS else sector
+
+
+@refcount_free_inlined
 def step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
     """Return the cell of a neighbour of `cell` on one side. `step` is the number of the neighbour,
     counted from 1, and `sector` is the heading sector.

@@ -34,7 +34,7 @@ v_n·k/k_n if the cell had fewer visits. q falls below 1 if the cell has less th
 without a value does not show grip, so q never lowers P(slippery) below UNSURE. The weights v fade
 with time, so that values from before a change of the road count little.
 
-A *measured* cell also hears measured cells near it, grip included, because somebody tested both: up
+A *measured* cell also hears measured cells near it, grip included, because vehicles tested both: up
 to HEARD_CELLS consecutive cells before it, as many behind it, and one of the other direction, but
 none beyond a border. A cell is measured if vehicles gave values there, and if some friction is
 HEARD_MOST times as probable as in the prior; otherwise its values have faded. The message is
@@ -67,7 +67,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.adjacent import ACROSS, ACROSS_CELLS, BEFORE, BEHIND, next_cell, step_to
+from fleet_service.fusion.adjacent import (
+    ACROSS,
+    ACROSS_CELLS,
+    BEFORE,
+    BEHIND,
+    heading_on,
+    next_cell,
+    step_to,
+)
 from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road, read_slippery
 from fleet_service.fusion.sources import is_border
@@ -223,7 +231,7 @@ def _is_measured(parts: MapParts, asked: Asked, row: int, belief: Bins) -> bool:
 
 @refcount_free_inlined
 def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
-    """Combine the belief about a measured cell with those of measured cells next to it, and write
+    """Combine the belief about a measured cell with those of measured cells near it, and write
     the resulting belief about the road to `out` (32). On entry, `out` is the belief without them;
     its P(slippery) does not change.
     """
@@ -253,25 +261,33 @@ def _hear_side(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> bo
     cell = key // grid.SECTORS
     sector = key % grid.SECTORS
     across = side == ACROSS
-    towards = (sector + 2) % grid.SECTORS if across else sector
+    towards = heading_on(side, sector)
     heard = False
     there = cell
     for step in range(1, (ACROSS_CELLS if across else c.HEARD_CELLS) + 1):
         there = step_to(cell, there, sector, side, step)
         row = find_row(parts.table, cells, there * grid.SECTORS + towards)
-        measured = row != NONE and cells[row].values > 0.0
-        measured = measured and not is_border(parts.live, asked.slot, row, asked.now)
+        measured = row != NONE and _can_hear(parts, asked, row, buffers)
         if measured:
-            _age_belief(parts.live, parts.weather, row, asked.now, buffers.scratch)
             road = buffers.scratch[ScratchRow.BELIEF]
-            measured = _is_measured(parts, asked, row, road)
-            if measured:
-                kept = _KEPT[1 if across else step]
-                _multiply_limited(buffers.product, road, parts.weather.prior[asked.prior], kept)
-                heard = True
+            kept = _KEPT[1 if across else step]
+            _multiply_limited(buffers.product, road, parts.weather.prior[asked.prior], kept)
+            heard = True
         if measured == across:
             break
     return heard
+
+
+@refcount_free_inlined
+def _can_hear(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> bool:
+    """Return True if the cell in row `row` is measured and no border is known between it and the
+    cell that is read. Then its aged belief is in `buffers.scratch`.
+    """
+    live = parts.live
+    if live.cells[row].values <= 0.0 or is_border(live, asked.slot, row, asked.now):
+        return False
+    _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
+    return _is_measured(parts, asked, row, buffers.scratch[ScratchRow.BELIEF])
 
 
 @refcount_free_inlined
@@ -345,7 +361,7 @@ def _choose_message(
     best = NONE
     key = cells[asked.slot].key
     sector = key % grid.SECTORS
-    towards = (sector + 2) % grid.SECTORS if side == ACROSS else sector
+    towards = heading_on(side, sector)
     there = key // grid.SECTORS
     for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
         there = step_to(key // grid.SECTORS, there, sector, side, step)
@@ -404,7 +420,7 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
                     break
                 out[k, 1 + side * c.NEIGHBOURS + step] = row
         cell = key // grid.SECTORS
-        towards = (sector + 2) % grid.SECTORS
+        towards = heading_on(ACROSS, sector)
         for step in range(ACROSS_CELLS):
             there = step_to(cell, cell, sector, ACROSS, step + 1)
             row = find_row(table, live.cells, there * grid.SECTORS + towards)

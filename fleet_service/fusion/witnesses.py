@@ -38,8 +38,9 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return who reported ice on the slippery stretches of road around the slots (one per cell and
-    heading sector) after the times `since` (k,) [ns].
+    """Return when two vehicles had reported ice on the slippery stretches of road around the slots
+    (one per cell and heading sector), and whether ice was reported on both sides. Only reports
+    after the times `since` (k,) [ns] count.
     """
     who, when = _reports_of_ice(fusion, slots, since)
     first, middle, end = (SOURCES * place for place in (1, 1 + NEIGHBOURS, 1 + 2 * NEIGHBOURS))

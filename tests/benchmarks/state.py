@@ -57,8 +57,8 @@ def state() -> list[Figure]:
             cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
     told = (
-        f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} "
-        "ms at the most"
+        f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited at most "
+        f"{1e3 * held:.0f} ms"
     )
     return [
         Figure("bench.state.snapshot_s", took, told, 1),

@@ -320,7 +320,7 @@ def _free_place(pairs: RecordArray, place: int) -> None:
     this.last = 0
     this.waiting = 0
     this.std = 0
-    for kind in range(2):
+    for kind in (ReportKind.BOUND, ReportKind.VALUE):
         this.time[kind] = 0
         this.mean[kind] = 0
         this.spent[kind] = 0
