@@ -25,7 +25,6 @@ LONG: Final = ir.IntType(64)
 INDEX: Final = ir.IntType(32)
 VECTOR: Final = ir.VectorType(DOUBLE, LANES)
 LONG_VECTOR: Final = ir.VectorType(LONG, LANES)
-POINTER_VECTOR: Final = ir.VectorType(ir.PointerType(), LANES)
 BIT_VECTOR: Final = ir.VectorType(ir.IntType(1), LANES)
 ANY_BYTE: Final = 8  # [bytes] alignment of vectors in memory: that of a single number
 INVERSE_BITS: Final = 0x7FDE623822FC16E6
@@ -327,28 +326,59 @@ def type_any(context: Any, mask: Any) -> Any:
     return types.boolean(mask), generate_code
 
 
-def type_gather(context: Any, table: Any, cell: Any) -> Any:
-    """Return the signature and the code generator of the intrinsic `gather`, which returns a vector
-    of values read from `table`. Each lane of the vector `cell` is the index of one value.
+def type_gather_pair(context: Any, table: Any, cell: Any) -> Any:
+    """Return the signature and the code generator of the intrinsic `gather_pair`, which returns two
+    vectors of values read from `table`. Each lane of the vector `cell` is the index of the value in
+    the first vector; the value in the second vector is the next one of the table.
+
+    Each pair is loaded at once, and the pairs are then transposed, because some processors gather
+    single numbers slowly. The indices are converted to 32 bits and moved to the address registers
+    in pairs of 64 bits.
     """
     number = LANES_TYPE if isinstance(cell, LanesType) else types.float64
 
     def generate_code(target: Any, builder: Any, sig: Any, values: Any) -> Any:
         data = target.make_array(sig.args[0])(target, builder, values[0]).data
         if number is not LANES_TYPE:
-            return builder.load(builder.gep(data, [builder.fptosi(values[1], LONG)]))
-        places = builder.fptosi(values[1], LONG_VECTOR)
-        offsets = builder.shl(places, _constant(LONG_VECTOR, 3))
-        begin = spread_value(builder, builder.ptrtoint(data, LONG), LONG_VECTOR)
-        pointers = builder.inttoptr(builder.add(begin, offsets), POINTER_VECTOR)
-        everywhere = ir.Constant(BIT_VECTOR, [ir.IntType(1)(1)] * LANES)
-        kind = ir.FunctionType(VECTOR, [POINTER_VECTOR, INDEX, BIT_VECTOR, VECTOR])
-        name = f"llvm.masked.gather.v{LANES}f64.v{LANES}p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        unused = ir.Constant(VECTOR, ir.Undefined)
-        return builder.call(function, [pointers, INDEX(ANY_BYTE), everywhere, unused])
+            place = builder.fptosi(values[1], LONG)
+            parts = [
+                builder.load(builder.gep(data, [builder.add(place, LONG(k))])) for k in range(2)
+            ]
+            return target.make_tuple(builder, sig.return_type, parts)
+        places = builder.fptosi(values[1], ir.VectorType(INDEX, LANES))
+        halves = builder.bitcast(places, ir.VectorType(LONG, LANES // 2))
+        pair = ir.VectorType(DOUBLE, 2)
+        pairs = []
+        for lane in range(LANES):
+            both = builder.extract_element(halves, INDEX(lane // 2))
+            shift = LONG(32 * (1 - lane % 2))
+            place = builder.lshr(builder.shl(both, shift), LONG(32))
+            start = builder.gep(data, [place])
+            pairs.append(builder.load(builder.bitcast(start, pair.as_pointer()), align=ANY_BYTE))
+        even = _join_vectors(builder, pairs[0::2])
+        odd = _join_vectors(builder, pairs[1::2])
+        parts = []
+        for k in range(2):
+            mask = [INDEX(k + 2 * (lane // 2) + LANES * (lane % 2)) for lane in range(LANES)]
+            kind = ir.VectorType(INDEX, LANES)
+            parts.append(builder.shuffle_vector(even, odd, ir.Constant(kind, mask)))
+        return target.make_tuple(builder, sig.return_type, parts)
 
-    return number(table, number), generate_code
+    return types.UniTuple(number, 2)(table, cell), generate_code
+
+
+def _join_vectors(builder: Any, parts: list[Any]) -> Any:
+    """Generate code that joins vectors of equal length to one vector; return its LLVM value. The
+    number of vectors must be a power of two.
+    """
+    while len(parts) > 1:
+        width = 2 * parts[0].type.count
+        mask = ir.Constant(ir.VectorType(INDEX, width), [INDEX(k) for k in range(width)])
+        parts = [
+            builder.shuffle_vector(first, second, mask)
+            for first, second in zip(parts[0::2], parts[1::2], strict=True)
+        ]
+    return parts[0]
 
 
 def _constant(long: Any, value: int) -> Any:

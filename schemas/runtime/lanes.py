@@ -40,8 +40,11 @@ select = cast(Callable[[bool, float, float], float], intrinsic_of("type_select")
 any_lane = cast(Callable[[bool], bool], intrinsic_of("type_any"))
 sum_lanes = cast(Function, intrinsic_of("type_sum"))
 largest_lane = cast(Function, intrinsic_of("type_largest"))
-# gather(table, cell): the elements of a table at integer indices. The indices must lie inside it.
-gather = cast(Callable[[FloatArray, float], float], intrinsic_of("type_gather"))
+# gather_pair(table, cell): the elements of a table at integer indices, and the elements after them.
+# All must lie inside the table.
+gather_pair = cast(
+    Callable[[FloatArray, float], tuple[float, float]], intrinsic_of("type_gather_pair")
+)
 floor = cast(Function, intrinsic_of("type_floor"))
 # power_of_two(k): 2^k for an integer k. exponent_of(x): the integer k with 2^k <= x < 2^(k+1), for
 # x > 0.

@@ -16,7 +16,7 @@ from schemas.runtime.lanes import (
     any_lane,
     exp_lanes,
     floor,
-    gather,
+    gather_pair,
     inverse_of,
     inverse_root_of,
     lanes_at,
@@ -86,7 +86,9 @@ def run_inverses(x: FloatArray, inverses: FloatArray, roots: FloatArray) -> None
 
 @nogil
 def read_table(table: FloatArray, places: FloatArray, out: FloatArray) -> None:
-    put_lanes(out, 0, gather(table, lanes_at(places, 0)))
+    first, second = gather_pair(table, lanes_at(places, 0))
+    put_lanes(out, 0, first)
+    put_lanes(out, 1, second)
 
 
 @nogil
@@ -158,10 +160,11 @@ def test_exponential_ends_at_its_limits() -> None:
 
 def test_lanes_are_read_from_a_table_and_reduced() -> None:
     table = np.arange(20.0) ** 2
-    places = np.array([[0.0, 3.0, 19.0, 7.0, 7.0, 1.0, 2.0, 8.0]])
-    out = np.empty_like(places)
+    places = np.array([[0.0, 3.0, 18.0, 7.0, 7.0, 1.0, 2.0, 8.0]])
+    out = np.empty((2, LANES))
     read_table(table, places, out)
-    assert np.array_equal(out, places**2)
+    assert np.array_equal(out[:1], places**2)
+    assert np.array_equal(out[1:], (places + 1.0) ** 2)
     assert reduce_lanes(np.arange(1.0, 9.0)[None]) == (36.0, 8.0, True, False)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
-from schemas.runtime.lanes import any_lane, floor, gather, inverse_root_of, select
+from schemas.runtime.lanes import any_lane, floor, gather_pair, inverse_root_of, select
 
 # Number of cells of a table. Linear interpolation in a cell errs by less than 1e-6 of the force.
 CELLS: Final = 1024
@@ -98,8 +98,8 @@ def interpolate_table(table: FloatArray, place: float) -> float:
     cells: int = table.shape[0] - 1
     scaled = place * cells
     cell = min(floor(scaled), cells - 1.0)
-    first = gather(table, cell)
-    return first + (scaled - cell) * (gather(table, cell + 1.0) - first)
+    first, second = gather_pair(table, cell)
+    return first + (scaled - cell) * (second - first)
 
 
 @inlined
