@@ -137,7 +137,7 @@ def _absorb_votes(
     waiting = 0
     for step in range(len(votes.row) + 3 * AHEAD):
         k = step - 3 * AHEAD
-        _prefetch_votes(state, arrivals, votes, step, step - max(k, 0))
+        _prefetch_votes(state, arrivals, votes, step, step - 2 * AHEAD - max(k, 0))
         if k < 0:
             continue
         row = votes.row[k]
@@ -199,10 +199,11 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
 
 @refcount_free_inlined
 def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, ahead: int) -> None:
-    """Prefetch the memory that later votes will access: first the rows whose numbers are known, for
-    the vote in row `step` of `votes`. Rows whose numbers must be read from memory follow for the
-    vote AHEAD rows before it, and the last entry of its window for the vote 2·AHEAD rows before it.
-    `ahead` is the number of votes between the present one and the vote in row `step`.
+    """Prefetch the memory that later votes will access: for the vote in row `step` of `votes` the
+    cell and the place of its settled reports, for the vote AHEAD rows before it the rows whose
+    numbers these contain, and for the vote 2·AHEAD rows before it all other rows. The last are most
+    of the memory, and the processor's first-level cache cannot hold them for more votes.
+    `ahead` is the number of votes between the present one and the vote in row `step` - 2·AHEAD.
 
     The memory accesses of later votes then overlap with the work on the present vote. The code uses
     `max` and `min` instead of branches on the values that it loads. A processor that mispredicts a
@@ -215,18 +216,7 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, a
     if step < len(votes.row):
         slot = votes.slot[step]
         prefetch(live.cells, slot, 0)
-        prefetch(live.belief, slot, 0)
-        pair = first_place(state.pairs, slot, arrivals.vehicle[votes.row[step]])
-        prefetch(state.pairs, pair, 0)
-        prefetch(state.pairs, pair + 1, 0)
-        entry = state.free_entries[used[FREE_ENTRIES] - 1 - ahead]
-        prefetch(state.entries, entry, 0)
-        prefetch(state.entries, entry, 1)
         prefetch(state.settled_begin, slot, 0)
-        window = state.free_windows[used[FREE_WINDOWS] - 1 - ahead]
-        prefetch(base.cells, window, 0)
-        prefetch(base.belief, window, 0)
-        prefetch(windows, window, 0)
     k = step - AHEAD
     if 0 <= k < len(votes.row):
         prefetch(windows, max(live.cells[votes.slot[k]].window, 0), 0)
@@ -240,7 +230,19 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, a
             prefetch(state.settled_keys, row + 8, 0)
     k = step - 2 * AHEAD
     if 0 <= k < len(votes.row):
-        prefetch(state.entries, windows[max(live.cells[votes.slot[k]].window, 0)].tail, 0)
+        slot = votes.slot[k]
+        prefetch(state.entries, windows[max(live.cells[slot].window, 0)].tail, 0)
+        prefetch(live.belief, slot, 0)
+        pair = first_place(state.pairs, slot, arrivals.vehicle[votes.row[k]])
+        prefetch(state.pairs, pair, 0)
+        prefetch(state.pairs, pair + 1, 0)
+        entry = state.free_entries[used[FREE_ENTRIES] - 1 - ahead]
+        prefetch(state.entries, entry, 0)
+        prefetch(state.entries, entry, 1)
+        window = state.free_windows[used[FREE_WINDOWS] - 1 - ahead]
+        prefetch(base.cells, window, 0)
+        prefetch(base.belief, window, 0)
+        prefetch(windows, window, 0)
 
 
 @refcount_free_inlined
