@@ -62,12 +62,12 @@ def grow_windows(state: State, most: int) -> State:
     return state._replace(windows=windows, base=base, free_windows=free)
 
 
-def grow_pairs(state: State, most: int) -> State:
-    """Return the fusion's state with room for at least `most` pairs in its hash table
-    `State.pairs`. A pair is the record of one vehicle in one slot (cell and heading sector) in
-    which the vehicle has reported recently.
+def resize_pairs(state: State, places: int) -> State:
+    """Return the fusion's state with `places` places in its hash table `State.pairs`, which must be
+    more than the pairs in use. A pair is the record of one vehicle in one slot (cell and heading
+    sector) in which the vehicle has reported recently.
     """
-    new = no_pairs(places_for(max(int(state.used[PAIRS]), most)))
+    new = no_pairs(places)
     move_pairs(state.entries, state.pairs, new)
     return state._replace(pairs=new)
 
@@ -82,7 +82,7 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
 
     `names` (V,) are the records of the vehicles, and `size` is the number of slots in use.
     """
-    most = int(state.used[PAIRS])
+    places = places_for(int(state.used[PAIRS]))
     reports, values = drop_reports(state, names, now)
     begins = np.empty((size + 1, 2), np.uint32)
     begins[: len(state.settled_begin)] = state.settled_begin
@@ -96,7 +96,7 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     state.settled_std.resize(values + more_values, refcheck=False)
     insert_reports(state, resting, now, reports, values, len(names))
     # The table usually keeps its size, because as many pairs will follow.
-    return grow_pairs(state, most) if 2 * places_for(most) < len(state.pairs) else state
+    return resize_pairs(state, places) if 2 * places < len(state.pairs) else state
 
 
 def rebuild_reporters(state: State, size: int, least: int) -> State:

@@ -13,11 +13,11 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
 from fleet_service.fusion.store.growth import (
     grow_entries,
-    grow_pairs,
     grow_rows,
     grow_windows,
     no_pairs,
     rebuild_reporters,
+    resize_pairs,
     settle_pairs,
 )
 from fleet_service.fusion.store.records import (
@@ -41,6 +41,7 @@ from fleet_service.fusion.store.table import (
     LEAST,
     assign_rows,
     is_full,
+    places_for,
     rows_of,
     slots_for,
     table_of,
@@ -218,8 +219,10 @@ class Store:
             self.state = self.state._replace(
                 live=live._replace(reporters=grow_rows(live.reporters, most))
             )
-        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs)):
-            self.state = grow_pairs(self.state, int(used[PAIRS]) + rows)
+        pairs = int(used[PAIRS]) + rows
+        if is_full(pairs, len(self.state.pairs)):
+            places = max(places_for(pairs), 2 * len(self.state.pairs))
+            self.state = resize_pairs(self.state, places)
 
     def forget(self, checkpoint_s: int) -> None:
         """Delete old data and move inactive data to compact storage. `checkpoint_s` [s] is the time
@@ -276,7 +279,7 @@ class Store:
             pointing[used] = place[pointing[used]]
         self.size = len(stay)
         self._slots = table_of(cells, self.size, self.size)
-        self.state = grow_pairs(self.state, 0)
+        self.state = resize_pairs(self.state, places_for(int(self.state.used[PAIRS])))
         return place
 
 
