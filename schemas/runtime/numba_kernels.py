@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
 
+import llvmlite.binding as llvm  # type: ignore[import-untyped]
 import numba
 from numba.core import event, types
 from numba.core.caching import FunctionCache
@@ -17,6 +18,11 @@ from numba.extending import typeof_impl
 
 from schemas.runtime import progress_messages
 from schemas.runtime.native_kernels import NativeIntrinsic, NativeKernel
+from schemas.runtime.records import LANES
+
+# LLVM turns a loop into vector instructions only if it has not unrolled the loop before, so a loop
+# of four vectors or more must not be unrolled completely.
+llvm.set_option("gripmap", f"-unroll-full-max-count={4 * LANES - 1}")
 
 P = ParamSpec("P")
 R = TypeVar("R")
