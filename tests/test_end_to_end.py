@@ -131,13 +131,15 @@ def slippery_cells(system: System) -> list[dict[str, object]]:
     ]
 
 
-@pytest.mark.xfail(
-    reason="the median drifts up to .39 towards the stop, P(slippery) down to .53", strict=True
-)
 def test_three_braking_cars_tell_ice_within_six_hundredths(system: System) -> None:
     excited = slippery_cells(system)
     assert excited
     assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.06
+
+
+@pytest.mark.xfail(reason="P(slippery) falls to .69 towards the stop", strict=True)
+def test_three_braking_cars_are_sure_of_ice_in_each_cell(system: System) -> None:
+    excited = slippery_cells(system)
     slippery = {
         cell["vehicles"]: float(str(cell["p_slippery"]))
         for cell in sorted(excited, key=_most_slippery_first)

@@ -1,21 +1,28 @@
-"""Tests of the end of a slide, when the belief changes from ice to another road. Only a wheel that
-grips again under load may show that the ice has ended.
+"""Tests of the belief on friction during a slide and at its end. Only a wheel that grips again
+under load may show that the ice has ended. While a wheel slides with the same force, the road stays
+the same.
 """
 
 from __future__ import annotations
 
 from typing import cast
 
+import numpy as np
 import pytest
 
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.estimators.friction_mixture.mixture.mixing import carried_degree
-from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.mixture.mixing import apply_road_change, carried_degree
+from edge_agent.estimators.friction_mixture.state.constants import NODES, Constants
+from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
-from schemas.runtime.records import records
+from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext, Scratch
+from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
+from schemas.runtime.records import put_record, records
 from tests.edge_agent.estimators.drives import drive
 
 SNOW = 0.3
+ICE = 0.25
 # An upper end of the interval below this is a report of a slippery road.
 SLIPPERY = 0.5
 
@@ -38,3 +45,41 @@ def test_snow_stays_reported_between_pulses_of_the_brake() -> None:
     upper = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None]).mu_upper[:, 0]
     slippery = upper < SLIPPERY
     assert slippery[slippery.argmax() :].mean() > 0.99  # .973 if each end of a slide is the snow's
+
+
+@pytest.mark.parametrize(
+    ("slides", "new", "moved"), [(1.0, 0.0, False), (1.0, 1.0, True), (0.0, 0.0, True)]
+)
+def test_road_stays_the_same_while_a_wheel_slides_with_the_same_force(
+    slides: float, new: float, *, moved: bool
+) -> None:
+    context = records(MixtureContext, 1)
+    put_record(context["design"][0], design_of(Memberships(), adaptive=True))
+    memory = records(MixtureMemory, 1)
+    memory["weight"][0, 6] = memory["visit_weight"][0, 6] = 1.0
+    memory["friction_left"]["median"] = memory["friction_right"]["median"] = 0.25
+    memory["slip"]["held"] = slides
+    context["scratch"]["features"]["new"] = new
+    apply_road_change(
+        cast(MixtureMemory, memory[0]),
+        cast(MixtureDesign, context["design"][0]),
+        cast(Scratch, context["scratch"][0]),
+        10.0,
+    )
+    assert (memory["weight"][0, 6] < 0.99) == moved
+    assert memory["weight"][0, :NODES].sum() == pytest.approx(1.0)
+
+
+def test_five_stops_with_sliding_wheels_keep_speed_and_friction() -> None:
+    errors = []
+    medians = []
+    for seed in range(1, 6):
+        t, signals, vehicle = drive("braking", ICE, seed)
+        log, _ = simulate_manoeuvre("braking", mu=ICE, seed=seed, setup=DriveSetup(sensors="mems"))
+        estimates = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+        end = np.searchsorted(t, 7.5)
+        errors.append(estimates.vx[end, 0] - log["true_vx"].to_numpy()[end])
+        medians.append(estimates.mu[end, 0])
+    # .85 m/s and .32 if the mean residual of the cubature points counts in a slide too.
+    assert np.mean(errors) < 0.65
+    assert np.mean(medians) < ICE + 0.03

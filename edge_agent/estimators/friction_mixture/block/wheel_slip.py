@@ -2,9 +2,9 @@
 
 A wheel slides if its speed differs from the other wheels by more than tyre radii explain, or if its
 speed changes faster than the car's. Anti-lock and traction control use the same evidence. The
-filter uses it in three places: as an input of the rule base (`adaptation/rule_base.py`), as an
-explanation of large innovations (`trust.py`), and as a sign that the road has just changed
-(`mixing.py`).
+filter uses it in four places: as an input of the rule base (`adaptation/rule_base.py`), as an
+explanation of large innovations (`trust.py`), as a sign that the road has just changed or is still
+the same (`mixing.py`), and in the measurement update of sliding wheels (`node_filter.py`).
 """
 
 from __future__ import annotations
@@ -47,8 +47,16 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 
 
 @compiled
+def sliding_degree(memory: MixtureMemory) -> float:
+    """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the current block (0.05 s)."""
+    return float(memory.slip.held - memory.slip.ended)
+
+
+@compiled
 def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the block (0.05 s)."""
+    """Compute the fuzzy truth value, 0 to 1, of "a wheel slides" from the wheel speeds of the block
+    (0.05 s).
+    """
     slowest = math.inf
     fastest = -math.inf
     spin = 0.0

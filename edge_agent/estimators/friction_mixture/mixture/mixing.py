@@ -21,6 +21,7 @@ import numpy as np
 
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.common.arrays import copy_vector
+from edge_agent.estimators.friction_mixture.block.wheel_slip import sliding_degree
 from edge_agent.estimators.friction_mixture.node.covariance import mix_states
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
@@ -111,6 +112,8 @@ def apply_road_change(
     count = active_nodes(memory)
     constants = design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
+    # The force of a sliding wheel follows the friction. If it stays the same, so does the road.
+    metres *= 1.0 - sliding_degree(memory) * (1.0 - scratch.features.new)
     hazard = 1.0 - math.exp(-metres * constants.physical.hazard)
     ended = max(memory.slip.ended, memory.slip.axle_ended)
     ended *= carried_degree(memory, constants, scratch.features.demand)

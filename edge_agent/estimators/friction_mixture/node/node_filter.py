@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from edge_agent.estimators.friction_mixture.block.wheel_slip import sliding_degree
 from edge_agent.estimators.friction_mixture.node.covariance import (
     factorize_first,
     predict_covariance,
@@ -98,7 +99,7 @@ def update_nodes(
     put_lanes(node.gained_y, 0, gained_y)
     price = linearize_nodes(memory.row, design, mean, features, node)
     factorize_first(covariance, node.root)
-    spread_points(memory.row, design, mean, features, node)
+    spread_points(memory.row, design, mean, features, node, sliding_degree(memory))
     find_covariances(covariance, node)
     plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
     before = belief_cost(mean, memory.nominal)
@@ -200,13 +201,17 @@ def spread_points(
     mean: FloatArray,
     features: BlockFeatures,
     node: NodeWorkspace,
+    slides: float,
 ) -> None:
     """Evaluate the residuals of the six measurements at the cubature points (sample states around
     the mean) of a group of nodes (friction hypotheses).
 
     The results for each residual are:
 
-    - node.residual: mean over the points.
+    - node.residual: mean over the points. For wheels, the more they slide (`slides`, 0 to 1), the
+      more it stays the residual at the mean state. Beyond its peak the tyre curve is almost flat.
+      The points between there and the peak would raise the mean force in each block, although
+      earlier blocks have excluded these states. The estimated speed would then increase.
     - node.curved: for each column of node.root, change of the residual if the states move by this
       column. node.root is the first columns of the lower-triangular factor of the covariance.
     - node.nonlinearity: variance caused by nonlinearity.
@@ -236,7 +241,9 @@ def spread_points(
         for column in range(CURVED):
             apart = lanes_at(node.middle, (column, r)) - centre
             nonlinearity += apart * apart * (1.0 / CURVED)
-        put_lanes(node.residual, r, centre)
+        at_mean = slides if r < 4 else 0.0
+        residual = at_mean * lanes_at(node.residual, r) + (1.0 - at_mean) * centre
+        put_lanes(node.residual, r, residual)
         put_lanes(node.nonlinearity, r, nonlinearity)
 
 
