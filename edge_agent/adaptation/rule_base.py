@@ -6,7 +6,7 @@ share of the evidence on friction that is used, and the rate at which sensor off
 | mismatch of wheels or axles is in one of five sets | ln R changes by the set's step | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
-| slide, demand, new forces, strain are in certain sets | evidence share changes | Takagi–Sugeno |
+| slide, demand, novelty, strain are in certain sets | evidence share changes | Takagi–Sugeno |
 
 Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1).
 Takagi–Sugeno: each combination of the four inputs' sets has a value of ln(evidence share). The
@@ -15,9 +15,10 @@ result is the mean of these values, weighted by membership. The first row is imp
 `Memberships` contains feet, peaks and consequents.
 
 Mismatch is actual over theoretical innovation variance, minus 1. Demand is the force over load of
-an axle. Forces are new if they differ from their recent averages. Strain is the deviation of the
-estimated states of car and sensors from their prior. The rules are evaluated once per block (0.05 s
-of samples), after the block has ended. Therefore no rule changes its own input within a block.
+an axle. Novelty is the degree to which forces or slips differ from their recent averages. Strain is
+the deviation of the estimated states of car and sensors from their prior. The rules are evaluated
+once per block (0.05 s of samples), after the block has ended. Therefore no rule changes its own
+input within a block.
 
 `plain_rules` is the baseline without fuzzy sets. It replaces the last row by the formula of
 `plain_share`, and switches off the second and third row. The evaluation divides the score with
@@ -57,7 +58,7 @@ class RuleBase(NamedTuple):
     shares: Annotated[FloatArray, 12]
     strained: Annotated[FloatArray, 2]
     by_sets: bool  # True if the fuzzy rules give the share of evidence, False for `plain_share`
-    steady: float  # [1] factor of `plain_share` while the forces equal their recent averages
+    steady: float  # [1] factor of `plain_share` while forces and slips equal their recent averages
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
@@ -86,7 +87,7 @@ def plain_rules(steady: float) -> RuleBase:
     return to their prior at the usual rate, even if innovations are larger than expected.
 
     Args:
-        steady: factor on the share while the forces equal their recent averages [1].
+        steady: factor on the share while forces and slips equal their recent averages [1].
     """
     idle = Memberships(consequents=(0.0, 0.0))
     return rule_base(idle)._replace(by_sets=False, steady=steady)
@@ -131,7 +132,7 @@ def demand_weight(demand: float) -> float:
 def plain_share(steady: float, demand: float, new: float) -> float:
     """Return ln of the share of the evidence on friction from a block (0.05 s) that is used if
     there are no fuzzy rules. `demand` is force over load of an axle [1], `new` the degree (0 to 1)
-    to which the forces differ from their recent averages.
+    to which forces or slips differ from their recent averages.
 
     The share is (steady + (1 - steady)*new)*demand_weight(demand).
     """
@@ -152,7 +153,7 @@ def evidence_share(
         rules: the consequents, `shares` (12,) and `strained` (2,) [nat].
         slides: fuzzy degree of "a wheel slides", 0 to 1.
         demand: the larger force over load of the two axles [1].
-        new: fuzzy degree of "the forces differ from their recent averages", 0 to 1.
+        new: fuzzy degree of "forces or slips differ from their recent averages", 0 to 1.
         strain: deviation of the estimated states of car and sensors from their prior, as chi-square
             over degrees of freedom [1].
     """

@@ -1,5 +1,5 @@
-"""Tests of novelty, the degree (0 to 1) to which the lateral force or slip in a block (some
-samples) differs from its usual value.
+"""Tests of novelty, the degree (0 to 1) to which a force or slip in a block (some samples) differs
+from its usual value.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import Parameter, parameter_table
 from edge_agent.estimators.friction_mixture.mixture.weighing import saturation, update_novelty
+from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, MixtureContext
@@ -53,7 +54,14 @@ class Bend:
         self.memory["weight"][0, np.argmin(np.abs(self.mu - mu))] = 1.0
         self.memory["friction"]["median"] = mu
 
-    def drive_block(self, slip: float, *, force: float = BEND, seconds: float = BLOCK_S) -> float:
+    def drive_block(
+        self,
+        slip: float,
+        *,
+        force: float = BEND,
+        braking_slip: float = 0.0,
+        seconds: float = BLOCK_S,
+    ) -> float:
         """Drive through the bend. Return the degree (0 to 1) to which the last block of samples
         counts as new, that is, differs from the usual.
 
@@ -61,10 +69,14 @@ class Bend:
             slip: lateral slip, expressed as the side force over load of a linear tyre with this
                 slip.
             force: measured side force over load.
+            braking_slip: longitudinal slip of the front wheels, expressed in the same way.
             seconds: duration.
         """
         slope = self.memory["row"][0, Parameter.SLOPE_Y]
         across = -slip / slope * SPEED_M_S
+        slope = self.memory["row"][0, Parameter.SLOPE_X]
+        self.features["rolling"] = SPEED_M_S
+        self.features["rolling"][0, :2] *= 1.0 - braking_slip / slope
         self.features["side"] = force
         self.features["demand"] = abs(force)
         for _ in range(round(seconds / BLOCK_S)):
@@ -92,6 +104,23 @@ def test_nothing_is_new_in_a_steady_bend() -> None:
 @pytest.mark.parametrize(("slip", "force"), [(BEND, 0.25), (0.3, BEND), (0.05, BEND)])
 def test_force_or_slip_alone_is_new(slip: float, force: float) -> None:
     assert Bend().drive_block(slip, force=force) > 0.9
+
+
+def test_braking_slip_alone_is_new_for_about_a_second() -> None:
+    bend = Bend()
+    assert bend.drive_block(BEND, braking_slip=0.15) > 0.9
+    assert bend.drive_block(BEND, braking_slip=0.15, seconds=5.0) < 0.1
+
+
+def test_braking_slip_of_a_bump_is_not_new() -> None:
+    bend = Bend()
+    share = Constants().physical.abrupt_share
+    bend.features["abrupt_noise"][0, :2] = (share * 0.15) ** 2
+    assert bend.drive_block(BEND, braking_slip=0.15) < 0.01
+
+
+def test_a_missing_wheel_speed_is_not_new() -> None:
+    assert Bend().drive_block(BEND, braking_slip=np.nan) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_missing_side_force_is_not_new() -> None:

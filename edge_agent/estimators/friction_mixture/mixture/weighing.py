@@ -2,9 +2,10 @@
 weaken (temper) the likelihoods, and the measurement noise R is adapted.
 
 While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
-the evidence of such blocks counts less. Where a bend becomes icy, the forces stay the same and the
-slip grows. Therefore a change of force or of slip makes the evidence count in full. Where an axle
-has slid and grips again at the same force, the ice has probably ended (`mixing.py`).
+the evidence of such blocks counts less. Where the road becomes icy in a bend or while the driver
+brakes steadily, the forces stay the same and the slip grows. Therefore a change of force or of slip
+makes the evidence count in full. Where an axle has slid and grips again at the same force, the ice
+has probably ended (`mixing.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.block.grip_guard import guard_penalty
+from edge_agent.estimators.friction_mixture.block.wheel_slip import wheel_speed
 from edge_agent.estimators.friction_mixture.mixture.ice_patch import shrink_patches
 from edge_agent.estimators.friction_mixture.mixture.mixing import (
     active_nodes,
@@ -30,7 +32,7 @@ from edge_agent.estimators.friction_mixture.mixture.trust import (
 from edge_agent.estimators.friction_mixture.node.node_filter import predict_nodes, update_nodes
 from edge_agent.estimators.friction_mixture.node.residuals import is_measured
 from edge_agent.estimators.friction_mixture.node.rolling_motion import take_rolling
-from edge_agent.estimators.friction_mixture.state.constants import ROWS, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import ROWS, Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.friction_grid import multiply_likelihood
 from edge_agent.estimators.friction_mixture.state.gap import SLOWEST_M_S
@@ -215,9 +217,16 @@ def update_novelty(
     for r in range(6):
         now = features.force[r] if r < 4 else features.side[r - 4]
         force = max(force, advance_usual(memory.usual_force, r, now, keep))
+    drift = slip_drift(memory, constants, vx)
+    for wheel in range(4):
+        now = wheel_slip(memory, features, vx, wheel)
+        # A bump makes a wheel turn faster for an instant; only a change that lasts is new.
+        sudden = features.abrupt_noise[wheel] / constants.physical.abrupt_share**2
+        noise = math.sqrt(sudden + features.slip_noise[wheel] + drift * drift)
+        slip = max(slip, advance_usual(memory.usual_slip, wheel, now, keep) - noise)
     for axle in range(2):
         now = axle_slip(memory.row, features, vx, vy, axle)
-        slip = max(slip, advance_usual(memory.usual_slip, axle, now, keep))
+        slip = max(slip, advance_usual(memory.usual_slip, 4 + axle, now, keep))
         slides = max(slides, saturation(now, memory.friction.median))
     change = max(force, slip)
     features.new = change**2 / (change**2 + constants.chosen.steady_half**2)
@@ -250,6 +259,30 @@ def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
     apart = abs(now - usual[i])
     usual[i] = keep * usual[i] + (1.0 - keep) * now
     return float(apart)
+
+
+@compiled
+def wheel_slip(memory: MixtureMemory, features: BlockFeatures, vx: float, wheel: int) -> float:
+    """Return the longitudinal slip of a wheel at the speed `vx` [m/s] of the car; NaN without a
+    reading of the wheel speed. Slip is expressed as the force over load [1] that a tyre of constant
+    stiffness would have at this slip.
+    """
+    faster = wheel_speed(memory, features, wheel) - vx
+    return float(memory.row[Parameter.SLOPE_X] * faster / max(abs(vx), SLOWEST_SLIP_M_S))
+
+
+@compiled
+def slip_drift(memory: MixtureMemory, constants: Constants, vx: float) -> float:
+    """Return the standard deviation of the change of slip, within the time of its moving average,
+    that an unknown offset of a_x and the unknown slope of the road explain. The unit is that of
+    `wheel_slip`. `vx` is the speed of the car [m/s].
+    """
+    variance = memory.overall_covariance
+    bias = NodeState.BIAS_X
+    slope = NodeState.SLOPE
+    offset = variance[bias, bias] + variance[slope, slope] + 2.0 * variance[slope, bias]
+    gained = constants.chosen.window * math.sqrt(max(offset, 0.0))
+    return float(memory.row[Parameter.SLOPE_X] * gained / max(abs(vx), SLOWEST_SLIP_M_S))
 
 
 @compiled

@@ -185,8 +185,9 @@ class MixtureMemory:
     last_side: Annotated[FloatArray, 2]  # [1] axles' lateral force over load in the previous block
     usual_rolling: Annotated[FloatArray, 4]  # [m/s] smoothed forward speed according to each wheel
     usual_force: Annotated[FloatArray, 6]  # [1] smoothed force over load of wheels and axles
-    # [1] smoothed lateral slip of the axles, as force over load of a linear tyre
-    usual_slip: Annotated[FloatArray, 2]
+    # [1] smoothed slip of wheels (longitudinal) and axles (lateral), as force over load of a linear
+    # tyre
+    usual_slip: Annotated[FloatArray, 6]
     # [1] smoothed force over load of the axles, along and across
     axle_force: Annotated[FloatArray, 2, 2]
     drive_odds: Annotated[FloatArray, 3]  # probabilities of rear, all-wheel and front drive
