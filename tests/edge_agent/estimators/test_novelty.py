@@ -12,7 +12,7 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import Parameter, parameter_table
 from edge_agent.estimators.friction_mixture.mixture.weighing import saturation, update_novelty
-from edge_agent.estimators.friction_mixture.state.constants import Constants
+from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures, MixtureContext
@@ -116,6 +116,14 @@ def test_braking_slip_of_a_bump_is_not_new() -> None:
     bend = Bend()
     share = Constants().physical.abrupt_share
     bend.features["abrupt_noise"][0, :2] = (share * 0.15) ** 2
+    assert bend.drive_block(BEND, braking_slip=0.15) < 0.01
+
+
+def test_braking_slip_that_an_unknown_slope_explains_is_not_new() -> None:
+    bend = Bend()
+    stiffness = bend.memory["row"][0, Parameter.SLOPE_X]
+    offset = 0.15 * SPEED_M_S / (stiffness * Constants().chosen.window)
+    bend.memory["overall_covariance"][0, NodeState.SLOPE, NodeState.SLOPE] = offset**2
     assert bend.drive_block(BEND, braking_slip=0.15) < 0.01
 
 
