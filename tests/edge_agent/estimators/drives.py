@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
 
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
@@ -13,6 +14,11 @@ from schemas.vehicle import Vehicle
 
 TORQUE = slice(S.TORQUE, S.TORQUE + 4)
 OMEGA = slice(S.OMEGA, S.OMEGA + 4)
+
+
+def signals_of(log: pa.Table) -> FloatArray:
+    """Return the signals (T, 18) of a simulated drive from its table `log`."""
+    return np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
 
 
 @cache
@@ -25,11 +31,7 @@ def drive(
     log, vehicle = simulate_manoeuvre(
         name, mu=mu, seed=seed, duration_s=seconds, setup=DriveSetup(sensors="mems")
     )
-    return (
-        log["t"].to_numpy(),
-        np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float),
-        vehicle,
-    )
+    return log["t"].to_numpy(), signals_of(log), vehicle
 
 
 def join_drives(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,14 @@ from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
-from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, drive_over_joints, join_drives
+from tests.edge_agent.estimators.drives import (
+    OMEGA,
+    TORQUE,
+    drive,
+    drive_over_joints,
+    join_drives,
+    signals_of,
+)
 
 SAMPLES = 400  # samples of the short drives
 FIRST = 100  # first sample that counts in the figures
@@ -184,11 +191,7 @@ def make_drive(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
             duration_s=12.0,
             setup=DriveSetup(sensors="rough", road="hilly"),
         )
-        return (
-            log["t"].to_numpy(),
-            np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float),
-            vehicle,
-        )
+        return log["t"].to_numpy(), signals_of(log), vehicle
     return made_up(name)
 
 

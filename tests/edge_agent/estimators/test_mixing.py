@@ -19,7 +19,7 @@ from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import MixtureContext, Scratch
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.runtime.records import put_record, records
-from tests.edge_agent.estimators.drives import drive
+from tests.edge_agent.estimators.drives import drive, signals_of
 
 SNOW = 0.3
 ICE = 0.25
@@ -74,9 +74,12 @@ def test_five_stops_with_sliding_wheels_keep_speed_and_friction() -> None:
     errors = []
     medians = []
     for seed in range(1, 6):
-        t, signals, vehicle = drive("braking", ICE, seed)
-        log, _ = simulate_manoeuvre("braking", mu=ICE, seed=seed, setup=DriveSetup(sensors="mems"))
-        estimates = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+        log, vehicle = simulate_manoeuvre(
+            "braking", mu=ICE, seed=seed, setup=DriveSetup(sensors="mems")
+        )
+        t = log["t"].to_numpy()
+        bank = bank_of("aco-fckf", [vehicle])
+        estimates = bank.advance(t[:, None], signals_of(log)[:, None])
         end = np.searchsorted(t, 7.5)
         errors.append(estimates.vx[end, 0] - log["true_vx"].to_numpy()[end])
         medians.append(estimates.mu[end, 0])

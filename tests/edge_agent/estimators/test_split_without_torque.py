@@ -11,8 +11,8 @@ from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
 from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, S
-from tests.edge_agent.estimators.drives import TORQUE
+from schemas.signals import S
+from tests.edge_agent.estimators.drives import TORQUE, signals_of
 
 # The estimates between these shares of the stopping time are evaluated.
 FIRST_SIDES = 0.5
@@ -31,7 +31,7 @@ def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
     otherwise on the right.
     """
     log, vehicle = simulate_manoeuvre("split-braking", seed=seed)
-    signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
+    signals = signals_of(log)
     signals[:, TORQUE] = np.nan
     if mirrored:
         signals[:, [S.AY, S.YAW_RATE]] *= -1.0

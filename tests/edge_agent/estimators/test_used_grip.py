@@ -15,9 +15,9 @@ from edge_agent.estimators import Estimates
 from edge_agent.estimators.friction_mixture.block.used_grip import MOST_USED
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, S
+from schemas.signals import S
 from schemas.thresholds import GRAVITY
-from tests.edge_agent.estimators.drives import TORQUE, drive
+from tests.edge_agent.estimators.drives import TORQUE, drive, signals_of
 
 FRONT = slice(S.TORQUE, S.TORQUE + 2)
 REAR = slice(S.TORQUE + 2, S.TORQUE + 4)
@@ -31,7 +31,7 @@ def stop(mu: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     brakes.
     """
     log, _ = simulate_manoeuvre("braking", mu=mu, seed=2, setup=DriveSetup(sensors="mems"))
-    signals = np.stack([log[name].to_numpy() for name in CHANNELS], axis=-1).astype(float)
+    signals = signals_of(log)
     return log["t"].to_numpy(), signals, log["true_vx"].to_numpy()
 
 
