@@ -13,6 +13,8 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.inputs.doctor.drive import wheel_median
+from edge_agent.inputs.doctor.lags import correlate_by_spectra
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -42,7 +44,7 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
         np.stack([np.interp(t, t[good], omega[good, wheel]) for wheel in range(4)], axis=1)
         * vehicle.wheel_radius
     )
-    speed = np.median(rims, axis=1)
+    speed = wheel_median(rims)
     way = np.concatenate([[0.0], np.cumsum(np.maximum(speed[:-1], 0.0) * np.diff(t))])
     way, rows = np.unique(way, return_index=True)
     at = np.arange(0.0, way[-1], STEP_M)
@@ -76,14 +78,10 @@ def _travel_direction(
     among[len(among) - most :] = False
     if among.sum() * STEP_M < LEAST_M or front[among].std() == 0.0 or rear[among].std() == 0.0:
         return 0
-    limits = CLIPPED * front[among].std(), CLIPPED * rear[among].std()
-    front = np.clip(front, -limits[0], limits[0])
-    rear = np.clip(rear, -limits[1], limits[1])
-    lags = np.arange(-most, most + 1)
-    like = np.array(
-        [float(np.corrcoef(front[among], np.roll(rear, -lag)[among])[0, 1]) for lag in lags]
-    )
-    metres = lags * STEP_M
+    front = np.clip(front / front[among].std(), -CLIPPED, CLIPPED)
+    rear = np.clip(rear / rear[among].std(), -CLIPPED, CLIPPED)
+    like = correlate_by_spectra(front, rear, among, most)[::-1]
+    metres = np.arange(-most, most + 1) * STEP_M
     top = int(np.argmax(like))
     near = abs(abs(metres[top]) - wheelbase) <= NEAR_M
     mirrored = like[np.abs(metres + metres[top]) <= NEAR_M].max()

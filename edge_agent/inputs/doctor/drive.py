@@ -14,11 +14,12 @@ Legend
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from schemas.numeric import BoolArray, FloatArray
+from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.signals import CHANNELS, S
 from schemas.thresholds import EARTH_RADIUS_M
 from schemas.vehicle import Vehicle
@@ -38,6 +39,7 @@ SLIP_S: Final = 1.0  # [s] time before and after a moment of slip that is also l
 # Share of the drive's high speed below which the car counts as standing. It does not depend on the
 # unit of the wheel speeds.
 CREEP: Final = 0.15
+FOLLOWED: Final = 0.25  # relative difference allowed between the driven and the steered curvature
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,27 @@ class EvenDrive:
     grips: FloatArray
     yaw_front: FloatArray  # yaw rate from the front wheels alone [rad/s]
     yaw_rear: FloatArray  # yaw rate from the rear wheels alone [rad/s]
+    fast: float  # 95 % quantile of the size of v, 0 if v is unknown
     wheelbase: float
     torque: FloatArray  # sum over all wheels [N·m]
 
-    @property
+    @cached_property
     def v_dot(self) -> FloatArray:
         """Return the car's acceleration (n,) computed from the wheel speeds [m/s²]."""
         return np.asarray(np.gradient(self.v, self.t))
+
+    @cached_property
+    def follows_steering(self) -> BoolArray:
+        """Return a mask (n,) that is True at the samples at which the car turns as its steering
+        predicts, that is, does not slide.
+        """
+        fast = np.maximum(np.abs(self.v), 1.0)
+        wanted = self.wheelbase * self.r / fast
+        steered = np.isfinite(self.delta) & np.isfinite(wanted)
+        return steered & (
+            np.abs(np.tan(np.clip(self.delta, -1.0, 1.0)) - wanted)
+            < FOLLOWED * np.abs(wanted) + 0.01
+        )
 
 
 def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
@@ -80,12 +96,69 @@ def smooth_twice(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
     The result is NaN where x is NaN, or where less than about 40 % of the window is known.
     """
     width = min(max(1, round(seconds * RATE_HZ)), len(x))
+    window = np.ones(width)
     for _ in range(2):
         good = np.isfinite(x)
-        total = np.convolve(np.where(good, x, 0.0), np.ones(width), "same")
-        count = np.convolve(good.astype(float), np.ones(width), "same")
-        x = np.where(good & (count > 0.4 * width), total / np.maximum(count, 1.0), np.nan)
+        total = np.convolve(np.where(good, x, 0.0), window, "same")
+        count = _count_near(good, width)
+        x = np.where(good & (count > 0.4 * width), total / np.maximum(count, 1), np.nan)
     return x
+
+
+def _count_near(good: BoolArray, width: int) -> IntArray:
+    """Return, for each sample, the number of True values of `good` (n,) in a window of `width`
+    samples around it.
+    """
+    before = np.concatenate([np.zeros(width // 2 + 1, np.int64), np.cumsum(good)])
+    before = np.concatenate([before, np.full((width - 1) // 2, before[-1])])
+    return np.asarray(before[width:] - before[:-width])
+
+
+def correlate_series(x: FloatArray, y: FloatArray) -> float:
+    """Return the correlation coefficient of x (n,) and y (n,), or 0 if one of them is constant."""
+    both = np.stack([x, y])
+    both -= both.mean(axis=1, keepdims=True)
+    (xx, xy), (_, yy) = both @ both.T * (1.0 / (len(x) - 1))
+    return float(xy / np.sqrt(xx) / np.sqrt(yy)) if xx > 0.0 and yy > 0.0 else 0.0
+
+
+def wheel_median(wheels: FloatArray) -> FloatArray:
+    """Return the median (n,) of the known values in each row of `wheels` (n, k); NaN if no value of
+    the row is known.
+    """
+    ordered = np.sort(wheels, axis=1)  # NaN is last
+    rows = np.arange(len(wheels))
+    count = wheels.shape[1] - np.isnan(wheels).sum(axis=1)
+    return np.asarray(0.5 * (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]))
+
+
+def median_of_others(wheels: FloatArray) -> FloatArray:
+    """Return, for each of the known `wheels` (n, 4), the median (n, 4) of the other three."""
+    ordered = np.sort(wheels, axis=1)
+    low = ordered[:, 1:2]
+    return np.where(wheels <= low, ordered[:, 2:3], low)
+
+
+class EvenTimes:
+    """Even time steps `at` (n,) [s], at which the readings of a log with the times `t` (T,) [s] are
+    interpolated. Only the first `longest` seconds of the log are used.
+    """
+
+    def __init__(self, t: FloatArray, longest: float = LONGEST_S) -> None:
+        self.t = t
+        self.at = np.arange(t[0], min(t[-1], t[0] + longest), 1.0 / RATE_HZ)
+        self._near = _is_between(t, self.at) if len(t) > 1 else np.zeros(len(self.at), bool)
+
+    def interpolate_channel(self, x: FloatArray) -> FloatArray:
+        """Return the readings x (T,) of a signal at the even time steps (n,); see
+        `interpolate_near`."""
+        if not np.isfinite(x).all():
+            return interpolate_near(self.t, x, self.at)
+        return np.where(self._near, np.interp(self.at, self.t, x), np.nan)
+
+    def smooth_channel(self, x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
+        """Return the readings x (T,) of a signal at the even time steps (n,), smoothed."""
+        return smooth_twice(self.interpolate_channel(x), seconds)
 
 
 def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
@@ -97,27 +170,33 @@ def interpolate_near(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray
     if good.sum() < 2:
         return np.full(len(at), np.nan)
     known = t[good]
-    values = x[good]
+    return np.where(_is_between(known, at), np.interp(at, known, x[good]), np.nan)
+
+
+def _is_between(known: FloatArray, at: FloatArray) -> BoolArray:
+    """Return a mask that is True for the times `at` (n,) [s] between two of the times `known` [s]
+    that are at most JOINED_S apart.
+    """
     place = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
-    near = (known[place] - known[place - 1] <= JOINED_S) & (at >= known[0]) & (at <= known[-1])
-    return np.where(near, np.interp(at, known, values), np.nan)
+    apart = np.diff(known)[place - 1]
+    return np.asarray((apart <= JOINED_S) & (at >= known[0]) & (at <= known[-1]))
 
 
 def over_ground(
-    t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
+    even: EvenTimes, latitude: FloatArray, longitude: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return speed over ground [m/s] and course [rad] at the times `at` (n,) [s]. Both are computed
-    from the positions FIX_S / 2 before and FIX_S / 2 after each time. `latitude` and `longitude`
-    [deg] are the fixes at the times `t` [s].
+    """Return speed over ground [m/s] and course [rad] at the even time steps (n,). Both are
+    computed from the positions FIX_S / 2 before and FIX_S / 2 after each time. `latitude` and
+    `longitude` [deg] are the recorded fixes (T,).
     """
-    north = interpolate_near(t, np.radians(latitude) * EARTH_RADIUS_M, at)
-    east = interpolate_near(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(
+    north = even.interpolate_channel(np.radians(latitude) * EARTH_RADIUS_M)
+    east = even.interpolate_channel(np.radians(longitude) * EARTH_RADIUS_M) * np.cos(
         np.radians(np.nanmean(latitude))
     )
     half = round(0.5 * FIX_S * RATE_HZ)
-    speed = np.full(len(at), np.nan)
-    course = np.full(len(at), np.nan)
-    if len(at) > 2 * half:
+    speed = np.full(len(north), np.nan)
+    course = np.full(len(north), np.nan)
+    if len(north) > 2 * half:
         d_east = east[2 * half :] - east[: -2 * half]
         d_north = north[2 * half :] - north[: -2 * half]
         speed[half:-half] = np.hypot(d_east, d_north) / FIX_S
@@ -137,50 +216,42 @@ def prepare_drive(
         ground: speed measured by the position receiver (T,) [m/s], if it was recorded; it is more
             accurate than the speed computed from positions.
     """
-    last = min(t[-1], t[0] + LONGEST_S)
-    at = np.arange(t[0], last, 1.0 / RATE_HZ)
-
-    def even_column(index: int) -> FloatArray:
-        return smooth_twice(interpolate_near(t, signals[:, index], at))
-
+    even = EvenTimes(t)
+    at = even.at
     wheels = (
-        np.stack([interpolate_near(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1)
+        np.stack([even.interpolate_channel(signals[:, S.OMEGA + i]) for i in range(4)], axis=1)
         * vehicle.wheel_radius
     )
-    some = np.isfinite(wheels).any(axis=1)
-    middle = np.full(len(at), np.nan)
-    middle[some] = np.nanmedian(wheels[some], axis=1)
+    middle = wheel_median(wheels)
     raw = wheels
     wheels = np.where(
         np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels
     )
     rims = np.stack([smooth_twice(wheels[:, i]) for i in range(4)], axis=1)
-    v = smooth_twice(np.where(np.isfinite(middle), middle, np.nan))
+    v = smooth_twice(middle)
     tracks = vehicle.track_front, vehicle.track_rear
     axles = [(rims[:, 2 * k + 1] - rims[:, 2 * k]) / tracks[k] for k in range(2)]
     r_wheels = np.where(np.isfinite(axles[1]), axles[1], axles[0])
-    fast = np.nanpercentile(np.abs(v), 95) if np.isfinite(v).any() else 0.0
+    fast = float(np.nanpercentile(np.abs(v), 95)) if np.isfinite(v).any() else 0.0
     place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
     located = np.isfinite(place[0]).sum() > 5
     nothing = np.full(len(at), np.nan)
-    v_ground, course = over_ground(t, *place, at) if located else (nothing, nothing)
+    v_ground, course = over_ground(even, *place) if located else (nothing, nothing)
     if ground is not None and np.isfinite(ground).sum() > 5:
-        v_ground = smooth_twice(interpolate_near(t, ground, at))
+        v_ground = even.smooth_channel(ground)
     yaw = signals[:, S.YAW]
     yaw_at = (
-        interpolate_near(t, np.unwrap(yaw), at)
+        even.interpolate_channel(np.unwrap(yaw))
         if np.isfinite(yaw).all()
         else _nearest_yaw(t, yaw, at)
     )
     delta = signals[:, S.DELTA]
     return EvenDrive(
         t=at,
-        ax=even_column(S.AX),
-        ay=even_column(S.AY),
-        r=even_column(S.YAW_RATE),
-        delta=smooth_twice(
-            interpolate_near(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)
-        ),
+        ax=even.smooth_channel(signals[:, S.AX]),
+        ay=even.smooth_channel(signals[:, S.AY]),
+        r=even.smooth_channel(signals[:, S.YAW_RATE]),
+        delta=even.smooth_channel(np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1])),
         wheels=rims,
         v=v,
         r_wheels=r_wheels,
@@ -189,10 +260,9 @@ def prepare_drive(
         course_yaw=yaw_at,
         moving=((np.abs(v) > CREEP * fast) & ~is_slipping(raw, fast)).astype(float),
         grips=(~left_ground(v, v_ground, fast)).astype(float),
+        fast=fast,
         wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
-        torque=smooth_twice(
-            interpolate_near(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)
-        ),
+        torque=even.smooth_channel(signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1)),
         yaw_front=axles[0],
         yaw_rear=axles[1],
     )
@@ -212,7 +282,7 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
         fast: 95 % quantile of the car's speed in this drive, in the same unit. A car slower than
             the share CREEP of this speed counts as standing.
     """
-    speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
+    speed = wheel_median(np.where(np.isfinite(wheels), wheels, 0.0))
     size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
     moves = np.abs(speed) > CREEP * fast
     off = np.zeros(len(wheels), bool)

@@ -17,7 +17,14 @@ import numpy as np
 from edge_agent.inputs.doctor.bumps import leading_axle
 from edge_agent.inputs.doctor.clocks import measure_clocks, wheels_speak_late
 from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, interpolate_near, prepare_drive
+from edge_agent.inputs.doctor.drive import (
+    RATE_HZ,
+    EvenDrive,
+    correlate_series,
+    interpolate_near,
+    median_of_others,
+    prepare_drive,
+)
 from edge_agent.inputs.doctor.identities import PARTS, Fit, fit_identities, fit_robustly
 from edge_agent.inputs.doctor.lift import is_on_lift
 from edge_agent.inputs.doctor.places import has_exchanged_position, yaw_findings
@@ -28,7 +35,6 @@ from edge_agent.inputs.doctor.slip import (
     STEADY_SHARE,
     TURNS_LIKE,
     find_exchanged_axles,
-    find_followed,
     find_locked_axles,
     has_equal_steps,
     is_foreign,
@@ -195,14 +201,16 @@ def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
     if good.sum() < 100:
         return
     rows = np.flatnonzero(good)
+    wheels = wheels[rows]
+    medians = median_of_others(wheels)
     for i, wheel in enumerate(WHEELS):
-        rest = np.delete(wheels[rows], i, axis=1)
-        others = np.median(rest, axis=1)
+        others = medians[:, i]
         fast = float(np.percentile(np.abs(others), 95))
-        above = wheels[rows, i] - others
+        above = wheels[:, i] - others
         off = np.abs(above) > 0.3 * np.abs(others) + 0.3 * fast
         if off.mean() <= JUMPS or not (
-            has_equal_steps(above, off) or is_foreign(rest, others, off, fast)
+            has_equal_steps(above, off)
+            or is_foreign(np.delete(wheels, i, axis=1), others, off, fast)
         ):
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
@@ -221,9 +229,7 @@ def _axes_exchanged(drive: EvenDrive) -> bool:
 
     def axis_likeness(x: FloatArray, y: FloatArray) -> float:
         good = np.isfinite(x) & np.isfinite(y) & (drive.moving > 0)
-        if good.sum() < 10 * RATE_HZ or x[good].std() == 0 or y[good].std() == 0:
-            return 0.0
-        return abs(float(np.corrcoef(x[good], y[good])[0, 1]))
+        return abs(correlate_series(x[good], y[good])) if good.sum() >= 10 * RATE_HZ else 0.0
 
     along = drive.v_dot
     across = drive.v * drive.r
@@ -356,15 +362,16 @@ def _find_radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Fi
         (drive.moving > 0)
         & (np.abs(drive.v_dot) < CALM)
         & np.isfinite(drive.r)
-        & find_followed(drive)
+        & drive.follows_steering
     )
     calm &= np.abs(drive.v * drive.r) < CALM_ACROSS
     rims = drive.wheels - half * drive.r[:, None]
+    good = np.flatnonzero(calm & np.isfinite(rims).all(axis=1))
+    medians = median_of_others(rims[good])
     for i, wheel in enumerate(WHEELS):
-        good = np.flatnonzero(calm & np.isfinite(rims).all(axis=1))
         if len(good) < 10 * RATE_HZ:
             continue
-        others = np.median(np.delete(rims[good], i, axis=1), axis=1)
+        others = medians[:, i]
         ratio = rims[good, i] / np.where(others == 0, np.nan, others) - 1.0
         parts = np.array(
             [float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)]
@@ -405,7 +412,7 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
         & (rear > 1.0)
     )
     turn = np.square(drive.wheelbase * drive.r / np.where(good, rear, 1.0))
-    good &= np.isfinite(turn) & find_followed(drive) & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
+    good &= np.isfinite(turn) & drive.follows_steering & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
     tight = good & (turn > TIGHT)
     if tight.sum() < TIGHT_S * RATE_HZ:
         return []
@@ -441,7 +448,7 @@ def _find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
         )
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
-        straight &= find_followed(drive)
+        straight &= drive.follows_steering
     beside = (drive.ay - drive.v * drive.r)[straight]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         listed.append(

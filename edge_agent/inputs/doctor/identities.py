@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, correlate_series, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 
 LONGEST_LAG_S: Final = 1.0  # [s] maximum lag that is searched
@@ -119,13 +119,12 @@ def _longitudinal_relation(d: EvenDrive) -> Relation:
 def _steering_relation(d: EvenDrive) -> Relation:
     # Multiply the equation by v. Otherwise turns at walking speed would outweigh all others; there
     # the angle is large and the steering linkage is not linear.
-    fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
-    v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
+    v = np.where(np.abs(d.v) > 0.25 * d.fast, d.v, np.nan)
     return Relation(
         d.delta * v,
         d.wheelbase * d.r,
         per=v,
-        bend=np.square(v / max(float(fast), 1e-9)),
+        bend=np.square(v / max(d.fast, 1e-9)),
         length=d.wheelbase,
     )
 
@@ -198,12 +197,11 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
         return NOTHING
     x = right[good]
     y = left[good]
-    size = np.percentile(np.abs(x - (0.0 if level else np.median(x))), 95)
-    excited = np.ones(len(x), bool) if level else np.abs(x - np.median(x)) > SLOW_SHARE * size
-    excited_s = excited.sum() / RATE_HZ
     if level:
+        excited = np.ones(len(x), bool)
+        excited_s = len(x) / RATE_HZ
         gain = _median_ratio(x, y)
-        correlation = float(np.corrcoef(x, y)[0, 1]) if x.std() > 0 and y.std() > 0 else 0.0
+        correlation = correlate_series(x, y)
         spread = float(np.std(y - gain * x)) / max(
             abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12
         )
@@ -222,6 +220,9 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
             (),
             parts,
         )
+    away = np.abs(x - np.median(x))
+    excited = away > SLOW_SHARE * np.percentile(away, 95)
+    excited_s = excited.sum() / RATE_HZ
     count = max(excited_s / CORRELATED_S, 1.0)
     constant = np.ones(len(x)) if sides.per is None else sides.per[good]
     besides = [other[good] for other in sides.beside]
@@ -233,7 +234,7 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     table = np.stack([x, constant, *besides], axis=1)
     solution, errors = _fit_with_priors(table, y, sides.loose, count)
     rest = y - table[:, 1:] @ solution[1:]
-    correlation = float(np.corrcoef(x, rest)[0, 1]) if x.std() > 0 and rest.std() > 0 else 0.0
+    correlation = correlate_series(x, rest)
     slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
     gain = (
         float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope)))
@@ -319,13 +320,13 @@ def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[f
     in each of PARTS consecutive parts of a drive. Only the samples of the mask `excited`, in which
     the signals change enough, are used. Parts that are too short are left out.
     """
-    rows = np.flatnonzero(excited)
     found = []
-    for part in np.array_split(rows, PARTS):
-        if len(part) < 0.3 * RATE_HZ:
+    parts = (np.array_split(side[excited], PARTS) for side in (x, y))
+    for right, left in zip(*parts, strict=True):
+        if len(right) < 0.3 * RATE_HZ:
             continue
-        across = float(np.sum(x[part] * y[part]))
-        size = float(np.sqrt(np.sum(y[part] ** 2) / max(float(np.sum(x[part] ** 2)), 1e-24)))
+        across = float(np.sum(right * left))
+        size = float(np.sqrt(np.sum(left**2) / max(float(np.sum(right**2)), 1e-24)))
         found.append(float(np.sign(across)) * size)
     return tuple(found)
 

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, interpolate_near, smooth_twice
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenTimes, correlate_series, smooth_twice
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -35,7 +35,6 @@ LEAST_LIKE: Final = 0.9  # minimum correlation at which a lag is used
 LEAST_RATE: Final = 1e-5  # [rad/s] a smaller standard deviation of the yaw rate is rounding
 ALIKE: Final = 0.02  # correlations that differ by less than this count as equal
 SMOOTH_S: Final = 0.1  # [s] width of the running mean, which is applied twice
-LONGEST_DRIVE_S: Final = 1800.0  # [s] only this first part of a drive is used
 DRIVEN: Final = 4.0  # [m/s] lags are measured above this speed
 SLOWEST: Final = 3.0  # [m/s] below this speed the model's slip angle has no meaning
 NEGLIGIBLE: Final = 1e-18  # share of an earlier motion that disappears in a float64
@@ -63,20 +62,18 @@ def find_lags(
     checks of the signals, because after smoothing over half a second the peak of the correlation
     would be too flat for a resolution of milliseconds.
     """
-    at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
-
-    def even_column(index: int) -> FloatArray:
-        return smooth_twice(interpolate_near(t, signals[:, index], at), SMOOTH_S)
-
-    rims = [even_column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
+    even = EvenTimes(t)
+    rims = [
+        even.smooth_channel(signals[:, S.OMEGA + wheel], SMOOTH_S) * vehicle.wheel_radius
+        for wheel in range(4)
+    ]
     v = np.mean(rims, axis=0)
-    gyro = even_column(S.YAW_RATE)
+    gyro = even.smooth_channel(signals[:, S.YAW_RATE], SMOOTH_S)
     left = signals[:, S.DELTA]
     front = (rims[1] - rims[0]) / vehicle.track_front
     rear = (rims[3] - rims[2]) / vehicle.track_rear
-    delta = smooth_twice(
-        interpolate_near(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at),
-        SMOOTH_S,
+    delta = even.smooth_channel(
+        np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), SMOOTH_S
     )
     driven = (v > DRIVEN) & np.isfinite(gyro)
     turning = gyro - smooth_twice(gyro, SLOW_S)
@@ -125,24 +122,26 @@ def _find_delay(
     spread = np.nanstd(left[among]), np.nanstd(turning[among])
     if any(size < LEAST_RATE for size in spread):  # a locked axle, or a straight drive
         return None
+    rows = np.flatnonzero(among & np.isfinite(left))
 
     def correlate_at(k: int) -> float:
-        other = np.roll(turning, k)
-        both = among & np.isfinite(left) & np.isfinite(other)
-        return float(np.corrcoef(left[both], other[both])[0, 1]) if both.sum() > 2 else 0.0
+        other = turning[rows - k]
+        both = np.isfinite(other)
+        return correlate_series(left[rows[both]], other[both]) if both.sum() > 2 else 0.0
 
-    like = _correlate_by_spectra(left / spread[0], turning / spread[1], among, most)
+    like = correlate_by_spectra(left / spread[0], turning / spread[1], among, most)
     for k in np.flatnonzero(~(like < np.nanmax(like, initial=-1.0) - NEAR_PEAK)):
         like[k] = correlate_at(int(k) - most)
     top = int(np.argmax(like))
     if like[top] < least or top in (0, 2 * most):
         return None
-    before, here, after = (correlate_at(k) for k in range(top - most - 1, top - most + 2))
+    here = like[top]
+    before, after = (correlate_at(top - most + k) for k in (-1, 1))
     seconds = (top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ
     return _Peak(float(seconds), float(here))
 
 
-def _correlate_by_spectra(
+def correlate_by_spectra(
     left: FloatArray, right: FloatArray, among: BoolArray, most: int
 ) -> FloatArray:
     """Return the correlation of `left` (n,) with `right` (n,) for every shift of `right` by -most

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, interpolate_near, smooth_twice
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenTimes, smooth_twice
 from schemas.numeric import FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -33,12 +33,12 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     """Return True if wheels turn while the body of the car stands, as on a lift or on rollers. `t`
     are times (T,) [s], `signals` readings (T, 18).
     """
-    at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
-    if len(at) < LEAST_S * RATE_HZ:
+    even = EvenTimes(t, np.inf)
+    if len(even.at) < LEAST_S * RATE_HZ:
         return False
     rims = (
         np.stack(
-            [interpolate_near(t, signals[:, S.OMEGA + wheel], at) for wheel in range(4)], axis=1
+            [even.interpolate_channel(signals[:, S.OMEGA + wheel]) for wheel in range(4)], axis=1
         )
         * vehicle.wheel_radius
     )
@@ -53,8 +53,7 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     if turns.sum() < LEAST_S * RATE_HZ:
         return False
     along, across, yaw = (
-        smooth_twice(interpolate_near(t, signals[:, channel], at))
-        for channel in (S.AX, S.AY, S.YAW_RATE)
+        even.smooth_channel(signals[:, channel]) for channel in (S.AX, S.AY, S.YAW_RATE)
     )
     rests = all(
         np.isfinite(value[turns]).any()

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.doctor.diagnosis import Finding
-from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, over_ground
+from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, EvenTimes, over_ground
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
@@ -40,9 +40,10 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
     findings = []
     if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
         return []
-    fast = np.nanpercentile(np.abs(drive.v), 95)
     good = (
-        np.isfinite(drive.course) & np.isfinite(drive.course_yaw) & (np.abs(drive.v) > 0.3 * fast)
+        np.isfinite(drive.course)
+        & np.isfinite(drive.course_yaw)
+        & (np.abs(drive.v) > 0.3 * drive.fast)
     )
     if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
         yaw = drive.course_yaw[good]
@@ -61,7 +62,8 @@ def _total_turn(angle: FloatArray) -> float:
     quantile, after jumps by 2π have been removed.
     """
     unwrapped = np.unwrap(angle)
-    return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
+    low, high = np.percentile(unwrapped, (5, 95))
+    return float(high - low)
 
 
 def _course_agreement(yaw: FloatArray, course: FloatArray) -> float:
@@ -83,16 +85,20 @@ def has_exchanged_position(t: FloatArray, signals: FloatArray, drive: EvenDrive)
         return True
     if np.nanmax(np.abs(longitude)) > 90.0:
         return False
-    fast = np.nanpercentile(np.abs(drive.v), 95) if np.isfinite(drive.v).any() else 0.0
-    good = (np.abs(drive.v) > CREEP * fast) & np.isfinite(drive.v_ground) & (drive.v != 0.0)
+    good = (np.abs(drive.v) > CREEP * drive.fast) & np.isfinite(drive.v_ground) & (drive.v != 0.0)
     if good.sum() < FEWEST:
         return False
-    other, course = over_ground(t, longitude, latitude, drive.t)
-    spreads = []
-    turns = []
-    for speed, way in ((drive.v_ground, drive.course), (other, course)):
+    other, course = over_ground(EvenTimes(t), longitude, latitude)
+
+    def ratio_spread(speed: FloatArray) -> float:
         ratio = np.log(np.maximum(speed[good], 1e-3) / np.abs(drive.v[good]))
-        spreads.append(float(np.percentile(ratio, 84) - np.percentile(ratio, 16)))
-        rate = np.diff(np.unwrap(way[good]))
-        turns.append(float(np.sum(rate * drive.r[good][1:])))
-    return spreads[1] < STEADIER * spreads[0] and turns[1] * turns[0] <= 0.0
+        low, high = np.percentile(ratio, (16, 84))
+        return float(high - low)
+
+    if ratio_spread(other) >= STEADIER * ratio_spread(drive.v_ground):
+        return False
+    turns = [
+        float(np.sum(np.diff(np.unwrap(way[good])) * drive.r[good][1:]))
+        for way in (drive.course, course)
+    ]
+    return turns[1] * turns[0] <= 0.0

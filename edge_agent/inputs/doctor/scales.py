@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import combinations, product
 from typing import Final, NamedTuple
 
@@ -194,19 +195,23 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
     costs: list[tuple[float, dict[str, Mistake]]] = []
+    misfits = [
+        (cache(partial(_misfit_of, name, fit)), [member.quantity for member in LAWS[name].members])
+        for name, fit in known.items()
+    ]
     for guess, price in _enumerate_guesses(choices):
-        costs.append(
-            (price + sum(_misfit_of(name, fit, guess) for name, fit in known.items()), guess)
-        )
+        total = sum([misfit(*map(guess.get, members)) for misfit, members in misfits])
+        costs.append((price + total, guess))
     best_cost, best = min(costs, key=lambda pair: pair[0])
-    margins = {}
-    for quantity in QUANTITIES:
-        others = [
-            cost
-            for cost, guess in costs
-            if not _are_equivalent(guess.get(quantity), best.get(quantity))
-        ]
-        margins[quantity] = min(others) - best_cost if _is_in_relations(quantity, known) else 0.0
+    margins = dict.fromkeys(QUANTITIES, 0.0)
+    for quantity in {member.quantity for name in known for member in LAWS[name].members}:
+        other = {
+            fault
+            for fault in (None, *choices[quantity])
+            if not _are_equivalent(fault, best.get(quantity))
+        }
+        rivals = (cost for cost, guess in costs if guess.get(quantity) in other)
+        margins[quantity] = min(rivals) - best_cost
     return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
 
 
@@ -217,10 +222,6 @@ def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
     if one is None or other is None:
         return one is other
     return abs(math.log(abs(one.factor / other.factor))) < ALIKE and one.factor * other.factor > 0.0
-
-
-def _is_in_relations(quantity: str, known: Mapping[str, Fit]) -> bool:
-    return any(member.quantity == quantity for name in known for member in LAWS[name].members)
 
 
 def _enumerate_guesses(
@@ -238,12 +239,12 @@ def _enumerate_guesses(
         yield chosen, 1.25 * FAULT_COST
 
 
-def _misfit_of(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
+def _misfit_of(name: str, fit: Fit, *faults: Mistake | None) -> float:
     law = LAWS[name]
     factor = law.centre
-    for quantity, power in law.members:
-        if quantity in guess:
-            factor *= guess[quantity].factor ** power
+    for fault, member in zip(faults, law.members, strict=True):
+        if fault is not None:
+            factor *= fault.factor**member.power
     away = math.log(abs(fit.gain) / abs(factor)) if fit.gain else 10.0
     cost = away**2 / (law.spread**2 + fit.error**2)
     if fit.gain * factor < 0.0:

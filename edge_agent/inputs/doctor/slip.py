@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth_twice
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, correlate_series, smooth_twice
 from edge_agent.inputs.doctor.identities import Fit
 from edge_agent.inputs.doctor.lags import find_lags
 from schemas.numeric import BoolArray, FloatArray
@@ -18,7 +18,6 @@ FEWEST_STEPS: Final = 5  # minimum number of sudden steps in a wheel speed for `
 # Minimum number of samples in motion before a wheel that disagrees with the others counts as
 # foreign.
 FOREIGN_ROWS: Final = 3000
-FOLLOWED: Final = 0.25  # relative difference allowed between the driven and the steered curvature
 RADIUS_PARTS: Final = 4
 # largest difference of ln gain at which a part of the drive agrees with the fit
 STEADY: Final = 0.4
@@ -90,9 +89,7 @@ def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
 
     def yaw_likeness(yaw: FloatArray) -> float:
         good = np.isfinite(yaw) & np.isfinite(drive.r) & (drive.moving > 0)
-        if good.sum() < 10 * RATE_HZ or yaw[good].std() == 0.0 or drive.r[good].std() == 0.0:
-            return 0.0
-        return float(np.corrcoef(yaw[good], drive.r[good])[0, 1])
+        return correlate_series(yaw[good], drive.r[good]) if good.sum() >= 10 * RATE_HZ else 0.0
 
     front = yaw_likeness(drive.yaw_front)
     rear = yaw_likeness(drive.yaw_rear)
@@ -141,18 +138,6 @@ def find_locked_axles(drive: EvenDrive) -> list[str]:
         if follows > LOCKED_LIKE and 0.6 < gain < 1.6 and abs(own_gain) < LOCKED_GAIN:
             locked.append(name)
     return locked
-
-
-def find_followed(drive: EvenDrive) -> BoolArray:
-    """Return a mask (n,) that is True at the samples at which the car turns as its steering
-    predicts, that is, does not slide.
-    """
-    fast = np.maximum(np.abs(drive.v), 1.0)
-    wanted = drive.wheelbase * drive.r / fast
-    steered = np.isfinite(drive.delta) & np.isfinite(wanted)
-    return steered & (
-        np.abs(np.tan(np.clip(drive.delta, -1.0, 1.0)) - wanted) < FOLLOWED * np.abs(wanted) + 0.01
-    )
 
 
 def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:

@@ -10,7 +10,7 @@ from edge_agent.inputs.doctor.drive import RATE_HZ
 from edge_agent.inputs.doctor.lags import (
     SLOWEST,
     _bicycle_yaw_rate,
-    _correlate_by_spectra,
+    correlate_by_spectra,
     find_lags,
 )
 from schemas.numeric import FloatArray
@@ -75,12 +75,12 @@ def test_correlation_by_spectra_equals_that_of_each_shift() -> None:
     right[[5, 200, 201, 690]] = np.nan
     among = rng.random(n) < 0.8
     among[: most + 1] = among[n - most - 1 :] = False
-    found = _correlate_by_spectra(left, right, among, most)
+    found = correlate_by_spectra(left, right, among, most)
     for k in range(-most, most + 1):
         other = np.roll(right, k)
         both = among & np.isfinite(left) & np.isfinite(other)
         assert abs(found[k + most] - np.corrcoef(left[both], other[both])[0, 1]) < 1e-10
-    assert np.isnan(_correlate_by_spectra(left, np.ones(n), among, most)).all(), "no variation"
+    assert np.isnan(correlate_by_spectra(left, np.ones(n), among, most)).all(), "no variation"
 
 
 def test_wheels_that_are_late_are_found_and_a_straight_drive_says_nothing() -> None:
