@@ -84,8 +84,12 @@ def find_lags(
             if name == "wheel_lag"
             else (_bicycle_yaw_rate(v, delta, vehicle),)
         )
-        peaks = [_find_delay(side, turning, driven & np.isfinite(side), least) for side in sides]
-        told = [peak for peak in peaks if peak is not None]
+        told = list[_Peak]()
+        for side in sides:
+            peak = _find_delay(side, turning, driven & np.isfinite(side), least)
+            told += [] if peak is None else [peak]
+            if told and told[0].likeness > 1.0 - ALIKE:
+                break  # no other side can agree clearly better with the gyroscope
         # Prefer the mean of both axles. If one axle is locked, its yaw rate shows nothing and
         # distorts the mean. Then the other axle agrees best with the gyroscope.
         if told:

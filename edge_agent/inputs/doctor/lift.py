@@ -52,19 +52,20 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
         one_stands = turns & (slowest < STANDS_M_S)
     if turns.sum() < LEAST_S * RATE_HZ:
         return False
-    along, across, yaw = (
-        even.smooth_channel(signals[:, channel]) for channel in (S.AX, S.AY, S.YAW_RATE)
-    )
-    rests = all(
-        np.isfinite(value[turns]).any()
-        and float(np.nanpercentile(np.abs(value[turns] - np.nanmedian(value[turns])), 90)) < limit
-        for value, limit in ((along, RESTS_M_S2), (across, RESTS_M_S2), (yaw, RESTS_RAD_S))
-    )
-    if not rests:
+
+    def rests_within(channel: int, limit: float) -> bool:
+        value = even.smooth_channel(signals[:, channel])[turns]
+        return bool(
+            np.isfinite(value).any()
+            and np.nanpercentile(np.abs(value - np.nanmedian(value)), 90) < limit
+        )
+
+    limits = ((S.AX, RESTS_M_S2), (S.AY, RESTS_M_S2), (S.YAW_RATE, RESTS_RAD_S))
+    if not all(rests_within(channel, limit) for channel, limit in limits):
         return False
     gained = np.gradient(fastest, 1.0 / RATE_HZ)[turns]
     gains = float(np.sqrt(np.nanmean(np.square(gained)))) > GAINS_M_S2
-    felt = float(np.nanstd(along[turns]))
+    felt = float(np.nanstd(even.smooth_channel(signals[:, S.AX])[turns]))
     return bool(
         one_stands.sum() > LEAST_SHARE * turns.sum() or (gains and felt < 0.25 * GAINS_M_S2)
     )
