@@ -20,7 +20,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, correlate_series, smooth_twice
+from edge_agent.inputs.doctor.drive import (
+    RATE_HZ,
+    EvenDrive,
+    correlate_series,
+    find_median,
+    smooth_twice,
+)
 from schemas.numeric import BoolArray, FloatArray
 
 LONGEST_LAG_S: Final = 1.0  # [s] maximum lag that is searched
@@ -220,7 +226,7 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
             (),
             parts,
         )
-    away = np.abs(x - np.median(x))
+    away = np.abs(x - find_median(x))
     excited = away > SLOW_SHARE * np.percentile(away, 95)
     excited_s = excited.sum() / RATE_HZ
     count = max(excited_s / CORRELATED_S, 1.0)
@@ -244,7 +250,7 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
     found = tuple(float(k) for k in solution[2:])
     if sides.bend is not None:
-        per_square = float(np.median(sides.bend[good] / np.maximum(np.square(constant), 1e-12)))
+        per_square = find_median(sides.bend[good] / np.maximum(np.square(constant), 1e-12))
         found = (gain * bend * per_square * sides.length,)
     return Fit(
         gain,
@@ -279,16 +285,31 @@ def _bend_of(
     """
     costs = np.zeros(len(BENDS))
     gains = np.zeros(len(BENDS))
+    least = 1e-3 * float(np.std(y)) + 1e-12
     for k, share in enumerate(BENDS):
-        table = np.stack([x * (1.0 + share * bend), constant], axis=1)
-        solution = fit_robustly(table, y)
-        left = float(np.median(np.abs(y - table @ solution))) + 1e-3 * float(np.std(y)) + 1e-12
+        line = x * (1.0 + share * bend)
+        gain, offset = _fit_line(line, constant, y)
+        off = np.abs(y - gain * line - offset * constant)
+        near = off <= 3.0 * 1.4826 * find_median(off) + 1e-12
+        gain, offset = _fit_line(line[near], constant[near], y[near])
+        left = find_median(np.abs(y - gain * line - offset * constant)) + least
         costs[k] = 2.0 * count * np.log(left) + ((share - USUAL_BEND) / BEND_SPREAD) ** 2
-        gains[k] = np.log(max(abs(solution[0]), 1e-12))
+        gains[k] = np.log(max(abs(gain), 1e-12))
     weights = np.exp(-0.5 * (costs - costs.min()))
     weights /= weights.sum()
     centre = float(weights @ gains)
     return float(weights @ BENDS), float(np.sqrt(weights @ np.square(gains - centre)))
+
+
+def _fit_line(x: FloatArray, constant: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the gains k and o of the least-squares fit y = k · x + o · constant, with all arrays
+    (n,). k is 0 if x is a multiple of `constant`.
+    """
+    square = constant @ constant
+    apart = x - constant @ x / square * constant
+    size = apart @ apart
+    gain = float(apart @ y / size) if size > 1e-24 * (x @ x) else 0.0
+    return gain, float(constant @ (y - gain * x) / square)
 
 
 def _fit_with_priors(
@@ -301,17 +322,18 @@ def _fit_with_priors(
     """
     solution = fit_robustly(table, y)
     off = np.abs(y - table @ solution)
-    spread = max(1.4826 * float(np.median(off)), 1e-9)
+    spread = max(1.4826 * find_median(off), 1e-9)
     near = off <= 3.0 * spread
-    weight = count / max(int(near.sum()), 1) / spread**2
-    normal = weight * (table[near].T @ table[near])
+    inside = table[near]
+    weight = count / max(len(inside), 1) / spread**2
+    normal = weight * (inside.T @ inside)
     first = len(normal) - len(loose)
     for k, std in enumerate(loose):
         normal[first + k, first + k] += 1.0 / std**2
     normal[np.diag_indices(len(normal))] += 1e-12 * np.trace(normal)
     inverse = np.linalg.inv(normal)
     if loose:
-        solution = inverse @ (weight * (table[near].T @ y[near]))
+        solution = inverse @ (weight * (inside.T @ y[near]))
     return solution, np.sqrt(np.diag(inverse))
 
 
@@ -325,15 +347,14 @@ def _gains_of_parts(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[f
     for right, left in zip(*parts, strict=True):
         if len(right) < 0.3 * RATE_HZ:
             continue
-        across = float(np.sum(right * left))
-        size = float(np.sqrt(np.sum(left**2) / max(float(np.sum(right**2)), 1e-24)))
-        found.append(float(np.sign(across)) * size)
+        size = np.sqrt(left @ left / max(right @ right, 1e-24))
+        found.append(float(np.sign(right @ left) * size))
     return tuple(found)
 
 
 def _median_ratio(x: FloatArray, y: FloatArray) -> float:
     big = np.abs(x) > 0.3 * np.percentile(np.abs(x), 95)
-    return float(np.median(y[big] / x[big])) if big.any() else 0.0
+    return find_median(y[big] / x[big]) if big.any() else 0.0
 
 
 def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
@@ -343,7 +364,7 @@ def fit_robustly(table: FloatArray, y: FloatArray) -> FloatArray:
     """
     solution = np.linalg.lstsq(table, y, rcond=None)[0]
     off = np.abs(y - table @ solution)
-    near = off <= 3.0 * 1.4826 * np.median(off) + 1e-12
+    near = off <= 3.0 * 1.4826 * find_median(off) + 1e-12
     if near.sum() > 10 * table.shape[1]:
         solution = np.linalg.lstsq(table[near], y[near], rcond=None)[0]
     return np.asarray(solution)

@@ -123,15 +123,16 @@ def _find_delay(
     if among.sum() < LEAST_S * RATE_HZ:
         return None
     left = side - smooth_twice(side, SLOW_S)
-    spread = np.nanstd(left[among]), np.nanstd(turning[among])
-    if any(size < LEAST_RATE for size in spread):  # a locked axle, or a straight drive
-        return None
     rows = np.flatnonzero(among & np.isfinite(left))
+    known = left[rows]
+    spread = known.std(), turning[among & np.isfinite(turning)].std()
+    if min(spread) < LEAST_RATE:  # a locked axle, or a straight drive
+        return None
 
     def correlate_at(k: int) -> float:
         other = turning[rows - k]
         both = np.isfinite(other)
-        return correlate_series(left[rows[both]], other[both]) if both.sum() > 2 else 0.0
+        return correlate_series(known[both], other[both]) if both.sum() > 2 else 0.0
 
     like = correlate_by_spectra(left / spread[0], turning / spread[1], among, most)
     for k in np.flatnonzero(~(like < np.nanmax(like, initial=-1.0) - NEAR_PEAK)):

@@ -25,14 +25,16 @@ devices.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from itertools import combinations, product
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from edge_agent.inputs.doctor.identities import Fit
 from edge_agent.inputs.units import ANGLE, DEG, SPEED
+from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
@@ -194,15 +196,9 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
     """
     choices = faults_of(vehicle, found["ground"])
     known = {name: fit for name, fit in found.items() if fit.is_known}
-    costs: list[tuple[float, dict[str, Mistake]]] = []
-    misfits = [
-        (cache(partial(_misfit_of, name, fit)), [member.quantity for member in LAWS[name].members])
-        for name, fit in known.items()
-    ]
-    for guess, price in _enumerate_guesses(choices):
-        total = sum([misfit(*map(guess.get, members)) for misfit, members in misfits])
-        costs.append((price + total, guess))
-    best_cost, best = min(costs, key=lambda pair: pair[0])
+    guesses, prices = zip(*_enumerate_guesses(choices), strict=True)
+    costs = np.array(prices) + sum(_misfits_of(name, fit, guesses) for name, fit in known.items())
+    best = guesses[int(np.argmin(costs))]
     margins = dict.fromkeys(QUANTITIES, 0.0)
     for quantity in {member.quantity for name in known for member in LAWS[name].members}:
         other = {
@@ -210,8 +206,8 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
             for fault in (None, *choices[quantity])
             if not _are_equivalent(fault, best.get(quantity))
         }
-        rivals = (cost for cost, guess in costs if guess.get(quantity) in other)
-        margins[quantity] = min(rivals) - best_cost
+        rivals = costs[[guess.get(quantity) in other for guess in guesses]]
+        margins[quantity] = float(rivals.min() - costs.min())
     return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
 
 
@@ -239,17 +235,20 @@ def _enumerate_guesses(
         yield chosen, 1.25 * FAULT_COST
 
 
-def _misfit_of(name: str, fit: Fit, *faults: Mistake | None) -> float:
+def _misfits_of(name: str, fit: Fit, guesses: Sequence[Mapping[str, Mistake]]) -> FloatArray:
+    """Return the squared normalised error (n,) that remains in the gain of an identity for each of
+    the sets of faults `guesses`.
+    """
     law = LAWS[name]
-    factor = law.centre
-    for fault, member in zip(faults, law.members, strict=True):
-        if fault is not None:
-            factor *= fault.factor**member.power
-    away = math.log(abs(fit.gain) / abs(factor)) if fit.gain else 10.0
-    cost = away**2 / (law.spread**2 + fit.error**2)
-    if fit.gain * factor < 0.0:
-        cost += WRONG_SIGN * fit.correlation**2
-    return min(cost, 400.0)
+    factors = np.full(len(guesses), law.centre)
+    for quantity, power in law.members:
+        factors *= [
+            guess[quantity].factor ** power if quantity in guess else 1.0 for guess in guesses
+        ]
+    away = np.log(abs(fit.gain) / np.abs(factors)) if fit.gain else np.full(len(guesses), 10.0)
+    costs = away**2 / (law.spread**2 + fit.error**2)
+    costs += np.where(fit.gain * factors < 0.0, WRONG_SIGN * fit.correlation**2, 0.0)
+    return np.minimum(costs, 400.0)
 
 
 def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ
+from edge_agent.inputs.doctor.drive import RATE_HZ, find_median, median_of_others, sum_windows
 from edge_agent.inputs.doctor.lags import (
     SLOWEST,
     _bicycle_yaw_rate,
@@ -50,6 +50,26 @@ def integrate_step_by_step(speed: FloatArray, steering: FloatArray, car: Vehicle
         before = delta
         found[k] = motion[1]
     return found
+
+
+def test_sums_of_windows_equal_a_convolution_and_keep_errors_local() -> None:
+    x = np.random.default_rng(0).normal(size=200)
+    for width in (1, 2, 3, 25, 64, 101, 200):
+        np.testing.assert_allclose(
+            sum_windows(x, width), np.convolve(x, np.ones(width), "same"), atol=1e-12
+        )
+    spoiled = x.copy()
+    spoiled[90] = 1e38
+    np.testing.assert_array_equal(sum_windows(spoiled, 25)[:78], sum_windows(x, 25)[:78])
+    np.testing.assert_array_equal(sum_windows(spoiled, 25)[103:], sum_windows(x, 25)[103:])
+
+
+def test_medians_equal_their_definition() -> None:
+    wheels = np.round(np.random.default_rng(0).normal(size=(101, 4)), 1)  # with equal values
+    for count in (1, 2, 100, 101):
+        assert find_median(wheels[:count, 0]) == np.median(wheels[:count, 0])
+    others = [np.median(np.delete(wheels, i, axis=1), axis=1) for i in range(4)]
+    np.testing.assert_array_equal(median_of_others(wheels), np.stack(others, axis=1))
 
 
 def test_bicycle_model_equals_integration_step_by_step() -> None:
