@@ -17,6 +17,7 @@ from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.likelihoods import at_least, bound_by_used, level_above_used
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import cell_shares
+from fleet_service.fusion.witnesses import stretch_sources
 from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.ingest.grouping import group_rows, largest_of
 from fleet_service.ingest.paths import VehiclePaths
@@ -69,6 +70,7 @@ def exercise_map() -> None:
     largest_of(column, group, 1)
     VehiclePaths().find_implausible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     cell_shares(np.ones(1), np.ones(1))
+    stretch_sources(fusion, np.arange(2), np.zeros(2, np.int64))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
     for kind in wire.Kind:
         columns = {name: np.zeros(1, dtype) for name, dtype in wire.column_types(kind).items()}

@@ -27,6 +27,7 @@ from schemas.thresholds import EARTH_RADIUS_M
 
 _EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # [m] circumference at the equator
 _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
+_BORDERS: Final = np.arange(-c.SPREAD_CELLS - 1, c.SPREAD_CELLS + 2)  # k ± 1 of all steps k
 
 
 def other_cells(
@@ -62,14 +63,9 @@ def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
     the cell length along the heading, both (n,) [m].
     """
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
-    return np.asarray(
-        (
-            _cdf_integral((_STEPS + 1) * ratio)
-            - 2.0 * _cdf_integral(_STEPS * ratio)
-            + _cdf_integral((_STEPS - 1) * ratio)
-        )
-        / ratio
-    )
+    integral = _cdf_integral(_BORDERS * ratio)
+    at = _STEPS - _BORDERS[0]
+    return np.asarray((integral[:, at + 1] - 2.0 * integral[:, at] + integral[:, at - 1]) / ratio)
 
 
 def _cdf_integral(x: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, IntArray
-from schemas.runtime.jit import refcount_free
+from schemas.runtime.jit import refcount_free, refcount_free_locked
 from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
 
 NUMBERS: Final = ("boot", "region", "seq", "first_held")
@@ -249,7 +249,7 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
     return at + length
 
 
-@refcount_free
+@refcount_free_locked
 def _copy_bytes(
     data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: IntArray, into: ByteArray
 ) -> None:
@@ -263,7 +263,7 @@ def _copy_bytes(
         to += lengths_out[k]
 
 
-@refcount_free
+@refcount_free_locked
 def _unpack_values(
     data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray
 ) -> None:

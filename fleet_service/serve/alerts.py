@@ -99,15 +99,31 @@ class Alerts:
         """Return the alerts that are raised or cleared because the given slots (one per cell and
         heading sector), (k,), were updated.
         """
-        time = self._fusion.live.time[slots]
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
-        likely = self._suspects(slots[slippery > LIKELY])
+        gripping = slots[(slippery < CLEAR_BELOW) & standing]
+        icy = slots[slippery > LIKELY]
+        icy = icy[self._own_sources(icy, Side.ICE)[:, 0] > 0]
+        raised = self._raise_likely(icy, slots) if len(icy) else []
+        cleared = gripping[self._can_clear(gripping)] if len(gripping) else gripping
+        reason = "later visits measured good grip"
+        times = self._fusion.live.time[cleared].tolist()
+        return raised + [
+            self._clear(slot, time, reason)
+            for slot, time in zip(cleared.tolist(), times, strict=True)
+        ]
+
+    def _raise_likely(self, icy: IntArray, updated: IntArray) -> list[Alert]:
+        """Return the alerts that are raised because the slots `icy` (one per cell and heading
+        sector), (k,), were updated, in which vehicles reported ice. They are some of the slots
+        `updated`, (n,).
+        """
+        likely = self._suspects(icy)
         likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
         # An alert that an update of a neighbouring cell causes gets the newest time of the update.
-        now = time.max(initial=0)
-        raised = np.where(np.isin(likely, slots), self._fusion.live.time[likely], now)
+        time = self._fusion.live.time
+        raised = np.where(np.isin(likely, updated), time[likely], time[updated].max(initial=0))
         out = []
         for slot, when, probability in zip(
             likely.tolist(), raised.tolist(), believed.tolist(), strict=True
@@ -116,10 +132,7 @@ class Alerts:
                 reason = f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
                 self._standing[slot] = self._alert(slot, when, True, reason)
                 out.append(self._standing[slot])
-        gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing)
-        gripping = gripping[self._can_clear(slots[gripping])]
-        reason = "later visits measured good grip"
-        return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
+        return out
 
     def _is_admitted(self, slot: int, time: int) -> bool:
         """Return True if the limit for idle roads permits an alert. A road is idle if fewer than
@@ -142,9 +155,9 @@ class Alerts:
         "source" of a slot is a vehicle that reported ice there within the hour before the slot's
         last report.
 
-        Among the updated `slots` (k,), those with a source are checked. The other slots on the same
-        slippery stretches of road are checked too. Slots with an active alert are left out. A slot
-        becomes a candidate if both conditions hold:
+        The given `slots` (k,) all have a source. They are checked, and also the other slots on the
+        same slippery stretches of road. Slots with an active alert are left out. A slot becomes a
+        candidate if both conditions hold:
 
         1. The slot itself or its stretch has enough sources. More are needed in a slot where
            vehicles also reported grip.
@@ -153,7 +166,6 @@ class Alerts:
            before and behind the slot.
         """
         fusion = self._fusion
-        slots = slots[self._own_sources(slots, Side.ICE)[:, 0] > 0]
         near = np.unique(stretch_slots(fusion, slots))
         near = near[near != NONE]
         near = near[~np.isin(near, np.fromiter(self._standing, np.int64, len(self._standing)))]

@@ -4,6 +4,7 @@ friction value), estimate unvisited cells, encode. Pure (no I/O).
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -127,17 +128,17 @@ def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     vehicles have visited. The result is a slice if all rows between two positions are selected,
     else a mask.
 
-    A slice is found with a few comparisons. The mask needs comparisons of whole arrays, each of
-    which releases the interpreter lock. Waiting until the lock is free again may take ten times as
-    long as the comparison.
+    A slice is found with a few comparisons of numbers. The mask needs comparisons of whole arrays,
+    each of which releases the interpreter lock. Waiting until the lock is free again may take ten
+    times as long as the comparison.
     """
     columns = shown.columns
     run = slice(0, len(shown.cells))
     if query.bbox is not None and shown.payload:
         _, south, _, north = query.bbox
         run = slice(
-            int(columns["north"].searchsorted(south, "right")),
-            int(columns["south"].searchsorted(north, "left")),
+            bisect_right(columns["north"], south),
+            bisect_left(columns["south"], north),
         )
     if query.min_vehicles <= shown.least and (
         query.bbox is None or grid.touches(query.bbox, shown.common)

@@ -144,17 +144,19 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
         OtherTypesError: the argument is neither a number, nor a truth value, nor a contiguous
             array, nor a tuple of these.
     """
-    if isinstance(value, np.ndarray):
-        flags = value.flags
-        if not (flags.c_contiguous and flags.aligned):
-            raise OtherTypesError
-        words.append(id(value))
-        words.extend(value.shape)
-        read_only = "" if flags.writeable else " read-only"
-        return f"{_describe_element(value.dtype)}[{value.ndim}]{read_only}"
     if isinstance(value, tuple):
         parts = ",".join([describe_type(part, words) for part in value])
         return f"{type(value).__qualname__}({parts})"
+    if isinstance(value, np.ndarray):
+        shape = value.shape
+        words.append(id(value))
+        words.extend(shape)
+        flags = value.flags
+        if flags.carray:  # contiguous, aligned and writeable
+            return _describe_array(value.dtype, len(shape))
+        if flags.c_contiguous and flags.aligned:
+            return f"{_describe_array(value.dtype, len(shape))} read-only"
+        raise OtherTypesError
     if type(value) is float or type(value) is np.float64:
         words.append(struct.unpack("q", struct.pack("d", value))[0])
         return "float"
@@ -168,7 +170,8 @@ def describe_type(value: Any, words: list[int]) -> str:  # noqa: ANN401 any argu
 
 
 @functools.cache
-def _describe_element(kind: np.dtype[Any]) -> str:
-    if kind.names is None:
-        return kind.str
-    return hashlib.blake2b(repr(kind).encode(), digest_size=8).hexdigest()
+def _describe_array(kind: np.dtype[Any], dimensions: int) -> str:
+    element = kind.str
+    if kind.names is not None:
+        element = hashlib.blake2b(repr(kind).encode(), digest_size=8).hexdigest()
+    return f"{element}[{dimensions}]"

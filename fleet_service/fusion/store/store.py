@@ -90,6 +90,7 @@ class Store:
         self._slots: IntArray = np.full(LEAST, NONE, np.int64)
         self._known: IntArray = np.full(LEAST, NONE, np.int64)
         self.forgotten_at = 0
+        self._columns: tuple[Rows, Cells] | None = None  # columns of the rows `state.live`
 
     @staticmethod
     def of(
@@ -119,7 +120,9 @@ class Store:
         """Return the state of all slots (one per cell and heading sector) as columns: belief,
         counts and times.
         """
-        return cells_of(self.state.live)
+        if self._columns is None or self._columns[0] is not self.state.live:
+            self._columns = (self.state.live, cells_of(self.state.live))
+        return self._columns[1]
 
     @property
     def waiting(self) -> int:
