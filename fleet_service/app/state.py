@@ -164,7 +164,7 @@ def load_state(
     fusion.update_weather(
         archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
     )
-    shown.mark_changed(np.arange(fusion.size))
+    shown.mark_all_changed()
     matters = Begin(first_day(root), begin.cut, until)
     heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)

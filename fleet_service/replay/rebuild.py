@@ -24,6 +24,7 @@ from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import RecordedResult
 from fleet_service.ingest.dedup import SequenceTrackers
+from fleet_service.ingest.grouping import group_rows
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.streams import IDENTITY, Begin, pseudonym_numbers
 from schemas import grid
@@ -220,9 +221,7 @@ def replay(
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
         rows = segments.rows_of(table)
         if since.known is not None:
-            names = np.stack([rows[name] for name in IDENTITY], axis=1)
-            distinct, index = np.unique(names, axis=0, return_inverse=True)
-            new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
+            new = ~_are_known(rows, since.known)
             rows = {name: column[new] for name, column in rows.items()}
         o = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
         before = _recorded_result(rows)
@@ -233,6 +232,17 @@ def replay(
         yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), heard)
     if waiting:
         yield from _fuse_epochs(fusion, *waiting[0], heard)
+
+
+def _are_known(rows: segments.Rows, known: SequenceTrackers) -> BoolArray:
+    """Return a mask of archived rows (n,): True if the row's batch (message with records) is in
+    `known`.
+    """
+    vehicle, boot, region, seq = (rows[name] for name in IDENTITY)
+    stream, _ = group_rows(vehicle.copy(), boot, region)
+    batch, first = group_rows(stream.astype(np.int64), seq, seq)
+    names = np.stack([rows[name][first] for name in IDENTITY], axis=1)
+    return known.accepted(Kind.OBSERVATION, names)[batch]
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:

@@ -45,6 +45,13 @@ class MapState:
         self._dirty.update(tiles)
         self._changed.update(dict.fromkeys(tiles, self.change))
 
+    def mark_all_changed(self) -> None:
+        """Record that all tiles changed."""
+        self._index()
+        self.change += 1
+        self._dirty.update(self._slots)
+        self._changed.update(dict.fromkeys(self._slots, self.change))
+
     def changed_at(self, tile: int) -> int:
         """Return the version of a tile: the value of the map's counter of changes when the tile
         changed last; 0 if the tile never changed.
