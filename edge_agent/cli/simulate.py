@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_agent.cli.options import add_json, print_list
 
 SENSORS = ("ideal", "mems", "mems-leak", "mems-patchy", "rough", "rough-coarse", "rough-late")
-ROADS = ("level", "rolling", "stepped", "banked", "hilly")
+ROADS = ("level", "rolling", "stepped", "banked", "hilly", "cobbled")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

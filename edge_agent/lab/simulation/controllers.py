@@ -74,7 +74,7 @@ def slip_limit(p: FloatArray, i: int) -> float:
 @compiled
 def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
     """Advance all slip controllers (ABS, traction control) in the vehicle's state `x` by `dt` [s],
-    from the wheel slips in `w` (8, 4), the vehicle's parameters `p` and its inputs `u` (5, 4).
+    from the wheel slips in `w` (8, 4), the vehicle's parameters `p` and its inputs `u` (6, 4).
     """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)

@@ -26,6 +26,7 @@ from edge_agent.lab.simulation.plant import (
     advance,
     command,
     gravity,
+    ground_velocity,
     regenerate,
     start_at,
     substeps_of,
@@ -45,6 +46,7 @@ from edge_agent.lab.simulation.sensors import (
     sensors_named,
 )
 from edge_agent.lab.simulation.state import INPUTS, STATES, Control, Motion, TrueParameter, Wheel
+from edge_agent.lab.simulation.unevenness import load_swing
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
@@ -103,7 +105,7 @@ class Truth:
 def run(
     states: tuple[FloatArray, FloatArray, IntArray, FloatArray],
     parameters: FloatArray,
-    ground: tuple[Lanes, FloatArray, FloatArray],
+    ground: tuple[Lanes, FloatArray, FloatArray, FloatArray],
     keys: tuple[KeyArray, KeyArray],
     samples: tuple[int, int],
     timing: tuple[float, int],
@@ -112,13 +114,13 @@ def run(
     RECORD), and advance the states in place.
 
     `states` are the states of the vehicles (N, STATES), drivers (N, len(Driver)), routes (N, 4) and
-    wheels (N, 8, 4); `parameters` are those of the vehicles. `ground` is the lanes, the friction
-    table and the relief table. `keys` are the random keys of routes and of traffic (N,). `samples`
-    is the index of the first sample, and the count of samples. `timing` is the sample period [s],
-    and the integration steps per sample.
+    wheels (N, 8, 4); `parameters` are those of the vehicles. `ground` is the lanes, and the tables
+    of friction, relief and unevenness. `keys` are the random keys of routes and of traffic (N,).
+    `samples` is the index of the first sample, and the count of samples. `timing` is the sample
+    period [s], and the integration steps per sample.
     """
     vehicles, drivers, routes, wheels = states
-    lanes, friction, relief = ground
+    lanes, friction, relief, surface = ground
     first, steps = samples
     period, substeps = timing
     records = np.empty((steps, vehicles.shape[0], RECORD))
@@ -146,9 +148,11 @@ def run(
             command(p, u, d[Driver.STEER], d[Driver.FORCE])
             if p[TrueParameter.REGENERATION] > 0.0:
                 regenerate(x, p, u)
+            velocity = ground_velocity(x)
             for i in range(4):
                 px, py = wheel_place(x, p, i)
                 u[Control.MU, i] = look_up(friction, PatchColumn.MU, t, px, py)
+                u[Control.SWING, i] = load_swing(surface, (px, py), velocity)
             observe(x, p, u, w, records[k, n])
             advance(x, p, u, w, period / substeps, substeps)
     return records
@@ -236,6 +240,7 @@ class SimulatedFleet:
         self._before = np.empty((0, vehicles, RECORD))
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table
+        self._surface = self.scenario.relief.surface_table
         self._next = 0
         self.truth = _truth(np.empty((0, vehicles, RECORD)), self.scenario.air_temperature)
 
@@ -251,7 +256,7 @@ class SimulatedFleet:
         origin = self.scenario.origin
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)
         timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
-        ground = (lanes, self.scenario.table, self._relief)
+        ground = (lanes, self.scenario.table, self._relief, self._surface)
         samples = (self._next, steps)
         records = run(self._states, self._parameters, ground, self._keys, samples, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])

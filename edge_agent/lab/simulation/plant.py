@@ -61,6 +61,7 @@ from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position, wheel_slips, w
 from edge_agent.dynamics.tyres import TINY, brush, dugoff, magic_formula
 from edge_agent.lab.simulation.controllers import control_slip, slip_limit
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
+from edge_agent.lab.simulation.unevenness import radius_change
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
@@ -140,6 +141,14 @@ def wheel_torques(
 
 
 @compiled
+def rolling_radius(p: FloatArray, u: FloatArray, i: int) -> float:
+    """Return the rolling radius [m] of wheel `i` of a vehicle with parameters `p` and inputs `u`.
+    It varies on uneven roads.
+    """
+    return float(p[Parameter.RADIUS] + radius_change(u[Control.SWING, i]))
+
+
+@compiled
 def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """Advance the delayed part of the tyres' slip in the vehicle's state `x` by `dt` [s]: over the
     relaxation length, it approaches the slip of the wheels. The wheel speeds in `x` must already
@@ -149,8 +158,9 @@ def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
         )
-        slip_x, slip_y = wheel_slips(p[Parameter.RADIUS], x[Motion.OMEGA + i], along, across)
-        rolled = max(abs(along), abs(p[Parameter.RADIUS] * x[Motion.OMEGA + i]), SLOWEST_M_S)
+        radius = rolling_radius(p, u, i)
+        slip_x, slip_y = wheel_slips(radius, x[Motion.OMEGA + i], along, across)
+        rolled = max(abs(along), abs(radius * x[Motion.OMEGA + i]), SLOWEST_M_S)
         share = -math.expm1(-dt * rolled / p[TrueParameter.RELAXATION])
         x[Motion.SLIP_X + i] += share * (slip_x - x[Motion.SLIP_X + i])
         x[Motion.SLIP_Y + i] += share * (slip_y - x[Motion.SLIP_Y + i])
@@ -159,18 +169,19 @@ def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
     """Write loads, forces, slips and torques of the wheels to `w` (8, 4), for the state `x`,
-    parameters `p` and inputs `u` (5, 4).
+    parameters `p` and inputs `u` (6, 4).
     """
     loads = wheel_loads(body_of(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
     at_rest = wheel_loads(body_of(p), 0.0, 0.0)
     _, _, share = gravity(u)
     for i in range(4):
-        load = share * loads[i]
+        load = share * loads[i] * (1.0 + u[Control.SWING, i])
+        radius = rolling_radius(p, u, i)
         omega = x[Motion.OMEGA + i]
         along, across = wheel_velocity(
             p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i]
         )
-        slip_x, slip_y = wheel_slips(p[Parameter.RADIUS], omega, along, across)
+        slip_x, slip_y = wheel_slips(radius, omega, along, across)
         raw_slip = slip_x
         if p[TrueParameter.RELAXATION] > 0.0:
             slip_x = DIRECT * slip_x + (1.0 - DIRECT) * x[Motion.SLIP_X + i]
@@ -201,9 +212,7 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         drive, brake = wheel_torques(x, p, u, i, raw_slip)
         w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
         w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, raw_slip, theta
-        w[Wheel.SLOPE, i] = (
-            secant * slope_x * load * p[Parameter.RADIUS] / max(abs(along), SLOWEST_M_S)
-        )
+        w[Wheel.SLOPE, i] = secant * slope_x * load * radius / max(abs(along), SLOWEST_M_S)
         if p[TrueParameter.RELAXATION] > 0.0:
             w[Wheel.SLOPE, i] *= DIRECT
         w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
@@ -245,8 +254,8 @@ def turn_wheels(
     that `wheel_forces` has filled for this state.
     """
     gain, yaw_acceleration = change
-    radius = p[Parameter.RADIUS]
     for i in range(4):
+        radius = rolling_radius(p, u, i)
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
         omega = x[Motion.OMEGA + i]
         slip = abs(w[Wheel.SLIP, i])
@@ -415,6 +424,14 @@ def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
     c = math.cos(x[Motion.YAW])
     s = math.sin(x[Motion.YAW])
     return x[Motion.X] + c * ahead - s * left, x[Motion.Y] + s * ahead + c * left
+
+
+@compiled
+def ground_velocity(x: FloatArray) -> tuple[float, float]:
+    """Return the velocity of a vehicle with state `x` over the ground (east, north) [m/s]."""
+    c = math.cos(x[Motion.YAW])
+    s = math.sin(x[Motion.YAW])
+    return c * x[Motion.VX] - s * x[Motion.VY], s * x[Motion.VX] + c * x[Motion.VY]
 
 
 @compiled

@@ -28,6 +28,12 @@ from typing import Final
 import numpy as np
 
 from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, normal, uniform
+from edge_agent.lab.simulation.unevenness import (
+    COBBLES,
+    HeightWave,
+    SurfaceColumn,
+    uneven_surface,
+)
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -59,12 +65,13 @@ class Wave:
 class Relief:
     """Slopes of the roads in a scenario. They are the sum of three parts: the slopes `waves`, the
     `crossfall` (sideways slope) of every lane [1], and the sideways slope of bends, which is
-    `banking` [m] times the curvature of the bend.
+    `banking` [m] times the curvature of the bend. The waves `surface` make the road uneven.
     """
 
     waves: tuple[Wave, ...] = ()
     crossfall: float = 0.0
     banking: float = 0.0
+    surface: tuple[HeightWave, ...] = ()
 
     @property
     def table(self) -> FloatArray:
@@ -84,6 +91,13 @@ class Relief:
                 wave.stepped,
             )
         return table
+
+    @property
+    def surface_table(self) -> FloatArray:
+        """Return the unevenness as a table, from which the function `load_swing` reads, shape
+        (waves, 4).
+        """
+        return np.array(self.surface).reshape(-1, len(SurfaceColumn))
 
 
 class WaveColumn(IntEnum):
@@ -195,12 +209,18 @@ def hilly_relief(seed: int) -> Relief:
     return Relief((lasting, *waves, steps), crossfall=0.025 * uniform(key, 13))
 
 
+def cobbled_relief(seed: int) -> Relief:
+    """Return a level relief of cobbles, on which the wheel loads swing."""
+    return Relief(surface=uneven_surface(COBBLES, seed))
+
+
 ROADS: Final[dict[str, Callable[[int], Relief]]] = {
     "level": level_relief,
     "rolling": rolling_relief,
     "stepped": stepped_relief,
     "banked": banked_relief,
     "hilly": hilly_relief,
+    "cobbled": cobbled_relief,
 }
 """Functions that return the relief of a test track for a seed, by name."""
 

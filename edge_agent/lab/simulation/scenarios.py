@@ -25,6 +25,7 @@ from edge_agent.lab.simulation.friction import (
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
 from edge_agent.lab.simulation.roads import LanePoint, Network, Road, build_network
+from edge_agent.lab.simulation.unevenness import COBBLES, uneven_surface
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
@@ -247,6 +248,11 @@ def drawn_town(seed: int) -> Scenario:
         patches=patches,
         relief=relief,
     )
+
+
+def with_cobbles(town: Scenario, seed: int) -> Scenario:
+    """Return the scenario with cobbles on all roads, on which the wheel loads swing."""
+    return replace(town, relief=replace(town.relief, surface=uneven_surface(COBBLES, seed)))
 
 
 def winter(seed: int) -> Scenario:

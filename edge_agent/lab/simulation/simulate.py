@@ -28,6 +28,7 @@ from edge_agent.lab.simulation.plant import (
     advance,
     command,
     gravity,
+    ground_velocity,
     regenerate,
     start_at,
     strongest_pull,
@@ -52,6 +53,7 @@ from edge_agent.lab.simulation.sensors import (
     sensors_named,
 )
 from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
+from edge_agent.lab.simulation.unevenness import load_swing
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
@@ -138,9 +140,9 @@ def simulate_manoeuvre(
     _check_positive(speed=speed, rate_hz=setup.rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
+    road = road_named(setup.road, seed, setup.slope)
     world = ProvingGround(
-        _friction_field(manoeuvre.friction if mu is None else mu),
-        road_named(setup.road, seed, setup.slope).table,
+        _friction_field(manoeuvre.friction if mu is None else mu), road.table, road.surface_table
     )
     records = _drive_manoeuvre(
         manoeuvre, truth, world, speed, setup.rate_hz, max(1, round(duration * setup.rate_hz))
@@ -182,11 +184,12 @@ def _friction_field(mu: Friction) -> Callable[[float, float, float], float]:
 
 class ProvingGround(NamedTuple):
     """The test track: a function that returns the friction at time t [s] and place (x, y) [m], and
-    the table of the relief (slopes).
+    the tables of the relief (slopes) and of the unevenness of its surface.
     """
 
     friction: Callable[[float, float, float], float]
     relief: FloatArray
+    surface: FloatArray
 
 
 def _drive_manoeuvre(
@@ -236,8 +239,11 @@ def _drive_manoeuvre(
                     currents[i], truth.motors, asked, float(x[Motion.OMEGA + i]), dt
                 )
                 u[Control.BRAKE, i] = 0.0
+        velocity = ground_velocity(x)
         for i in range(4):
-            u[Control.MU, i] = world.friction(k * dt, *wheel_place(x, p, i))
+            place = wheel_place(x, p, i)
+            u[Control.MU, i] = world.friction(k * dt, *place)
+            u[Control.SWING, i] = load_swing(world.surface, place, velocity)
         observe(x, p, u, w, records[k])
         advance(x, p, u, w, dt / substeps, substeps)
     return records

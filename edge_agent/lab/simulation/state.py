@@ -81,8 +81,8 @@ PARAMETERS: Final = len(Parameter) + len(TrueParameter)
 
 
 class Control(IntEnum):
-    """Index of a row of the simulated vehicle's inputs (5, 4): four rows with one input per wheel,
-    and a row with the slope of the road under the vehicle.
+    """Index of a row of the simulated vehicle's inputs (6, 4): rows with one input per wheel, and a
+    row with the slope of the road under the vehicle.
     """
 
     STEER = 0  # [rad] at the road wheel
@@ -92,6 +92,7 @@ class Control(IntEnum):
     # rise of the road per metre ahead of the vehicle, and to its left; the last two numbers are
     # unused
     TILT = 4
+    SWING = 5  # change of the wheel's load by an uneven road, over its static load
 
 
 INPUTS: Final = len(Control)
