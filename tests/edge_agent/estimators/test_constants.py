@@ -129,7 +129,7 @@ MOVES = {
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.15),
     # Group: noise. Larger assumed noise makes the normalised innovations (nis) smaller.
-    "omega_noise": Move("nis", "gaining-slalom", 0.6),
+    "omega_noise": Move("nis", "slalom", 0.4),
     "angle_share": Move("vy_std", "constant-radius", 1.25),
     "spin_share": Move("nis", "braking", 0.9),
     "floor_x": Move("nis", "acceleration", 0.92),

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
@@ -50,6 +51,26 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 def sliding_degree(memory: MixtureMemory) -> float:
     """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the current block (0.05 s)."""
     return float(memory.slip.held - memory.slip.ended)
+
+
+@compiled
+def fastest_speed(features: BlockFeatures, vx: float) -> float:
+    """Return the speed [m/s] of the car, `vx`, or that of its fastest wheel if this is larger."""
+    fastest = abs(vx)
+    for wheel in range(4):
+        if not math.isnan(features.rolling[wheel]):
+            fastest = max(fastest, abs(features.rolling[wheel]))
+    return fastest
+
+
+@compiled
+def slow_noise(fastest: float) -> float:
+    """Return the factor by which the measurement noise R of slips is multiplied at the speed
+    `fastest` [m/s]. Slip is a speed difference over the speed. Below SLOW_M_S the errors of this
+    difference, such as those by steering geometry, do not decrease with the speed any more.
+    """
+    share = min(max(fastest, SLOWEST_SLIP_M_S) / SLOW_M_S, 1.0)
+    return 1.0 / (share * share)
 
 
 @compiled

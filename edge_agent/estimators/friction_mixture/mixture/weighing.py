@@ -18,7 +18,11 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.block.grip_guard import guard_penalty
-from edge_agent.estimators.friction_mixture.block.wheel_slip import wheel_speed
+from edge_agent.estimators.friction_mixture.block.wheel_slip import (
+    fastest_speed,
+    slow_noise,
+    wheel_speed,
+)
 from edge_agent.estimators.friction_mixture.mixture.ice_patch import shrink_patches
 from edge_agent.estimators.friction_mixture.mixture.mixing import (
     active_nodes,
@@ -78,6 +82,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     """
     features = scratch.features
     inflation = max(design.constants.physical.correlation_time / features.duration, 1.0)
+    inflation *= slow_noise(fastest_speed(features, memory.overall_mean[NodeState.VX]))
     steady = design.constants.chosen.steady_share
     features.novelty = steady + (1.0 - steady) * features.new
     for kind in range(2):
@@ -149,6 +154,7 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     for j in range(count):
         best = max(best, scratch.log_likelihood[j])
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
+    blind = blind or fastest_speed(features, memory.overall_mean[NodeState.VX]) < SLOWEST_M_S
     slid = memory.slip.held
     share = math.exp(
         evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
@@ -156,14 +162,13 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
     price = 1.0 - demand_weight(features.demand)
     believed = used_evidence_share(memory.trust, constants)
     believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
-    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * believed
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants.guards.plausible_loss, 0.0)
         loss = max(loss, -constants.guards.plausible_loss)
-        loss = max(moving * (share * loss + beyond), -constants.guards.largest_loss)
-        loss -= moving * guard_penalty(memory.grip, constants, design.sides.mu[j])
-        charged = charge_penalty(memory, j, moving * price * scratch.moved[j])
+        loss = max(believed * (share * loss + beyond), -constants.guards.largest_loss)
+        loss -= believed * guard_penalty(memory.grip, constants, design.sides.mu[j])
+        charged = charge_penalty(memory, j, believed * price * scratch.moved[j])
         scratch.log_likelihood[j] = 0.0 if blind else loss - charged
 
 
@@ -183,21 +188,6 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
     charged = max(price, -memory.penalty[node])
     memory.penalty[node] += charged
     return float(charged)
-
-
-@compiled
-def slip_meaning(features: BlockFeatures, vx: float) -> float:
-    """Return the factor, 0 to 1, with which the evidence from slip counts. It is small at low
-    speed, because slip is then a quotient of small numbers.
-
-    The speed is `vx` [m/s], or that of the fastest wheel if this is larger. The factor is 0 up to
-    SLOWEST_M_S, 1 from twice that speed, and linear between them.
-    """
-    fastest = abs(vx)
-    for wheel in range(4):
-        if not math.isnan(features.rolling[wheel]):
-            fastest = max(fastest, abs(features.rolling[wheel]))
-    return min(max(fastest / SLOWEST_M_S - 1.0, 0.0), 1.0)
 
 
 @compiled

@@ -1,0 +1,55 @@
+"""Tests of the default estimator at walking pace: wheels that spin on ice, and starts on a dry
+road.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators.estimates import Estimates
+from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
+from schemas.numeric import FloatArray
+from tests.edge_agent.estimators.drives import TORQUE, signals_of
+
+
+def start(mu: float, vehicle: str, seed: int) -> tuple[Estimates, FloatArray]:
+    """Simulate a car that accelerates from walking pace without torque signals. Return the
+    estimates and the true speed (T,) [m/s].
+    """
+    log, known = simulate_manoeuvre(
+        "acceleration",
+        mu=mu,
+        speed=0.6,
+        seed=seed,
+        duration_s=5.0,
+        setup=DriveSetup(sensors="rough", vehicle=vehicle),
+    )
+    signals = signals_of(log)
+    signals[:, TORQUE] = np.nan
+    estimates = bank_of("aco-fckf", [known]).advance(log["t"].to_numpy()[:, None], signals[:, None])
+    return estimates, log["true_vx"].to_numpy()
+
+
+@pytest.mark.parametrize("vehicle", ["van", "sedan"])
+def test_wheels_that_spin_on_ice_are_noticed_below_three_metres_per_second(vehicle: str) -> None:
+    for seed in range(5, 9):
+        estimates, speed = start(0.15, vehicle, seed)
+        slow = speed < 3.0
+        assert estimates.p_slippery[slow, 0][-1] > 0.95
+        assert estimates.mu_upper[slow, 0][-1] < 0.4
+
+
+@pytest.mark.parametrize("vehicle", ["van", "sedan"])
+def test_a_start_on_a_dry_road_is_not_slippery(vehicle: str) -> None:
+    for seed in range(5, 9):
+        estimates, _ = start(0.8, vehicle, seed)
+        assert estimates.mu_upper[:, 0].min() > 0.8
+        assert estimates.p_slippery[200:, 0].max() < 0.1
+
+
+def test_nothing_is_learned_about_friction_at_standstill() -> None:
+    estimates, speed = start(0.15, "van", 5)
+    standing = speed < 1.0
+    assert np.ptp(estimates.mu_upper[standing, 0][50:]) < 0.02
