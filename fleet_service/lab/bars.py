@@ -92,7 +92,9 @@ BARS: Final[dict[str, MapBar]] = {
     ),
     "fusion.value.alert.precision.r20": MapBar(0.90, "more", "of cell-minutes under alert"),
     "fusion.value.alert.recall.r20": MapBar(0.95, "more", "of slippery cell-minutes"),
+    "fusion.value.alert.recall.ice.r20": MapBar(0.95, "more", "of icy cell-minutes"),
     "fusion.value.unnoticed.r5": MapBar(20, "less", "min, median, 5 cars an hour"),
+    "fusion.value.unnoticed.ice.r5": MapBar(20, "less", "min of ice, median, 5 cars an hour"),
     "fusion.demand.slippery.grip_raised": MapBar(
         0.05, "less", "of cells with grip on gentle roads: P(slippery) > .5"
     ),

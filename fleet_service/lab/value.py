@@ -34,7 +34,7 @@ from fleet_service.lab.town import CELLS, LENGTH, ROADS, START, Town, Visits
 from fleet_service.serve.alerts import Alerts
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray
-from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
+from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU, SURFACES
 
 VEHICLES: Final = 60
 MINUTES: Final = 360
@@ -48,6 +48,7 @@ GENTLE: Final = 0.6  # factor of the demand on gentle roads
 NARROW: Final = 0.3
 UNNOTICED_MOST: Final = 90.0  # [min] limit, which also stands for no warning
 HOUR_S: Final = 3600.0
+ICE_MOST = SURFACES["ice"][1]  # largest friction of ice; snow is slippery too
 CARS: Final = (5, 20)  # vehicles per hour and road
 SEEDS: Final = 3
 
@@ -167,10 +168,10 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
     return Readings(*(np.array(column) for column in zip(*read, strict=True)))
 
 
-def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
-    """Return, for each cell that became slippery, the minutes until the first warning; at most
-    UNNOTICED_MOST, which also stands for no warning. `warned` is the mask of warned cells each time
-    the map is read.
+def count_unnoticed(place: Town, warned: BoolArray, below: float = SLIPPERY_MU) -> FloatArray:
+    """Return, for each cell whose friction fell below `below`, the minutes until the first warning;
+    at most UNNOTICED_MOST, which also stands for no warning. `warned` is the mask of warned cells
+    each time the map is read.
     """
     moments = np.arange(-(-BEGIN // STEP) * STEP, MINUTES + 1, STEP)
     out = []
@@ -178,7 +179,7 @@ def count_unnoticed(place: Town, warned: BoolArray) -> FloatArray:
         (place.changed >= BEGIN) & (place.changed <= MINUTES - UNNOTICED_MOST)
     ).tolist():
         change = int(place.changed[cell])
-        turned = place.mu[change - 1, cell] >= SURE_GRIP and place.mu[change, cell] < SLIPPERY_MU
+        turned = place.mu[change - 1, cell] >= SURE_GRIP and place.mu[change, cell] < below
         if turned:
             found = moments[(moments >= change) & warned[:, cell]]
             out.append(
@@ -194,11 +195,11 @@ def precision(truth: FloatArray, warned: BoolArray) -> float:
     return float((truth[warned] < SLIPPERY_MU).mean()) if warned.any() else float("nan")
 
 
-def recall(truth: FloatArray, warned: BoolArray) -> float:
-    """Return the recall of warnings: the share of truly slippery cells and times that had a
-    warning.
+def recall(truth: FloatArray, warned: BoolArray, below: float = SLIPPERY_MU) -> float:
+    """Return the recall of warnings: the share of the cells and times with a true friction less
+    than `below` that had a warning.
     """
-    return float(warned[truth < SLIPPERY_MU].mean())
+    return float(warned[truth < below].mean())
 
 
 def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, float]:
@@ -221,8 +222,17 @@ def measure_rate(cars: int, seeds: range, demand: float = 1.0) -> dict[str, floa
         out[f"{label}.precision.r{cars}"] = precision(truth, warned)
         out[f"{label}.recall.r{cars}"] = recall(truth, warned)
         unnoticed = "unnoticed" if label == "alert" else f"{label}.unnoticed"
-        out[f"{unnoticed}.r{cars}"] = float(np.median(minutes)) if len(minutes) else float("nan")
+        out[f"{unnoticed}.r{cars}"] = median_of(minutes)
+    alerted = np.concatenate([of.alerted for _, of in towns])
+    minutes = np.concatenate([count_unnoticed(place, of.alerted, ICE_MOST) for place, of in towns])
+    out[f"alert.recall.ice.r{cars}"] = recall(truth, alerted, ICE_MOST)
+    out[f"unnoticed.ice.r{cars}"] = median_of(minutes)
     return out
+
+
+def median_of(values: FloatArray) -> float:
+    """Return the median of the values, or NaN if there are none."""
+    return float(np.median(values)) if len(values) else float("nan")
 
 
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:

@@ -65,6 +65,8 @@ def test_minutes_are_counted_from_the_change_and_never_counts_most() -> None:
     warned[moments >= 130, 0] = True
     minutes = value.count_unnoticed(place, warned)
     assert minutes.tolist() == [10.0, *[value.UNNOTICED_MOST] * (town.LENGTH - 1)]
+    frozen = place.mu[-1, 0]
+    assert len(value.count_unnoticed(place, warned, frozen)) == 0
 
 
 @pytest.mark.parametrize(
@@ -77,3 +79,10 @@ def test_precision_and_recall_count_both_directions(
     truth: FloatArray = np.array([0.2, 0.8])
     assert value.precision(truth, np.array(warned)) == precision
     assert value.recall(truth, np.array(warned)) == recall
+
+
+def test_recall_of_ice_leaves_snow_out() -> None:
+    truth: FloatArray = np.array([0.15, 0.35, 0.35])
+    warned = np.array([True, False, False])
+    assert value.recall(truth, warned) == pytest.approx(1.0 / 3.0)
+    assert value.recall(truth, warned, value.ICE_MOST) == 1.0
