@@ -43,7 +43,7 @@ from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import USUAL, DriveSet, DriveSpec, estimates, realistic
 from edge_agent.lab.evaluation.measures import errors, is_covered
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
-from edge_agent.lab.simulation.scenarios import drawn_town, winter
+from edge_agent.lab.simulation.scenarios import drawn_town, winter, with_cobbles
 from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
@@ -115,16 +115,19 @@ def in_winter(seed: int) -> bool:
     return seed % 2 == 1
 
 
-def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
+def town(
+    seed: int, cars: int, seconds: float, *, cobbles: bool = False
+) -> tuple[DriveSet, FloatArray]:
     """Simulate cars with large sensor errors (as in real cars) in a town drawn by the seed. Return
     their drives, and the utilisation of each car's most heavily used wheel, (T, N). Utilisation is
     the tyre force divided by the largest possible tyre force.
 
-    In winter towns all cars have winter equipment.
+    In winter towns all cars have winter equipment. With `cobbles`, all roads are uneven.
     """
     cold = in_winter(seed)
+    scenario = winter(seed) if cold else drawn_town(seed)
     fleet = SimulatedFleet(
-        winter(seed) if cold else drawn_town(seed),
+        with_cobbles(scenario, seed) if cobbles else scenario,
         cars,
         seed,
         RATE_HZ,

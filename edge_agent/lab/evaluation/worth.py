@@ -18,7 +18,8 @@ Legend of the filter variants (for all scores, less is better)
     colony       all rules with the vertices found by the ant colony, mean over the searches; same
                  budget as the random search
 
-Each seed gives a town and a set of manoeuvres on hills, with its own friction and vehicles. A ratio
+Each seed gives a town and a set of manoeuvres, with its own friction and vehicles. Every second
+town and some of the manoeuvres are on cobbles, where wheel speeds and loads swing. A ratio
 compares two variants: the mean score of one over all seeds, divided by that of the other. The
 figure `.difference` of a ratio is the mean over seeds of the difference of both scores, and
 `.difference.se` the standard error of that mean.
@@ -91,7 +92,8 @@ def campaign(
     found = ways()
     scores: dict[str, dict[str, list[float]]] = {way: {} for way in found}
     for seed in chosen:
-        batches = [town(seed, cars, seconds)[0], manoeuvres(seed, 2.0 if quick else DRIVE_S)]
+        rides = town(seed, cars, seconds, cobbles=seed % 2 == 1)[0]
+        batches = [rides, manoeuvres(seed, 2.0 if quick else DRIVE_S)]
         for way, designs in found.items():
             parts = [_score_drives(batches, design) for design in designs]
             for name in parts[0]:
