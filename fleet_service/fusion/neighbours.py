@@ -92,6 +92,8 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
+# number of cells in a tile, and largest number of aged beliefs that one reading keeps
+_TILE_CELLS: Final = 4 ** (grid.CELL_ZOOM - grid.TILE_ZOOM)
 
 
 @refcount_free_inlined
@@ -156,9 +158,16 @@ class Buffers(NamedTuple):
     all messages (factors from neighbours). `quiet` (32) is the same product with messages that are
     weaker because visits gave no friction value. `message` (32) is one message, and `road` (32) the
     belief about the road of a neighbour.
+
+    The aged beliefs of the last cells are kept, because cells that are read together are mostly
+    neighbours: `kept` (K, 32). Row i, the slot modulo K, is for the slot and time `kept_for[i]`
+    (2,), and for row `kept_prior[i]` of the priors.
     """
 
     scratch: FloatArray
+    kept: FloatArray
+    kept_for: IntArray
+    kept_prior: IntArray
     own: FloatArray
     product: FloatArray
     quiet: FloatArray
@@ -179,8 +188,12 @@ def road_beliefs(
     """
     parts = MapParts(live, table, weather, rule)
     out = np.empty((len(slots), _BINS))
+    kept = min(16 * len(slots), _TILE_CELLS)
     buffers = Buffers(
         np.empty((3, PADDED)),
+        np.empty((kept, _BINS)),
+        np.full((kept, 2), NONE),
+        np.empty(kept, np.int64),
         np.empty(_BINS),
         np.empty(_BINS),
         np.empty(_BINS),
@@ -202,7 +215,7 @@ def _read_beliefs(
     weather = parts.weather
     rule = parts.rule
     for k in range(len(slots)):
-        prior = _age_belief(live, weather, slots[k], now[k], buffers.scratch)
+        prior = _age_belief(live, weather, slots[k], now[k], buffers)
         for i in range(_BINS):
             buffers.own[i] = buffers.scratch[ScratchRow.BELIEF, i]
         asked = Asked(slots[k], now[k], prior)
@@ -286,7 +299,7 @@ def _can_hear(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> bool
     live = parts.live
     if live.cells[row].values <= 0.0 or is_border(live, asked.slot, row, asked.now):
         return False
-    _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
+    _age_belief(live, parts.weather, row, asked.now, buffers)
     return _is_measured(parts, asked, row, buffers.scratch[ScratchRow.BELIEF])
 
 
@@ -373,7 +386,7 @@ def _choose_message(
             if side == ACROSS:
                 continue
             break
-        _age_belief(live, parts.weather, row, asked.now, buffers.scratch)
+        _age_belief(live, parts.weather, row, asked.now, buffers)
         belief = buffers.scratch[ScratchRow.BELIEF]
         slippery = read_slippery(parts.rule.slippery, cells, row, belief)
         kept_surface = _KEPT[1 if side == ACROSS else step]
@@ -491,15 +504,26 @@ def _stored_slippery(live: Rows, row: int) -> float:
 
 
 @refcount_free
-def _age_belief(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
-    """Age the belief about a slot (cell and heading sector) to `now` [ns] and write it to
-    `scratch`. Return the row number of the prior that the weather of the cell's region gives.
+def _age_belief(live: Rows, weather: Weather, slot: int, now: int, buffers: Buffers) -> int:
+    """Age the belief about a slot (cell and heading sector) to `now` [ns] and write it to the row
+    BELIEF of `buffers.scratch`, or copy it if it is still kept. Return the row number of the prior
+    that the weather of the cell's region gives.
     """
+    p = buffers.scratch[ScratchRow.BELIEF]
+    place = slot % len(buffers.kept)
+    if buffers.kept_for[place, 0] == slot and buffers.kept_for[place, 1] == now:
+        for i in range(_BINS):
+            p[i] = buffers.kept[place, i]
+        return int(buffers.kept_prior[place])
     cells = live.cells
-    p = scratch[ScratchRow.BELIEF]
     unpack_belief(live.belief, slot, p)
     seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
     drift, change, prior = road_time(weather, cells[slot].key, now - int(seconds * NS), now)
     if now > cells[slot].time:
-        forget(p, drift, change, weather.prior[prior], scratch[ScratchRow.PADDED])
+        forget(p, drift, change, weather.prior[prior], buffers.scratch[ScratchRow.PADDED])
+    buffers.kept_for[place, 0] = slot
+    buffers.kept_for[place, 1] = now
+    buffers.kept_prior[place] = prior
+    for i in range(_BINS):
+        buffers.kept[place, i] = p[i]
     return int(prior)

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_service.fusion import Fusion
+from fleet_service.fusion import Fusion, neighbours
 from fleet_service.fusion.adjacent import next_cell
 from fleet_service.fusion.constants import NEIGHBOURS, UNSURE
 from fleet_service.fusion.weather import Reports
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray
+from schemas.thresholds import NS
 from tests.fleet_service.examples import (
     CELL,
     REGION,
@@ -243,3 +244,16 @@ def test_values_that_faded_are_not_refreshed_by_a_neighbour() -> None:
     now = START + int(week * 1e9)
     slot = fusion.slots_of(np.array([CELL]), np.array([0]))
     assert np.allclose(fusion.beliefs(slot, now)[0], mugrid.PRIOR, atol=1e-4)
+
+
+def test_a_reading_of_many_cells_equals_readings_of_single_cells(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fusion = road({k: (snow() if k % 7 < 3 else dry()) for k in range(12)} | {12: UNTESTED})
+    slots = np.arange(fusion.size)
+    now = START + 3600 * NS
+    single = np.concatenate([fusion.beliefs(slots[k : k + 1], now) for k in slots])
+    assert np.array_equal(fusion.beliefs(slots, now), single)
+    # The result does not depend on how many aged beliefs are kept.
+    monkeypatch.setattr(neighbours, "_TILE_CELLS", 3)
+    assert np.array_equal(fusion.beliefs(slots, now), single)
