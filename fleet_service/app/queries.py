@@ -42,7 +42,7 @@ class Queries:
         """Return those cells of a tile that readers may see, as an Arrow stream (bytes); empty
         bytes if there are none.
         """
-        shown = self._shared.tiles.make(tile, now)
+        (shown,) = self._shared.tiles.make([tile], now)
         return shown.payload if shown.cells.num_rows else b""
 
     def take_changed(self, now: int) -> list[int]:

@@ -5,8 +5,8 @@ friction value), estimate unvisited cells, encode. Pure (no I/O).
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,11 @@ from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.query import Format, MapQuery
 from schemas.regions import keys_along
+
+# Largest numbers of tiles and of cells that are made in one step. Making them takes some
+# milliseconds, in which no other expensive query gets a reply.
+TILES_TOGETHER: Final = 32
+CELLS_TOGETHER: Final = 2_000
 
 
 def answer_query(
@@ -41,15 +46,34 @@ def answer_query(
         InputError: the route is too long.
     """
     route = keys_along(query.route) if query.route else None
-    for tile in _select_tiles(cache, query, route, only):
-        if wanted(tile):
-            if route is None and query.basis is None:
-                shown = cache.shown(tile, now)
-            else:
-                shown = _view_tile(cache, tile, query, route, now)
-            payload = _encode_tile(shown, _select_rows(shown, query), query.format, tile)
-            if payload is not None:
-                yield tile, payload
+    tiles = filter(wanted, _select_tiles(cache, query, route, only))
+    for tile, shown in (
+        _shown_in_groups(cache, tiles, now)
+        if route is None and query.basis is None
+        else ((tile, _view_tile(cache, tile, query, route, now)) for tile in tiles)
+    ):
+        payload = _encode_tile(shown, _select_rows(shown, query), query.format, tile)
+        if payload is not None:
+            yield tile, payload
+
+
+def _shown_in_groups(
+    cache: TileCache, tiles: Iterable[int], now: int
+) -> Iterator[tuple[int, ShownTile]]:
+    """Yield each tile with its number. Small tiles are made in groups, when the first of a group is
+    needed.
+    """
+    group: list[int] = []
+    cells = 0
+    for tile in tiles:
+        with cache.guard:
+            count = cache.state.count(tile)
+        if group and (len(group) == TILES_TOGETHER or cells + count > CELLS_TOGETHER):
+            yield from zip(group, cache.shown(group, now), strict=True)
+            group, cells = [], 0
+        group.append(tile)
+        cells += count
+    yield from zip(group, cache.shown(group, now), strict=True)
 
 
 class AnswerSize(NamedTuple):

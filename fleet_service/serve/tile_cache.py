@@ -8,7 +8,7 @@ alert was sent before the query. Under load, most queries cost only a look-up.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Final, NamedTuple
 
@@ -93,26 +93,43 @@ class TileCache:
         """
         self._acknowledged = self.state.change
 
-    def shown(self, tile: int, now: int) -> ShownTile:
-        """Return a tile that is recent enough for a query at `now` [ns]: from the cache, or newly
-        made.
+    def shown(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
+        """Return tiles that are recent enough for a query at `now` [ns]. Each is from the cache, or
+        newly made.
         """
+        found = {tile: self._recent(tile, now) for tile in tiles}
+        missing = [tile for tile, kept in found.items() if kept is None]
+        made = dict(zip(missing, self.make(missing, now), strict=True))
+        return [found[tile] or made[tile] for tile in tiles]
+
+    def _recent(self, tile: int, now: int) -> ShownTile | None:
         kept = self._kept.get(tile)
         if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
-            return self.make(tile, now)
+            return None
         whole = kept.change >= min(self._acknowledged, self.state.changed_at(tile))
-        return kept if whole else self.make(tile, now)
+        return kept if whole else None
 
-    def make(self, tile: int, now: int) -> ShownTile:
-        """Make a tile from the state of the map at `now` [ns], and store it in the cache."""
+    def make(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
+        """Make tiles from the state of the map at `now` [ns], and store them in the cache. The
+        beliefs of all tiles are read and encoded together, because for a single small tile most of
+        the time would be the overhead of the calls.
+        """
+        if not tiles:
+            return []
         with self.guard:
             change = self.state.change
-            cells = self.seen(self._from_south(self.public(self.state.slots(tile), now)), now)
-        payload = arrow_stream(batch_of(cells, now))
-        batch = pa.ipc.open_stream(payload).read_next_batch()
-        columns = selected_by(batch)
-        made = ShownTile(batch, columns, payload, *_common_bounds(columns), now, change)
-        self._keep(tile, made)
+            slots = np.concatenate([self.state.slots(tile) for tile in tiles])
+            slots, owners = self._by_tile_from_south(self.public(slots, now))
+            cells = self.seen(slots, now)
+        batch = batch_of(cells, now)
+        first, last = (np.searchsorted(owners, tiles, side) for side in ("left", "right"))
+        made = []
+        for k, tile in enumerate(tiles):
+            payload = arrow_stream(batch.slice(first[k], last[k] - first[k]))
+            own = pa.ipc.open_stream(payload).read_next_batch()
+            columns = selected_by(own)
+            made.append(ShownTile(own, columns, payload, *_common_bounds(columns), now, change))
+            self._keep(tile, made[-1])
         return made
 
     def seen(self, slots: IntArray, now: int) -> CellView:
@@ -142,9 +159,15 @@ class TileCache:
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
 
-    def _from_south(self, slots: IntArray) -> IntArray:
-        _, row = grid.deinterleave(self.state.fusion.live.key[slots] // grid.SECTORS)
-        return slots[np.argsort(-row, kind="stable")]
+    def _by_tile_from_south(self, slots: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the slots (row numbers) ordered by tile, and within a tile from south to north;
+        also return the tile of each of them.
+        """
+        cell = self.state.fusion.live.key[slots] // grid.SECTORS
+        _, row = grid.deinterleave(cell)
+        tile = grid.tile_of(cell)
+        order = np.lexsort((-row, tile))
+        return slots[order], tile[order]
 
     def _keep(self, tile: int, made: ShownTile) -> None:
         with self.guard:
