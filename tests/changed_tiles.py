@@ -10,4 +10,9 @@ def changed_tiles(queries: Queries, now: int) -> list[tuple[int, bytes]]:
     `now` is the present time [ns].
     """
     changed = queries.take_changed(now)
-    return [(tile, stream) for tile in changed if (stream := queries.tile(tile, now))]
+    found: dict[int, bytes] = {}
+    while changed:
+        made = queries.first_tiles(changed, now)
+        found |= made
+        changed = changed[len(made) :]
+    return [(tile, stream) for tile, stream in found.items() if stream]

@@ -38,12 +38,14 @@ class Queries:
         self._shared = shared
         self._past = HistoricalMaps(root)
 
-    def tile(self, tile: int, now: int) -> bytes:
-        """Return those cells of a tile that readers may see, as an Arrow stream (bytes); empty
-        bytes if there are none.
+    def first_tiles(self, tiles: list[int], now: int) -> dict[int, bytes]:
+        """Return the first of the given tiles that are made in one step, at least one. For each
+        tile, those cells that readers may see are given as an Arrow stream (bytes), or empty bytes
+        if there are none.
         """
-        (shown,) = self._shared.tiles.make([tile], now)
-        return shown.payload if shown.cells.num_rows else b""
+        group = self._shared.tiles.first_group(tiles)
+        made = zip(group, self._shared.tiles.make(group, now), strict=True)
+        return {tile: shown.payload if shown.cells.num_rows else b"" for tile, shown in made}
 
     def take_changed(self, now: int) -> list[int]:
         """Return the numbers of the tiles that changed since the last call. If cells are hidden for

@@ -108,7 +108,7 @@ class Service:
         self._rounds = TileRounds(
             config.put_s,
             lambda: self.engine.queries.take_changed(self._clock.now()),
-            self._put_tile,
+            self._put_tiles,
             self.engine.counts,
             time.monotonic,
         )
@@ -287,10 +287,13 @@ class Service:
         if messages:
             publish_alerts(session, ingest_messages(self.engine, self._clock, messages))
 
-    def _put_tile(self, tile: int) -> None:
-        stream = self.engine.queries.tile(tile, self._clock.now())
-        if stream and self._session is not None:
-            publish_tile(self._session, tile, stream)
+    def _put_tiles(self, waiting: list[int]) -> int:
+        """Publish the first of the waiting tiles, and return their number."""
+        streams = self.engine.queries.first_tiles(waiting, self._clock.now())
+        for tile, stream in streams.items():
+            if stream and self._session is not None:
+                publish_tile(self._session, tile, stream)
+        return len(streams)
 
 
 def ingest_messages(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:

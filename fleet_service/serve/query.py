@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -19,11 +19,6 @@ from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.query import Format, MapQuery
 from schemas.regions import keys_along
-
-# Largest numbers of tiles and of cells that are made in one step. Making them takes some
-# milliseconds, in which no other expensive query gets a reply.
-TILES_TOGETHER: Final = 32
-CELLS_TOGETHER: Final = 2_000
 
 
 def answer_query(
@@ -63,17 +58,11 @@ def _shown_in_groups(
     """Yield each tile with its number. Small tiles are made in groups, when the first of a group is
     needed.
     """
-    group: list[int] = []
-    cells = 0
-    for tile in tiles:
-        with cache.guard:
-            count = cache.state.count(tile)
-        if group and (len(group) == TILES_TOGETHER or cells + count > CELLS_TOGETHER):
-            yield from zip(group, cache.shown(group, now), strict=True)
-            group, cells = [], 0
-        group.append(tile)
-        cells += count
-    yield from zip(group, cache.shown(group, now), strict=True)
+    left = list(tiles)
+    while left:
+        group = cache.first_group(left)
+        yield from zip(group, cache.shown(group, now), strict=True)
+        left = left[len(group) :]
 
 
 class AnswerSize(NamedTuple):

@@ -27,6 +27,10 @@ from schemas.thresholds import NS
 # [ns] Age up to which a cached tile is used; published tiles are up to a second old too.
 SHOWN_NS: Final = NS
 KEPT_BYTES: Final = 32 << 20
+# Largest numbers of tiles and of cells that are made in one step. Making them takes some
+# milliseconds, in which no other expensive query gets a reply.
+TILES_TOGETHER: Final = 32
+CELLS_TOGETHER: Final = 2_000
 # columns by which a query selects cells
 SELECTED_BY: Final = ("vehicles", "west", "south", "east", "north")
 
@@ -108,6 +112,14 @@ class TileCache:
             return None
         whole = kept.change >= min(self._acknowledged, self.state.changed_at(tile))
         return kept if whole else None
+
+    def first_group(self, tiles: Sequence[int]) -> Sequence[int]:
+        """Return the first of the given tiles that should be made in one step: at least one, and
+        more only if they have few cells together.
+        """
+        with self.guard:
+            counts = [self.state.count(tile) for tile in tiles[:TILES_TOGETHER]]
+        return tiles[: max(int((np.cumsum(counts) <= CELLS_TOGETHER).sum()), 1)]
 
     def make(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
         """Make tiles from the state of the map at `now` [ns], and store them in the cache. The

@@ -10,7 +10,6 @@ so that the time of a publication does not reveal when a vehicle passed.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -26,7 +25,8 @@ class TileRounds:
     Args:
         every_s: time between the beginnings of two rounds [s].
         changed: function that returns the tiles that changed since its last call.
-        put: function that makes a tile and publishes it.
+        put: function that makes and publishes the first of the waiting tiles. It returns their
+            number, at least one.
         counts: counts of the service; `tile_rounds_skipped` is increased.
         clock: function that returns monotonic time [s].
     """
@@ -35,7 +35,7 @@ class TileRounds:
         self,
         every_s: float,
         changed: Callable[[], list[int]],
-        put: Callable[[int], None],
+        put: Callable[[list[int]], int],
         counts: ServiceCounts,
         clock: Callable[[], float],
     ) -> None:
@@ -45,7 +45,7 @@ class TileRounds:
         self._counts = counts
         self._clock = clock
         self._due = clock() + every_s
-        self._left = deque[int]()
+        self._left: list[int] = []
 
     @property
     def waiting(self) -> int:
@@ -70,10 +70,10 @@ class TileRounds:
         return True
 
     def go_on(self, share_s: float = SHARE_S) -> None:
-        """Publish tiles of the current round for `share_s` [s], but at least one tile."""
+        """Publish tiles of the current round for `share_s` [s], but at least the next ones."""
         end = self._clock() + share_s
         while self._left:
-            self._put(self._left.popleft())
+            del self._left[: self._put(self._left)]
             if self._clock() >= end:
                 break
 

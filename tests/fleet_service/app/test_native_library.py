@@ -47,7 +47,7 @@ for number in range(2):
         engine.intake.ingest(messages, max(now, NOW + 30 * number * 60 * 10**9))
         engine.settlement.flush()
     for tile in engine.queries.take_changed(now):
-        digest.update(repr(engine.queries.tile(tile, now)).encode())
+        digest.update(repr(engine.queries.first_tiles([tile], now)).encode())
     box = MapQuery(bbox=(-180.0, -85.0, 180.0, 85.0))
     digest.update(repr(list(engine.queries.answer(box, lambda tile: True, now))).encode())
     engine.alerts.expire(now)

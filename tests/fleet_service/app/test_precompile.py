@@ -47,7 +47,8 @@ def drive(root):
         engine.intake.ingest(messages[start : start + 40], time.time_ns())
     engine.settlement.flush()
     now = time.time_ns()
-    assert all(engine.queries.tile(tile, now) for tile in engine.queries.take_changed(now))
+    changed = engine.queries.take_changed(now)
+    assert all(engine.queries.first_tiles([tile], now)[tile] for tile in changed)
     engine.alerts.expire(time.time_ns())
     list(engine.queries.answer(MapQuery(), lambda tile: True, time.time_ns()))
     assert engine.state.fusion.size > 2100, engine.counts

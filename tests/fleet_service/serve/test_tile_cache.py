@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.serve import query, tile_cache
+from fleet_service.serve import tile_cache
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer_query
 from fleet_service.serve.tile_cache import ShownTile, TileCache
@@ -181,8 +181,8 @@ def test_a_query_for_the_whole_map_gets_every_tile_once(monkeypatch: pytest.Monk
         (2, 2000, [2, 1]),
         (32, 40, [2, 1]),
     ):
-        monkeypatch.setattr(query, "TILES_TOGETHER", tiles_together)
-        monkeypatch.setattr(query, "CELLS_TOGETHER", cells_together)
+        monkeypatch.setattr(tile_cache, "TILES_TOGETHER", tiles_together)
+        monkeypatch.setattr(tile_cache, "CELLS_TOGETHER", cells_together)
         groups.clear()
         cache = TileCache(state, nullcontext(), 1)
         replies = list(answer_query(cache, MapQuery(), lambda _: True, NOW))

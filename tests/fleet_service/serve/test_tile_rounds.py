@@ -28,9 +28,10 @@ class Made:
         self.changed = set()
         return taken
 
-    def put(self, tile: int) -> None:
-        self.puts.append((tile, self.now))
+    def put(self, waiting: list[int]) -> int:
+        self.puts.append((waiting[0], self.now))
         self.now += COST_S
+        return 1
 
     def turn(self, seconds: float = 0.0) -> int:
         """Simulate one pass of the service's main loop: other work for `seconds`, and then the
@@ -96,3 +97,16 @@ def test_a_service_that_leaves_puts_what_is_left_and_each_once() -> None:
     made.changed = {5, 6}
     made.rounds.finish(1.0)
     assert [tile for tile, _ in made.puts] == [1, 2, 3, 4, 5, 6]
+
+
+def test_tiles_that_are_put_together_are_put_once() -> None:
+    puts: list[int] = []
+
+    def put_two(waiting: list[int]) -> int:
+        puts.extend(waiting[:2])
+        return len(waiting[:2])
+
+    rounds = TileRounds(1.0, lambda: [1, 2, 3, 4, 5], put_two, ServiceCounts(), lambda: 0.0)
+    rounds.finish(1.0)
+    assert puts == [1, 2, 3, 4, 5]
+    assert not rounds.waiting
