@@ -23,6 +23,7 @@ from tests.edge_agent.estimators.drives import drive, signals_of
 
 SNOW = 0.3
 ICE = 0.25
+ALONE = 7  # an improbable node among probable ones
 # An upper end of the interval below this is a report of a slippery road.
 SLIPPERY = 0.5
 
@@ -68,6 +69,26 @@ def test_road_stays_the_same_while_a_wheel_slides_with_the_same_force(
     )
     assert (memory["weight"][0, 6] < 0.99) == moved
     assert memory["weight"][0, :NODES].sum() == pytest.approx(1.0)
+
+
+def test_a_node_that_only_its_neighbours_keep_alive_has_no_penalty() -> None:
+    context = records(MixtureContext, 1)
+    design = design_of(Memberships(), adaptive=True)
+    put_record(context["design"][0], design)
+    memory = records(MixtureMemory, 1)
+    memory["weight"][0, :NODES] = memory["visit_weight"][0, :NODES] = design.prior
+    memory["weight"][0, ALONE] = 1e-9
+    memory["penalty"] = 50.0
+    apply_road_change(
+        cast(MixtureMemory, memory[0]),
+        cast(MixtureDesign, context["design"][0]),
+        cast(Scratch, context["scratch"][0]),
+        1.0,
+    )
+    penalty = memory["penalty"][0]
+    assert penalty[ALONE] < 0.1
+    others = np.delete(np.arange(NODES), ALONE)
+    assert penalty[others].min() > 49.0
 
 
 def test_five_stops_with_sliding_wheels_keep_speed_and_friction() -> None:

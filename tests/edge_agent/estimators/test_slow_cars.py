@@ -9,6 +9,9 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators.estimates import Estimates
+from edge_agent.lab.evaluation.batch import DriveSet, realistic
+from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS
+from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
 from schemas.numeric import FloatArray
 from tests.edge_agent.estimators.drives import TORQUE, signals_of
@@ -32,6 +35,12 @@ def start(mu: float, vehicle: str, seed: int) -> tuple[Estimates, FloatArray]:
     return estimates, log["true_vx"].to_numpy()
 
 
+@pytest.fixture(scope="module")
+def lane_changes() -> DriveSet:
+    """Lane changes of a car that accelerates from 4 to 40 km/h on a dry road."""
+    return realistic((PAPERS | OTHERS)["001.gaining.dlc"], [FIGURES + 6])
+
+
 @pytest.mark.parametrize("vehicle", ["van", "sedan"])
 def test_wheels_that_spin_on_ice_are_noticed_below_three_metres_per_second(vehicle: str) -> None:
     for seed in range(5, 9):
@@ -53,3 +62,21 @@ def test_nothing_is_learned_about_friction_at_standstill() -> None:
     estimates, speed = start(0.15, "van", 5)
     standing = speed < 1.0
     assert np.ptp(estimates.mu_upper[standing, 0][50:]) < 0.02
+
+
+def test_a_node_that_was_wrong_at_walking_pace_does_not_win_later(lane_changes: DriveSet) -> None:
+    (vehicle,) = lane_changes.vehicles
+    estimates = bank_of("aco-fckf", [vehicle]).advance(lane_changes.t, lane_changes.signals)
+    # A refund of penalties that had never reduced a probability gave .34.
+    assert estimates.mu_upper.min() > 0.8
+
+
+def test_nothing_is_charged_below_the_speed_at_which_slip_has_a_meaning(
+    lane_changes: DriveSet,
+) -> None:
+    (vehicle,) = lane_changes.vehicles
+    bank = bank_of("aco-fckf", [vehicle])
+    slow = int(np.searchsorted(lane_changes.t[:, 0], 1.0))
+    bank.advance(lane_changes.t[:slow], lane_changes.signals[:slow])
+    assert lane_changes.truth["true_vx"][:slow].max() < 1.5
+    assert not bank.memory("penalty").any()

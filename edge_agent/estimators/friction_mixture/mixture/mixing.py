@@ -5,7 +5,7 @@ Legend
     m_j, P_j, w_j   mean (n,), covariance (n, n) and probability of node j
     m, P            mean and covariance of the whole mixture
     zeta            share of a node's predicted probability that came from any other node by a
-                    road change [1]
+                    sudden road change [1]
 
 The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two
 moments. An improbable node thus keeps a plausible vehicle state and can explain the next sample
@@ -106,8 +106,12 @@ def apply_road_change(
     """Move probability between the nodes (friction hypotheses), because the road may have changed
     within the last `metres`.
 
-    Also compute scratch.mixing: for each node, the share of its probability that came from other
-    nodes. `mix_nodes` then replaces this share of the node's state by that of the whole mixture.
+    Also compute scratch.mixing: for each node, the share of its probability that came from all
+    nodes by a sudden change. `mix_nodes` then replaces this share of the node's state by that of
+    the whole mixture.
+
+    A node's penalty has reduced only the probability that the node had before. Therefore the
+    penalty shrinks by the whole share that came from other nodes, its neighbours included.
     """
     count = active_nodes(memory)
     constants = design.constants
@@ -129,11 +133,14 @@ def apply_road_change(
     change_road(visit, prior, NODES, change, predicted)
     copy_vector(visit, predicted)
     change_road(weight, prior, NODES, change, predicted)
-    copy_vector(weight, predicted)
     for j in range(PLACES):
         # An inactive node takes the state of the whole mixture, so that its values stay finite.
-        scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0) if j < count else 1.0
-        memory.penalty[j] *= 1.0 - scratch.mixing[j]
+        gained = scratch.mixing[j] = 1.0
+        if j < count:
+            scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0)
+            gained = max(1.0 - (1.0 - hazard) * weight[j] / predicted[j], scratch.mixing[j])
+        memory.penalty[j] *= 1.0 - gained
+    copy_vector(weight, predicted)
     share_weights(memory, scratch)
 
 

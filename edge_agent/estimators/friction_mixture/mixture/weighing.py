@@ -168,8 +168,10 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
         loss = max(loss, -constants.guards.plausible_loss)
         loss = max(believed * (share * loss + beyond), -constants.guards.largest_loss)
         loss -= believed * guard_penalty(memory.grip, constants, design.sides.mu[j])
-        charged = charge_penalty(memory, j, believed * price * scratch.moved[j])
-        scratch.log_likelihood[j] = 0.0 if blind else loss - charged
+        scratch.log_likelihood[j] = 0.0
+        if not blind:
+            charged = charge_penalty(memory, j, believed * price * scratch.moved[j])
+            scratch.log_likelihood[j] = loss - charged
 
 
 @compiled
@@ -179,7 +181,8 @@ def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
 
     `price` [nat] grows with the distance by which the block has moved the node's vehicle states
     away from their prior. It is negative if the states have moved back. The result is then a
-    refund, which is at most the total charged before.
+    refund, which is at most the total charged before. Probability that a node has since got from
+    other nodes was never charged (`apply_road_change`).
 
     Reason: the evidence of a block is weakened, but its measurements change the vehicle states in
     full. Without the charge, a wrong low friction would remain probable on drives with little grip
