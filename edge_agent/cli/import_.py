@@ -5,6 +5,7 @@ signals to channels). Without a profile, write a draft profile for the user to c
 from __future__ import annotations
 
 import argparse
+import math
 from functools import partial
 from pathlib import Path
 
@@ -66,13 +67,23 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             "source", "sources and --out are needed", "name recordings, and the log to write"
         )
-    if any(args.out.resolve() == source.resolve() for source in args.source):
+    used = {source.resolve(): "one of the recordings" for source in args.source}
+    if args.out.resolve() in used:
         raise InputError("out", f"{args.out} is one of the recordings", "name another file")
+    used[args.out.resolve()] = "the signal log"
+    if args.draft and (taken := used.get(args.draft.resolve())):
+        raise InputError("draft", f"{args.draft} is {taken}", "name another file")
+    shifts = _parse_shifts(args.clock)
     out = prepare_path("out", args.out)
     profile, folder = load_profile(args.profile) if args.profile else (None, Path())
     vehicle = load_vehicle(args.vehicle) if args.vehicle else None
     database = database_of(profile, folder, args.dbc)
     recordings = [read_source(path, profile, database) for path in args.source]
+    names = [one.name for one in recordings]
+    if unknown := [name for name in shifts if name not in names]:
+        raise InputError(
+            "clock", f"{unknown[0]} is not one of the recordings", f"use {', '.join(names)}"
+        )
     if profile is None:
         units = {
             name: series.unit
@@ -97,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         recordings,
         wheel_radius=vehicle.wheel_radius if vehicle else None,
         steering_ratio=vehicle.steering_ratio if vehicle else None,
-        shifts=_parse_shifts(args.clock),
+        shifts=shifts,
     )
     merged = merge_with(profile)
     if vehicle is not None:
@@ -126,9 +137,12 @@ def _parse_shifts(given: list[str]) -> dict[str, float]:
     for text in given:
         name, _, seconds = text.rpartition("=")
         try:
-            shifts[Path(name).name] = float(seconds)
-        except ValueError as error:
+            shift = float(seconds)
+        except ValueError:
+            shift = math.nan
+        if not math.isfinite(shift):
             raise InputError(
                 "clock", f"{text!r} is not a time shift", "write it like drive.nmea=-0.4"
-            ) from error
+            )
+        shifts[Path(name).name] = shift
     return shifts

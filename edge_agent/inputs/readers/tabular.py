@@ -8,6 +8,8 @@ column may contain its unit: `speed [km/h]`.
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,6 +39,15 @@ TIMES: Final = (
     "seconds",
 )
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNIT_SPELLINGS: Final = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "millisecond", "milliseconds"),
+    "us": ("us", "usec", "\u00b5s", "\u03bcs", "microsecond", "microseconds"),
+    "ns": ("ns", "nsec", "nanosecond", "nanoseconds"),
+}
+# [s] Unix times of the years 2000 and 2100: a first time between them is a date.
+FIRST_DATE: Final = 946_684_800.0
+LAST_DATE: Final = 4_102_444_800.0
 MOST_NAMES: Final = 20  # maximum number of column names in an error message
 RACECHRONO: Final = "racechrono"
 LONGEST_PREAMBLE: Final = 50  # [lines] maximum length of the text before the table
@@ -56,7 +67,7 @@ def read_table(path: Path, time: str | None = None, time_unit: str | None = None
     Raises:
         InputError: the file is broken or empty, has no time column, or its time goes backwards.
     """
-    kind = "Parquet" if path.suffix == ".parquet" else "CSV"
+    kind = "Parquet" if path.suffix.lower() == ".parquet" else "CSV"
     with foreign_errors(path, kind):
         return _read_recording(path, kind, time, time_unit)
 
@@ -72,17 +83,18 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
         return convert_vbo(
             path, {name: values for name, values in found.items() if values is not None}, {}
         )
-    named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
+    table = table.rename_columns(_make_distinct(table.column_names))
+    named = _plain_names(table.column_names)
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
-    t, start_ns = _parse_seconds(
-        table[named[column]], column, time_unit or (unit["unit"] if unit else None)
-    )
+    stated = _parse_time_unit(column, unit["unit"]) if unit else None
+    t, start_ns = _parse_seconds(table[named[column]], column, time_unit or stated)
     back = np.flatnonzero(~(np.diff(t) >= 0.0))
-    if len(back) or not np.isfinite(t[:1]).all():
-        row = int(back[0]) + 1 if len(back) else 0
+    if len(back):
         raise InputError(
-            column, f"is missing or goes back at row {row}", "sort the recording by time"
+            column,
+            f"is missing or goes back at row {int(back[0]) + 1}",
+            "sort the recording by time",
         )
     recording = Recording(path.name, {}, start_ns, rows=True)
     for name, whole in named.items():
@@ -147,6 +159,18 @@ def _make_distinct(names: list[str]) -> list[str]:
     return [name if name not in names[:k] else f"{name} {k}" for k, name in enumerate(names)]
 
 
+def _plain_names(titles: Sequence[str]) -> dict[str, str]:
+    """Return the titles of the columns by name. The name of a column is its title without the
+    unit, or the whole title if other columns have the same name.
+    """
+    plain = [_plain_title(title) or title for title in titles]
+    count = Counter(plain)
+    return {
+        name if count[name] == 1 else title: title
+        for name, title in zip(plain, titles, strict=True)
+    }
+
+
 def _plain_title(title: str) -> str:
     return _UNIT.sub(r"\g<name>", title).strip()
 
@@ -164,13 +188,11 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
         whole = next((name for name, full in named.items() if given in (name, full)), None)
         if whole is not None:
             return whole
-        if given not in named:
-            raise InputError(
-                "time",
-                f"{path} has no column {given}",
-                f"choose one of {', '.join(list(named)[:20])}",
-            )
-        return given
+        raise InputError(
+            "time",
+            f"{path} has no column {given}",
+            f"choose one of {', '.join(list(named)[:MOST_NAMES])}",
+        )
     lower = {name.lower(): name for name in reversed(named)}
     for name in TIMES:
         if name in lower:
@@ -184,6 +206,35 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
         f"{path} has no time column; its columns are {seen}",
         'name it in the profile as "time"',
     )
+
+
+def _parse_time_unit(column: str, stated: str) -> str:
+    """Return the key in TIME_UNITS of the unit `stated` in the title of a time column.
+
+    Raises:
+        InputError: the unit is not known.
+    """
+    for unit, spellings in UNIT_SPELLINGS.items():
+        if stated.strip().lower() in spellings:
+            return unit
+    raise InputError(
+        column,
+        f"has the unit {stated!r}, which is not a unit of time",
+        'set "time_unit" in the profile to s, ms, us or ns',
+    )
+
+
+def _guess_time_unit(name: str, first: float, *, whole: bool) -> str:
+    """Return the unit of a time column without a stated unit. It follows from the ending of the
+    column's name, or from the size of the `first` number if it is a date. Other numbers are
+    seconds, except for whole numbers in a column `timestamp`, which are nanoseconds.
+    """
+    small = ("ms", "us", "ns")
+    ends = (unit for unit in small if name.lower().endswith(f"_{unit}"))
+    dates = (unit for unit in small if FIRST_DATE < first * TIME_UNITS[unit] < LAST_DATE)
+    if unit := next(ends, None) or next(dates, None):
+        return unit
+    return "ns" if whole and name.lower() == "timestamp" else "s"
 
 
 def _parse_seconds(
@@ -203,20 +254,16 @@ def _parse_seconds(
         return (values - values[0]) / NS, int(values[0])
     if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
         raise InputError(name, f"is {column.type}, not a time", "write seconds, or a time stamp")
-    if unit not in TIME_UNITS:
-        unit = next((u for u in ("ms", "us", "ns") if name.lower().endswith(f"_{u}")), None)
     raw = np.asarray(column.to_numpy(zero_copy_only=False))
-    if unit is None and name == "timestamp":
-        unit = "ns" if pa.types.is_integer(column.type) else "s"
-    factor = TIME_UNITS[unit or "s"]
+    if not np.isfinite(raw[0]):
+        raise InputError(name, "is missing at row 0", "give every sample its time")
+    whole = pa.types.is_integer(column.type)
+    unit = unit or _guess_time_unit(name, float(raw[0]), whole=whole)
+    factor = TIME_UNITS[unit]
     first = float(raw[0]) * factor
     exact = (raw - raw[0]) * factor if factor != 1.0 or abs(first) > NS / 10 else raw * 1.0
-    dated = 946_684_800.0 < first < 4_102_444_800.0  # between the years 2000 and 2100, Unix time
-    start = (
-        int(raw[0])
-        if dated and unit == "ns" and pa.types.is_integer(column.type)
-        else round(first * NS)
-    )
+    dated = FIRST_DATE < first < LAST_DATE
+    start = int(raw[0]) if dated and unit == "ns" and whole else round(first * NS)
     t: FloatArray = np.asarray(exact, dtype=np.float64)
     return (t - t[0] if dated else t), start if dated else None
 

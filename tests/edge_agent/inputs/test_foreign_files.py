@@ -8,6 +8,8 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.cli import main
@@ -150,3 +152,81 @@ def test_libraries_do_not_report_what_nobody_asked(tmp_path: Path) -> None:
         DATABASE,
     )
     assert not logging.getLogger("can").isEnabledFor(logging.INFO)
+
+
+@pytest.mark.parametrize(
+    ("title", "first", "step", "dated"),
+    [
+        ("time [msec]", 0, 10, False),
+        ("time [µs]", 0, 10_000, False),
+        ("Time (Seconds)", 0, 0.01, False),
+        ("time", 1_700_000_000_000, 10, True),
+        ("Timestamp", 1_700_000_000_000_000_000, 10_000_000, True),
+        ("timestamp", 1_700_000_000_000, 10, True),
+        ("timestamp", 1_500_000_000, 10_000_000, False),
+        ("timestamp_ns", 1_500_000_000, 10_000_000, False),
+        ("t", 1_700_000_000.5, 0.01, True),
+    ],
+)
+def test_a_time_column_has_its_stated_unit_or_that_of_a_date(
+    tmp_path: Path, title: str, first: float, step: float, *, dated: bool
+) -> None:
+    text = f"{title},ax\n{first},1.0\n{first + step},2.0\n"
+    recording = read_source(write(tmp_path / "a.csv", text), None, None)
+    assert np.diff(recording.signals["ax"].t) == pytest.approx([0.01], rel=1e-4)
+    assert (recording.start_ns is not None) == dated
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time [lap],ax\n0,1.0\n1,2.0\n", "'lap', which is not a unit of time.*time_unit"),
+        ("t,ax\n,1.0\n0.01,2.0\n", "t: is missing at row 0"),
+        ("t,ax\ninf,1.0\n0.01,2.0\n", "t: is missing at row 0"),
+        ("t,ax\n0.0,1.0\n,2.0\n", "t: is missing or goes back at row 1"),
+    ],
+)
+def test_an_unknown_unit_or_a_missing_time_is_named(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read_source(write(tmp_path / "a.csv", text), None, None)
+
+
+def test_columns_with_the_same_name_are_all_kept(tmp_path: Path) -> None:
+    text = "t,speed [km/h],speed [m/s],ax,ax\n0.0,36.0,10.0,1.0,3.0\n0.01,36.0,10.0,1.0,3.0\n"
+    signals = read_source(write(tmp_path / "a.csv", text), None, None).signals
+    assert signals["speed [km/h]"].unit == "km/h"
+    assert signals["speed [m/s]"].values[0] == pytest.approx(10.0)
+    assert signals["ax"].values[0] == pytest.approx(1.0)
+    assert signals["ax 4"].values[0] == pytest.approx(3.0)
+
+
+def test_a_suffix_in_capitals_is_parquet(tmp_path: Path) -> None:
+    pq.write_table(pa.table({"t": [0.0, 0.01], "ax": [1.0, 2.0]}), tmp_path / "a.PARQUET")
+    assert read_source(tmp_path / "a.PARQUET", None, None).signals["ax"].values[1] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--draft", "a.csv"), "draft: a.csv is one of the recordings"),
+        (("--draft", "out.parquet"), "draft: out.parquet is the signal log"),
+        (("--clock", "a.csv=nan"), "clock: 'a.csv=nan' is not a time shift"),
+        (("--clock", "b.csv=0.1"), "clock: b.csv is not one of the recordings"),
+    ],
+)
+def test_import_does_not_overwrite_a_recording_or_ignore_a_clock(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: tuple[str, str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = "t,ax,ay\n0.0,1.0,0.0\n0.01,1.0,0.0\n"
+    path = write(Path("a.csv"), text)
+    assert main(["import", "a.csv", "--out", "out.parquet", *options]) != 0
+    assert message in capsys.readouterr().err
+    assert path.read_text() == text
+    assert not Path("out.parquet").exists()
