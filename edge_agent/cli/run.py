@@ -111,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("route", "needs --ahead", "give both, or neither")
     if args.autoware is not None and not args.ahead:
         raise InputError("autoware", "needs --ahead", "give both, or neither")
+    if args.autoware_hash is not None and args.autoware is None:
+        raise InputError("autoware-hash", "needs --autoware", "give both, or neither")
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _run_live(args, sources, config)

@@ -87,9 +87,10 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
     named = _plain_names(table.column_names)
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
-    stated = _parse_time_unit(column, unit["unit"]) if unit else None
-    t, start_ns = _parse_seconds(table[named[column]], column, time_unit or stated)
-    back = np.flatnonzero(~(np.diff(t) >= 0.0))
+    t, start_ns = _parse_seconds(
+        table[named[column]], column, time_unit or (unit["unit"] if unit else None)
+    )
+    back = np.flatnonzero(~((np.diff(t) >= 0.0) & np.isfinite(t[1:])))
     if len(back):
         raise InputError(
             column,
@@ -258,7 +259,10 @@ def _parse_seconds(
     if not np.isfinite(raw[0]):
         raise InputError(name, "is missing at row 0", "give every sample its time")
     whole = pa.types.is_integer(column.type)
-    unit = unit or _guess_time_unit(name, float(raw[0]), whole=whole)
+    if unit:
+        unit = _parse_time_unit(name, unit)
+    else:
+        unit = _guess_time_unit(name, float(raw[0]), whole=whole)
     factor = TIME_UNITS[unit]
     first = float(raw[0]) * factor
     exact = (raw - raw[0]) * factor if factor != 1.0 or abs(first) > NS / 10 else raw * 1.0

@@ -81,6 +81,13 @@ def test_limits_for_a_planner_without_listening_are_a_mistake(
     assert "autoware: needs --ahead" in capsys.readouterr().err
 
 
+def test_type_of_limits_without_a_planner_is_a_mistake(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([*WORDS, "--ahead", "--autoware-hash", "RIHS01_0"]) == 2
+    assert "autoware-hash: needs --autoware" in capsys.readouterr().err
+
+
 def test_a_route_without_listening_is_a_mistake(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

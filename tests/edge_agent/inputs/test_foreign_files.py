@@ -15,6 +15,7 @@ import pytest
 from edge_agent.cli import main
 from edge_agent.inputs.bring_in import read_source
 from edge_agent.inputs.readers.dbc import parse_dbc
+from edge_agent.inputs.readers.tabular import read_table
 from schemas.errors import InputError
 
 VBO = """File created on 01/09/2020 at 10:15:00
@@ -184,6 +185,7 @@ def test_a_time_column_has_its_stated_unit_or_that_of_a_date(
         ("t,ax\n,1.0\n0.01,2.0\n", "t: is missing at row 0"),
         ("t,ax\ninf,1.0\n0.01,2.0\n", "t: is missing at row 0"),
         ("t,ax\n0.0,1.0\n,2.0\n", "t: is missing or goes back at row 1"),
+        ("t,ax\n0.0,1.0\ninf,2.0\n", "t: is missing or goes back at row 1"),
     ],
 )
 def test_an_unknown_unit_or_a_missing_time_is_named(
@@ -191,6 +193,15 @@ def test_an_unknown_unit_or_a_missing_time_is_named(
 ) -> None:
     with pytest.raises(InputError, match=message):
         read_source(write(tmp_path / "a.csv", text), None, None)
+
+
+def test_a_profile_states_the_unit_and_a_date_needs_none(tmp_path: Path) -> None:
+    lap = write(tmp_path / "a.csv", "time [lap],ax\n0,1.0\n10,2.0\n")
+    assert read_table(lap, "time", "ms").signals["ax"].t[1] == pytest.approx(0.01)
+    text = "time (UTC),ax\n2024-05-01T10:00:00.00Z,1.0\n2024-05-01T10:00:00.01Z,2.0\n"
+    dated = read_table(write(tmp_path / "b.csv", text))
+    assert dated.signals["ax"].t[1] == pytest.approx(0.01)
+    assert dated.start_ns == 1_714_557_600_000_000_000
 
 
 def test_columns_with_the_same_name_are_all_kept(tmp_path: Path) -> None:
