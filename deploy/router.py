@@ -43,9 +43,15 @@ def load_configuration(
             "config", f"cannot use {config} ({error})", "give a Zenoh configuration file"
         ) from error
     if listen is not None:
-        settings.insert_json5(
-            "listen/endpoints", json.dumps([listen] if isinstance(listen, str) else list(listen))
-        )
+        endpoints = [listen] if isinstance(listen, str) else list(listen)
+        try:
+            settings.insert_json5("listen/endpoints", json.dumps(endpoints))
+        except zenoh.ZError as error:
+            raise InputError(
+                "listen",
+                f"{', '.join(endpoints)} is not a Zenoh endpoint",
+                "write it like tcp/127.0.0.1:7447",
+            ) from error
         # The admin space reports the actual port if port 0 was given.
         settings.insert_json5("adminspace/enabled", "true")
     return settings

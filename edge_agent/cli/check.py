@@ -50,9 +50,10 @@ def run(args: argparse.Namespace) -> int:
         report_lines,
         report_page,
     )
-    from edge_agent.inputs.signal_log import read_log
+    from edge_agent.inputs.signal_log import read_log, require_log
     from schemas.vehicle import load_vehicle
 
+    require_log(args.log)
     file = args.vehicle or vehicle_file_of(args.log)
     vehicle = load_vehicle(file)
     log = read_log(args.log)

@@ -18,6 +18,7 @@ from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
+    from edge_agent.app.plausible import Plausibility
     from edge_agent.estimators import Estimates
     from edge_agent.inputs.block import Block
     from edge_agent.inputs.signal_log import SignalLog
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
     from edge_agent.cli.common import require_valid_signals, warn_about_faults
     from edge_agent.inputs.doctor.adopt import prepare_log
-    from edge_agent.inputs.signal_log import read_log
+    from edge_agent.inputs.signal_log import read_log, require_log
     from schemas.config import AgentConfig, load
     from schemas.vehicle import load_vehicle
 
@@ -129,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
             f"write {', '.join(REPORTS)}",
         )
     path = args.log[0]
+    require_log(path)
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
     if args.out.suffix in REPORTS and args.publish:
@@ -146,9 +148,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         notes += warn_about_faults(diagnosis)
     if args.out.suffix in REPORTS:
-        notes += _write_report(args, log, vehicle, [estimator, *_split_names(args.compare)])
-        print("\n".join(notes), file=sys.stderr)
-        return 0
+        names = [estimator, *_split_names(args.compare)]
+        notes += _write_report(args, log, vehicle, names, plausibility)
+        print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
+        return IMPLAUSIBLE if plausibility.problems() else 0
     with EstimatesFile(args.out) as file:
         code = 0
 
@@ -177,10 +180,14 @@ def _split_names(names: str | None) -> list[str]:
 
 
 def _write_report(
-    args: argparse.Namespace, log: SignalLog, vehicle: Vehicle, names: list[str]
+    args: argparse.Namespace,
+    log: SignalLog,
+    vehicle: Vehicle,
+    names: list[str],
+    plausibility: Plausibility,
 ) -> list[str]:
     """Estimate a log with each estimator in `names`, write the report (plots of the estimates), and
-    return notes for the user.
+    return notes for the user. Add the estimates of the first one to `plausibility`.
     """
     import pyarrow as pa
 
@@ -193,8 +200,13 @@ def _write_report(
     found = {}
     for name in dict.fromkeys(names):
         progress_messages.set_status(f"estimating with {name}")
-        bank = bank_of(name, [vehicle])
-        parts = [to_table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
+        bank = bank_of(name, [vehicle], memberships_of(args) if name == names[0] else None)
+        parts = []
+        for block in log.blocks(0):
+            estimates = bank.advance(block.t, block.signals)
+            parts.append(to_table(block.t, estimates))
+            if name == names[0]:
+                plausibility.add(block.t, block.signals, estimates)
         found[name] = pa.concat_tables(parts)
     title = f"{args.log[0].name}: {vehicle.name}, {float(log.t[-1] - log.t[0]):.0f} s"
     drive_report.write_report(drive_report.RecordedDrive(log, found, title), args.out)

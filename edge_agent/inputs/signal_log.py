@@ -93,7 +93,16 @@ def read_log(path: Path) -> SignalLog:
     return SignalLog(t, signals, start_ns, ground, _read_context(table))
 
 
+def require_log(path: Path) -> None:
+    """Raise InputError if there is no file `path`. Commands call this before they look for the
+    vehicle file next to a log.
+    """
+    if not path.exists():
+        raise InputError("log", f"{path} does not exist", "give the path of a signal log")
+
+
 def _read_table(path: Path) -> pa.Table:
+    require_log(path)
     try:
         with pq.ParquetFile(path) as file:
             present = set(file.schema_arrow.names)
@@ -104,14 +113,12 @@ def _read_table(path: Path) -> pa.Table:
                     if name in present
                 ]
             )
-    except FileNotFoundError as error:
-        raise InputError(
-            "log", f"{path} does not exist", "give the path of a signal log"
-        ) from error
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            "log", f"{path} is not a Parquet file ({reason})", "write the log as Parquet"
+            "log",
+            f"{path} is not a Parquet file ({reason})",
+            "convert it with edge-agent import",
         ) from error
 
 

@@ -60,6 +60,11 @@ def test_a_wrong_configuration_names_the_field_and_the_fix(
     assert capsys.readouterr().err.startswith("error: config: cannot use")
 
 
+def test_an_address_that_is_no_endpoint_names_the_form() -> None:
+    with pytest.raises(InputError, match="listen: 127.0.0.1:7447 is not a Zenoh endpoint.*tcp/"):
+        router.load_configuration(listen="127.0.0.1:7447")
+
+
 def test_a_taken_port_is_said() -> None:
     session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
     with session, pytest.raises(InputError, match="^listen: "):

@@ -188,7 +188,7 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such file": (lambda path: None, "^log: .* does not exist; give"),
     "empty file": (
         lambda path: path.write_bytes(b""),
-        "^log: .* is not a Parquet file .*; write the log as Parquet",
+        "^log: .* is not a Parquet file .*; convert it with edge-agent import",
     ),
     "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),
     "no rows": (lambda path: pq.write_table(pa.table(a_log(0)), path), "^log: .* has no rows; "),

@@ -97,8 +97,8 @@ def publishing_advice(diagnosis: Diagnosis) -> str:
     if diagnosis.findings:
         return "not passed: correct the profile (--fix writes it), import again"
     return (
-        "not passed: drive half a minute with turns and some braking, or accept the log unchecked "
-        "with --trust"
+        "not passed: drive half a minute with turns and some braking, or publish the log unchecked "
+        "with edge-agent replay --publish --trust"
     )
 
 
