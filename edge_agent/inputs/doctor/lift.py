@@ -4,7 +4,8 @@ not accelerate.
 On a road, wheels that gain 0.5 m/s² for a second accelerate the body, and the accelerometer shows
 it. Wheels that spin on ice are an exception: the body hardly accelerates, but the other wheels show
 whether the car moves. Therefore the test requires that one axle stands while the other turns fast,
-or that all wheels change their speed while accelerometers and yaw rate show no motion.
+or that all wheels change their speed while accelerometers and yaw rate show no motion. A car whose
+position moves is not on a lift; accelerations in a wrong unit may seem to be at rest.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenTimes, smooth_twice
 from schemas.numeric import FloatArray
 from schemas.signals import S
+from schemas.thresholds import EARTH_RADIUS_M
 from schemas.vehicle import Vehicle
 
 TURNS_M_S: Final = 5.0  # [m/s] rim speed from which an axle turns
@@ -26,6 +28,7 @@ LEAST_S: Final = 5.0  # [s] minimum time in which an axle turns
 LEAST_SHARE: Final = 0.8
 RESTS_M_S2: Final = 0.3  # [m/s^2] deviation of the accelerometers from their median at rest
 RESTS_RAD_S: Final = 0.01
+MOVED_M: Final = 100.0  # [m] more than the error of a position
 GAINS_M_S2: Final = 0.4  # [m/s^2] root mean square of the wheels' acceleration
 
 
@@ -50,7 +53,7 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     with np.errstate(invalid="ignore"):
         turns = np.isfinite(fastest) & np.isfinite(slowest) & (fastest > TURNS_M_S)
         one_stands = turns & (slowest < STANDS_M_S)
-    if turns.sum() < LEAST_S * RATE_HZ:
+    if turns.sum() < LEAST_S * RATE_HZ or _moved_m(signals) > MOVED_M:
         return False
 
     def rests_within(channel: int, limit: float) -> bool:
@@ -69,3 +72,13 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
     return bool(
         one_stands.sum() > LEAST_SHARE * turns.sum() or (gains and felt < 0.25 * GAINS_M_S2)
     )
+
+
+def _moved_m(signals: FloatArray) -> float:
+    """Return the larger extent [m] of the positions to the north or to the east; 0 without
+    positions.
+    """
+    north = np.radians(signals[:, S.LATITUDE]) * EARTH_RADIUS_M
+    east = np.radians(signals[:, S.LONGITUDE]) * EARTH_RADIUS_M * np.cos(north / EARTH_RADIUS_M)
+    known = np.isfinite(north) & np.isfinite(east)
+    return float(max(np.ptp(north[known]), np.ptp(east[known]))) if known.any() else 0.0

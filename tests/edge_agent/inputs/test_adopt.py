@@ -15,6 +15,7 @@ import pytest
 
 from edge_agent.inputs.correct import correct_log
 from edge_agent.inputs.doctor.adopt import adopt_measured, align_devices
+from edge_agent.inputs.doctor.lift import is_on_lift
 from edge_agent.inputs.signal_log import SignalLog
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
@@ -119,3 +120,15 @@ def test_car_on_a_lift_is_recognised_and_stands(driven: tuple[int, ...]) -> None
             replace(adopted.log, signals=on_road), vehicle
         ).diagnosis.findings
     )
+
+
+@pytest.mark.parametrize(("north_m_s", "lifted"), [(0.1, True), (15.0, False)])
+def test_car_whose_position_moves_is_not_on_a_lift(north_m_s: float, *, lifted: bool) -> None:
+    t = np.arange(0.0, 20.0, 0.01)
+    signals = np.full((len(t), len(CHANNELS)), np.nan)
+    signals[:, [S.AX, S.AY]] = 0.0  # in g instead of m/s^2, they seem to be at rest
+    signals[:, S.YAW_RATE] = 0.0
+    signals[:, OMEGA] = (40.0 + 30.0 * np.sin(0.5 * t))[:, None]
+    signals[:, S.LATITUDE] = 59.0 + np.degrees(north_m_s * t / 6_378_137.0)
+    signals[:, S.LONGITUDE] = 18.0
+    assert is_on_lift(t, signals, PRESETS["sedan"].vehicle) == lifted
