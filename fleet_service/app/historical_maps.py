@@ -94,7 +94,7 @@ class HistoricalMaps:
         try:
             while not ended:
                 tile, size = _HEAD.unpack(head)
-                payload = process.out.read(size)
+                payload = process.payload(size)
                 ended = tile in (_ERROR, _END)
                 if tile == _ERROR:
                     raise InputError(*json.loads(payload))
@@ -162,6 +162,15 @@ class _Process:
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")
         return head
+
+    def payload(self, size: int) -> bytes:
+        """Return a reply's payload of `size` bytes. Raise ChildProcessError if the process has
+        ended before it was complete.
+        """
+        payload = self.out.read(size)
+        if len(payload) < size:
+            raise ChildProcessError(f"the past map is incomplete ({self._child.wait()})")
+        return payload
 
     def end(self) -> None:
         """Kill the process that rebuilds past maps, and close its pipes."""

@@ -8,6 +8,7 @@ import re
 import threading
 import time
 import urllib.request
+from http.client import HTTPException
 from typing import Any, Final
 
 from schemas.runtime.metrics import PREFIX
@@ -47,7 +48,7 @@ class ServiceHealth:
         try:
             with urllib.request.urlopen(f"{address.rstrip('/')}/metrics", timeout=READ_S) as answer:
                 text = answer.read(MOST_BYTES).decode("utf-8", "replace")
-        except (OSError, ValueError):
+        except (OSError, ValueError, HTTPException):
             return {"address": address, "answers": False}
         found = parse_metrics(text)
         rows = found.get("rows", {}).get("observation", 0.0)

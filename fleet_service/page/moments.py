@@ -94,7 +94,7 @@ class Moments:
                 table = pq.read_table(
                     files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None
                 )
-            except FileNotFoundError:  # retention has removed the file
+            except (OSError, pa.ArrowException):  # removed by retention, or damaged
                 continue
             for row in table.to_pylist()[:1]:
                 known = row["basis"] == "measured" or row["p_slippery"] > KNOWN_SLIPPERY

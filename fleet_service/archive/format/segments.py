@@ -84,6 +84,10 @@ class Writer:
             for path in (*list_segments(root, kind), *layout.compacted_files(root, kind))
         ]
         used = [layout.age_key(path.name)[0] for path in named]
+        # A restart does not read segments that are older than a checkpoint. The run that saved it
+        # may have had a clock that was ahead, and no rows.
+        saved = (root / layout.CHECKPOINTS).glob("[0-9]*")
+        used += [layout.term_of(f"{layout.CHECKPOINTS}/{path.name}") or 0 for path in saved]
         self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
     @property

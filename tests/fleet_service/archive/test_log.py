@@ -104,3 +104,12 @@ def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path
         disk.write_image(after)
         assert (after / "keys" / "2026-01.key").exists()
         assert load_or_create_key(after / "keys" / "2026-01.key") == key
+
+
+def test_segments_are_newer_than_a_checkpoint_of_a_clock_that_was_ahead(tmp_path: Path) -> None:
+    ahead = 9_999_999_000
+    (tmp_path / layout.CHECKPOINTS / f"{ahead:010d}-{0:012d}").mkdir(parents=True)
+    log: SegmentLog[str] = SegmentLog(tmp_path, "shard-0")
+    # Otherwise no restart would read these segments, and their reports would be accepted again.
+    assert log.newest > layout.Cut(ahead, 0)
+    log.close()
