@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     ).start()
     service.run(stop)
     stopped.set()
-    return service.exit_code if holding.lease is not None else 0
+    return service.exit_code
 
 
 def _open_archive(
