@@ -23,7 +23,7 @@ from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Term, largest_epoch
 from fleet_service.replication.fenced_bucket import FencedBucket
 from fleet_service.replication.file_transfer import FileTransfer
-from fleet_service.replication.replica_files import LOG, MANIFEST, ReplicaFiles
+from fleet_service.replication.replica_files import KEYS, LOG, MANIFEST, ReplicaFiles
 from fleet_service.replication.upload_backoff import UploadBackoff
 from fleet_service.replication.upload_journal import UploadJournal
 from schemas.config import ServiceConfig
@@ -145,9 +145,12 @@ class BucketReplica:
         """Remove files of the archive's folder that the bucket does not contain with the same size.
         `there` has names and sizes of the bucket's valid objects. Then remove the journal entries
         (list of uploaded files) of all files that the folder does not contain.
+
+        Files of the folder `keys` are always removed, and so downloaded again: two secret keys of
+        one month have the same name and size, and only the bucket's belongs to valid rows.
         """
         for name, stamp in self._files.list_files().items():
-            if there.get(name) != stamp.size:
+            if there.get(name) != stamp.size or name.startswith(KEYS):
                 self._files.path_of(name).unlink()
         for name in self._journal.copy_stamps():
             if not self._files.path_of(name).exists():

@@ -202,6 +202,25 @@ def test_what_was_cut_off_is_made_good_at_the_next_start(
         assert there(bucket) == list_copied_files(root)
 
 
+@pytest.mark.parametrize("uploaded", [False, True])
+def test_former_owner_takes_over_the_key_of_its_successor(
+    bucket: BucketServer, make: Make, tmp_path: Path, *, uploaded: bool
+) -> None:
+    former = tmp_path / "former"
+    copy = make(former)
+    Pseudonyms(former / "keys").of("sim-001", 0)
+    if uploaded:
+        copy.sync()
+        # The successor replaces a key that was uploaded after the lease had ended.
+        ObjectBucket(bucket.url, bucket.store, 5.0).delete("keys/1970-01.key")
+    successor = tmp_path / "successor"
+    with closing(fill_log(successor, make(successor))):
+        content = there(bucket)
+        copy.sync_under_lease(NAME, succeeds=True)
+        assert there(bucket) == content
+        assert (former / "keys" / "1970-01.key").read_bytes() == content["keys/1970-01.key"]
+
+
 def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
     make(tmp_path / "archive")
     (tmp_path / "other").mkdir()
