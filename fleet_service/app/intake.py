@@ -83,7 +83,9 @@ class Intake:
         self._paths = VehiclePaths()
         self._places = NewCells()
         keys = Pseudonyms(self._root / "keys")
-        self.batches = BatchIntake(self._shared.state.streams, keys, self._counts, self.acks)
+        self.batches = BatchIntake(
+            self._shared.state.streams, keys, self._counts, self.acks, self._config.publishers
+        )
         self.weather.fusion = self._shared.state.fusion
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:

@@ -9,7 +9,7 @@ an overloaded service slows its senders down (back-pressure).
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from itertools import compress
 from threading import Lock
@@ -162,15 +162,22 @@ class BatchIntake:
         pseudonyms: pseudonyms that replace the vehicles' names in the archive.
         counts: counts of the service; refusals are counted in `refused[RULE]`.
         acks: collects refusals, and acknowledgements of duplicates that are already durable.
+        publishers: senders that report many places at once, so that their streams have no limit.
     """
 
     def __init__(
-        self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: ServiceCounts, acks: Acks
+        self,
+        streams: SequenceTrackers,
+        pseudonyms: Pseudonyms,
+        counts: ServiceCounts,
+        acks: Acks,
+        publishers: Collection[str] = (),
     ) -> None:
         self._streams = streams
         self._pseudonyms = pseudonyms
         self._counts = counts
         self._acks = acks
+        self._publishers = publishers
         self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read_erasures(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
@@ -352,7 +359,8 @@ class BatchIntake:
         key = (pseudonym, boot, kind, region)
         if key not in self._streams:  # older archives contain the unchanged start numbers
             key = (pseudonym, boot_pseudonym, kind, region)
-        if key not in self._streams and not self._budget.take(witness, 1, self._now):
+        is_limited = key not in self._streams and vehicle not in self._publishers
+        if is_limited and not self._budget.take(witness, 1, self._now):
             self._counts.too_many_streams += 1
             return None
         stream = self._known[kind][name] = self._streams[key]

@@ -235,6 +235,21 @@ def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
     assert engine.counts.too_many_streams == 999 - STREAMS_AT_ONCE
 
 
+def test_a_publisher_reports_from_all_regions_of_a_country(tmp_path: Path) -> None:
+    now = time.time_ns()
+    with closing(Engine(ServiceConfig(publishers=["cits-se"]), tmp_path)) as engine:
+        for k in range(200):
+            latitude = 56.0 + 0.5 * (k // 20)
+            longitude = 12.0 + 0.5 * (k % 20)
+            cell = int(grid.cell_of(latitude, longitude))
+            one = batch(
+                "cits-se", 1, now, [0.3], latitude=[latitude], longitude=[longitude], cell=[cell]
+            )
+            engine.intake.ingest([message(replace(one, region=int(grid.region_of(cell))))], now)
+        assert engine.counts.too_many_streams == 0
+        assert engine.counts.observations == 200
+
+
 def test_new_cells_are_counted_once_and_by_vehicle() -> None:
     budgets = NewCells(3)
     vehicle = np.array([2, 1, 1, 2, 1, 1, 1])
