@@ -37,9 +37,7 @@ class ServiceCounts:
     )
     weather: int = _count("weather reports admitted")
     duplicates: int = _count("duplicate batches")
-    too_many_gaps: int = _count(
-        "batches refused because too many earlier batches of their stream are missing"
-    )
+    too_many_gaps: int = _count("batches refused because their stream has too many gaps")
     too_many_streams: int = _count(
         "batches not accepted because their vehicle opened too many streams; the vehicle keeps them"
     )

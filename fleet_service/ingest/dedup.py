@@ -1,15 +1,19 @@
 """Record of accepted batches (messages with records), which detects duplicates. Each stream
-(batches of one vehicle, start, kind and region) has a watermark and a set of numbers. No batch with
-a sequence number up to the watermark is expected any more. The set contains the accepted sequence
-numbers above it. Pure (no I/O).
+(batches of one vehicle, start, kind and region) has a watermark and runs of numbers. No batch with
+a sequence number up to the watermark is expected any more. A run consists of consecutive accepted
+sequence numbers above it. Pure (no I/O).
 
-The record's size is bounded by accepted data. Every number above a watermark is a batch in the
-archive, a stream has at most MAX_GAPS such numbers, and a stream is dropped when its newest record
-is older than the service accepts.
+The record's size is bounded by accepted data. Every run above a watermark contains a batch in the
+archive, a stream has at most MAX_GAPS runs, and a stream is dropped when its newest record is older
+than the service accepts.
+
+A sender's numbers continue in a new month, but its pseudonym changes, so a new stream begins. If
+the sender does not state `first_held`, all its later numbers are one run above the watermark 0.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -20,11 +24,11 @@ from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
-# Largest distance of a batch's number from the first missing one of its stream. An agent sends old
-# batches first, so after an outage only some hundreds are missing.
+# Largest number of gaps between the accepted numbers of a stream. An agent sends old batches first,
+# so after an outage only some hundreds of numbers are missing.
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
-_NONE: Final[frozenset[int]] = frozenset()
+_NONE: Final[tuple[int, ...]] = ()
 # pseudonym of the vehicle and of its start (as numbers), kind, region
 StreamKey = tuple[int, int, Kind, int]
 
@@ -38,11 +42,12 @@ class SequenceTracker:
         boot: identifier of the vehicle's start, as sent; 0 until it sends.
         witness: permanent number that identifies the vehicle in the map; 0 until the vehicle sends.
         low: watermark: each sequence number up to this one is accepted, or will never arrive.
-        seen: accepted sequence numbers above the watermark.
+        runs: runs of accepted sequence numbers above the watermark: for each run its first number
+            and the number after its last one, ascending.
         newest: newest time of an accepted record [ns]; it decides when the stream is dropped.
     """
 
-    __slots__ = ("boot", "key", "low", "newest", "seen", "vehicle", "witness")
+    __slots__ = ("boot", "key", "low", "newest", "runs", "vehicle", "witness")
 
     def __init__(self, key: StreamKey) -> None:
         self.key = key
@@ -51,28 +56,24 @@ class SequenceTracker:
         self.witness = 0
         self.low = 0
         self.newest = 0
-        self.seen: set[int] | frozenset[int] = _NONE
+        self.runs: list[int] | tuple[int, ...] = _NONE
 
     def accepted(self, seq: int) -> bool:
         """Return True if the batch (message with records) of this stream (vehicle, start, kind,
         region) with this sequence number was accepted before.
         """
-        return seq <= self.low or seq in self.seen
+        # An odd number of limits up to `seq` means that it lies in a run.
+        return seq <= self.low or bisect_right(self.runs, seq) % 2 == 1
 
     def accept(self, seq: int, time: int = 0) -> bool:
         """Record the sequence number of an accepted batch (message with records), and the newest
-        time of the batch's records [ns]. Return False and record nothing if an earlier number is
-        missing and MAX_GAPS later ones are already recorded.
+        time of the batch's records [ns]. Return False and record nothing if the number would begin
+        another run and the stream has MAX_GAPS runs.
         """
         if seq == self.low + 1:
-            self.low = seq
-            self._close()
-        elif seq > self.low:
-            if len(self.seen) >= MAX_GAPS:
-                return False
-            if not isinstance(self.seen, set):
-                self.seen = set()
-            self.seen.add(seq)
+            self.raise_to(seq + 1)
+        elif seq > self.low and not self._add_run(seq, seq):
+            return False
         if time > self.newest:
             self.newest = time
         return True
@@ -93,21 +94,25 @@ class SequenceTracker:
         numbers below `first_held` will never arrive.
         """
         if first_held - 1 > self.low:
-            if isinstance(self.seen, set):
-                if first_held - self.low > len(self.seen):
-                    self.seen = {seq for seq in self.seen if seq >= first_held}
-                else:
-                    self.seen.difference_update(range(self.low, first_held))
-            self.low = first_held - 1
-            self._close()
+            place = bisect_right(self.runs, first_held)
+            is_in_run = place % 2 == 1
+            self.low = self.runs[place] - 1 if is_in_run else first_held - 1
+            self.runs = self.runs[place + is_in_run :] or _NONE
 
-    def _close(self) -> None:
-        if isinstance(self.seen, set):
-            while self.low + 1 in self.seen:
-                self.low += 1
-                self.seen.remove(self.low)
-            if not self.seen:
-                self.seen = _NONE
+    def _add_run(self, first: int, last: int) -> bool:
+        """Add the numbers from `first` to `last`, and join runs that touch. Return False and add
+        nothing if this would exceed MAX_GAPS runs.
+        """
+        begin = bisect_left(self.runs, first)
+        end = bisect_right(self.runs, last + 1)
+        limits = [first] if begin % 2 == 0 else []
+        limits += [last + 1] if end % 2 == 0 else []
+        if len(self.runs) + len(limits) - (end - begin) > 2 * MAX_GAPS:
+            return False
+        if not isinstance(self.runs, list):
+            self.runs = []
+        self.runs[begin:end] = limits
+        return True
 
 
 BatchId = tuple[SequenceTracker, int]  # stream and sequence number
@@ -171,12 +176,12 @@ class SequenceTrackers:
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
         """Return two items: all streams (batches of one vehicle, start, kind and region) as columns
-        (n,), and the accepted sequence numbers above the watermarks (numbers up to which no batch
-        is expected any more) of all streams in one array. The column `above` is the number of items
-        of this array that belong to each stream.
+        (n,), and the runs of accepted sequence numbers above the watermarks (numbers up to which no
+        batch is expected any more) of all streams in one array (k, 2): first number of the run, and
+        the number after its last one. The column `above` is the number of rows of this array that
+        belong to each stream.
         """
         streams = list(self._streams.values())
-        above = [sorted(stream.seen) for stream in streams]
         table = {
             "vehicle": [stream.key[0] for stream in streams],
             "boot": [stream.key[1] for stream in streams],
@@ -184,12 +189,11 @@ class SequenceTrackers:
             "region": [stream.key[3] for stream in streams],
             "low": [stream.low for stream in streams],
             "newest": [stream.newest for stream in streams],
-            "above": [len(seqs) for seqs in above],
+            "above": [len(stream.runs) // 2 for stream in streams],
         }
-        return (
-            {name: np.array(values, np.int64) for name, values in table.items()},
-            np.array([seq for seqs in above for seq in seqs], np.int64),
-        )
+        limits = np.array([limit for stream in streams for limit in stream.runs], np.int64)
+        columns = {name: np.array(values, np.int64) for name, values in table.items()}
+        return columns, limits.reshape(-1, 2)
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
@@ -198,7 +202,6 @@ class SequenceTrackers:
         """
         out = SequenceTrackers()
         at = 0
-        seqs = above.tolist()
         order = ("vehicle", "boot", "kind", "region", "low", "newest", "above")
         for vehicle, boot, kind, region, low, newest, n in zip(
             *(columns[name].tolist() for name in order), strict=True
@@ -207,7 +210,7 @@ class SequenceTrackers:
             stream.low = low
             stream.newest = newest
             if n:
-                stream.seen = set(seqs[at : at + n])
+                stream.runs = above[at : at + n].ravel().tolist()
                 at += n
         return out
 

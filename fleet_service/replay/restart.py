@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from fleet_service.archive.format.layout import Cut
@@ -67,7 +68,8 @@ def load_restart(
             taken = checkpoints.load_checkpoint(path)
             tables = dict(taken.tables)
             standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
-            above = tables.pop(ABOVE)["seq"].to_numpy()
+            runs = tables.pop(ABOVE)
+            above = np.stack([runs[name].to_numpy() for name in ("first", "end")], axis=1)
             columns = tables.pop(STREAMS)
             streams = SequenceTrackers.of(
                 {name: columns[name].to_numpy() for name in columns.column_names}, above
@@ -102,5 +104,5 @@ def image_of(
     return tables_of(fusion) | {
         ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing]),
         STREAMS: pa.table({name: pa.array(column) for name, column in columns.items()}),
-        ABOVE: pa.table({"seq": pa.array(above)}),
+        ABOVE: pa.table({"first": pa.array(above[:, 0]), "end": pa.array(above[:, 1])}),
     }

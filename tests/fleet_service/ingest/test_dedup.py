@@ -4,6 +4,8 @@ admits, and the number of remembered batches must stay bounded.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -32,14 +34,15 @@ def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(
         accepted.add(seq)
     for seq in range(1, 62):
         assert stream.accepted(seq) == (seq <= floor or seq in accepted)
-    assert all(seq > stream.low + 1 for seq in stream.seen)
+    assert all(limit > stream.low + 1 for limit in stream.runs)
+    assert all(before < after for before, after in pairwise(stream.runs))
 
 
 def test_a_stream_without_gaps_is_one_number() -> None:
     stream = SequenceTracker(KEY)
     for seq in range(1, 5001):
         assert stream.accept(seq)
-    assert (stream.low, len(stream.seen)) == (5000, 0)
+    assert (stream.low, len(stream.runs)) == (5000, 0)
 
 
 def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
@@ -47,10 +50,26 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
 ) -> None:
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
     stream = SequenceTracker(KEY)
-    assert [stream.accept(2**62 - k) for k in range(4)] == [True, True, True, False]
-    assert not stream.accepted(2**62 - 3)
+    assert [stream.accept(2**62 - 2 * k) for k in range(4)] == [True, True, True, False]
+    assert not stream.accepted(2**62 - 6)
     assert stream.accept(1)
     assert stream.low == 1
+
+
+def test_a_sender_without_first_held_is_accepted_in_a_new_month(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A sender's numbers continue in the stream that begins with its new pseudonym."""
+    monkeypatch.setattr(dedup, "MAX_GAPS", 3)
+    streams = SequenceTrackers()
+    for seq in range(1001, 2001):
+        assert streams[KEY].accept(seq)
+    again = SequenceTrackers.of(*streams.columns())
+    for kept in (streams, again):
+        assert all(kept[KEY].accepted(seq) for seq in range(1001, 2001))
+        assert not kept[KEY].accepted(1000)
+        assert not kept[KEY].accepted(2001)
+    assert len(again[KEY].runs) == 2
 
 
 @pytest.mark.campaign
@@ -72,7 +91,7 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(
     for vehicle in {row[0] for row in rows}:
         one = before[vehicle, 5, Kind.STATE, 7]
         other = after[vehicle, 5, Kind.STATE, 7]
-        assert (one.low, set(one.seen), one.newest) == (other.low, set(other.seen), other.newest)
+        assert (one.low, list(one.runs), one.newest) == (other.low, list(other.runs), other.newest)
     assert len(before) == len(after)
 
 
