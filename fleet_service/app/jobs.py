@@ -66,7 +66,8 @@ def archive_jobs(
 
     def compaction(stop: threading.Event) -> str | None:
         # If compaction ran now, the segments that are not yet in the bucket could never be copied.
-        if engine.copy is not None and engine.settlement.failing:
+        # A full disk is no reason to wait, because compaction makes room.
+        if engine.copy is not None and engine.copy.backoff.trouble is not None:
             return "compaction waits for the archive's copy"
         disk_reserve.allocate(root)
         weather.join_daily_files(root)

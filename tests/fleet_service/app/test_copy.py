@@ -5,25 +5,30 @@ the first of the two writes.
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
 import zenoh
 
+from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
+from fleet_service.app.jobs import archive_jobs
 from fleet_service.archive.format import reading, segments
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
+from fleet_service.replication.bucket import CopyError
 from fleet_service.replication.replica import OWNER
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
@@ -109,6 +114,32 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert len(segments.list_segments(new, Kind.OBSERVATION)) == len(
             segments.list_segments(root, Kind.OBSERVATION)
         )
+
+
+def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
+    bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_disk(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    config = settings(bucket)
+    with closing(Engine(config, tmp_path)) as engine:
+        assert engine.copy is not None
+        compaction, *_ = archive_jobs(engine, config, tmp_path, SteadyClock().moment)
+        take(engine, reports(0.8, 1, 1))
+        engine.settlement.flush()
+        with monkeypatch.context() as full:
+            full.setattr(segments.Writer, "write", fill_disk)
+            take(engine, reports(0.8, 2, 2))
+            engine.settlement.flush()
+            assert engine.settlement.failing
+            assert (compaction.work(threading.Event()) or "").startswith("compacted: ")
+        assert len(engine.settlement.flush()) == VEHICLES
+        with suppress(CopyError), engine.copy.backoff.try_upload():
+            raise CopyError("no answer")
+        assert (compaction.work(threading.Event()) or "").startswith("compaction waits")
+        tables = list(reading.read_tables(tmp_path, Kind.OBSERVATION, ["row"]))
+        assert sum(table.num_rows for table in tables) == 2 * 3 * VEHICLES
 
 
 def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
