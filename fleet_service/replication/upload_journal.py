@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from threading import Lock
 from typing import Final, NamedTuple
@@ -21,6 +22,8 @@ from typing import Final, NamedTuple
 from schemas.runtime.durable import open_durably
 
 NAME: Final = "copied"
+# The journal is written again when it has more than twice as many lines as entries, and this many.
+SPARE_LINES: Final = 10_000
 
 
 class Stamp(NamedTuple):
@@ -53,21 +56,29 @@ class UploadJournal:
     """
 
     def __init__(self, root: Path, url: str) -> None:
-        path = root / NAME
-        head = json.dumps({"copy": url})
+        self._path = root / NAME
+        self._head = json.dumps({"copy": url})
         self._guard = Lock()
         self._stamps: dict[str, Stamp] = {}
-        lines = path.read_text(errors="replace").splitlines() if path.exists() else []
-        for line in lines[1:] if lines[:1] == [head] else []:
+        lines = self._path.read_text(errors="replace").splitlines() if self._path.exists() else []
+        for line in lines[1:] if lines[:1] == [self._head] else []:
             with suppress(ValueError, TypeError, KeyError):  # a power loss cut off the line
                 name, *stamp = json.loads(line)
                 self._stamps.pop(name, None)
                 if stamp:
                     self._stamps[name] = Stamp(*map(int, stamp))
-        with open_durably(path) as file:
+        self._file = self._write_entries()
+
+    def _write_entries(self) -> FileIO:
+        """Replace the file by one with a line for each entry; return the file, open for further
+        lines.
+        """
+        with open_durably(self._path) as file:
             rest = [json.dumps([name, *stamp]) for name, stamp in self._stamps.items()]
-            file.write("".join(f"{line}\n" for line in [head, *rest]).encode())
-        self._file = path.open("ab", buffering=0)
+            file.write("".join(f"{line}\n" for line in [self._head, *rest]).encode())
+        written = self._path.open("ab", buffering=0)
+        self._lines = len(rest)
+        return written
 
     def copy_stamps(self) -> dict[str, Stamp]:
         """Return the stamp (size and time) at the upload of each file in the archive's copy, by
@@ -85,19 +96,33 @@ class UploadJournal:
     def add(self, name: str, stamp: Stamp) -> None:
         """Record that the file `name` was uploaded to the bucket copy in the version `stamp`."""
         with self._guard:
-            self._file.write(f"{json.dumps([name, *stamp])}\n".encode())
+            self._append_line([name, *stamp])
             self._stamps[name] = stamp
 
     def remove(self, name: str) -> None:
         """Record that a file was deleted from the archive's copy."""
         with self._guard:
-            self._file.write(f"{json.dumps([name])}\n".encode())
+            self._append_line([name])
             self._stamps.pop(name, None)
+
+    def _append_line(self, entry: list[str | int]) -> None:
+        self._file.write(f"{json.dumps(entry)}\n".encode())
+        self._lines += 1
 
     def sync(self) -> None:
         """Write the recorded lines of the upload journal (list of uploaded files) durably to disk
-        (fsync).
+        (fsync). If most lines are out of date, write the whole file again. One thread at a time may
+        call this.
+
+        Raises:
+            OSError: the disk is full or broken; the file stays as it is.
         """
+        with self._guard:
+            if self._lines > 2 * len(self._stamps) + SPARE_LINES:
+                before = self._file
+                self._file = self._write_entries()
+                before.close()
+                return
         os.fsync(self._file.fileno())
 
     def close(self) -> None:

@@ -8,9 +8,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from datetime import date
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -20,10 +22,10 @@ from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import retire_rows
 from fleet_service.archive.segment_log import SegmentLog
-from fleet_service.replication import replica
+from fleet_service.replication import replica, upload_journal
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.replica import OWNER, BucketReplica
-from fleet_service.replication.upload_journal import last_copy_url
+from fleet_service.replication.upload_journal import Stamp, UploadJournal, last_copy_url
 from schemas.config import ServiceConfig, load
 from schemas.errors import InputError
 from schemas.wire import Kind
@@ -315,3 +317,35 @@ def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) ->
     with pytest.raises(InputError) as told:
         load(path, ServiceConfig)
     assert SECRET not in str(told.value)
+
+
+def test_a_journal_of_a_long_run_is_rewritten_and_loses_no_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(upload_journal, "SPARE_LINES", 10)
+    journal = UploadJournal(tmp_path, "s3://copy")
+    path = tmp_path / upload_journal.NAME
+    journal.add("old", Stamp(1, 1))
+    for number in range(100):
+        journal.add(f"{number}", Stamp(number, number))
+        journal.remove(f"{number - 1}")
+        journal.sync()
+        assert len(path.read_text().splitlines()) <= 1 + 2 * 2 + 10
+    with monkeypatch.context() as full:
+        full.setattr(upload_journal, "SPARE_LINES", -100)
+        full.setattr(upload_journal, "open_durably", fail_to_open)
+        with pytest.raises(OSError, match="disk"):
+            journal.sync()
+    with ThreadPoolExecutor() as threads:
+        for number in range(100, 400):
+            threads.submit(journal.add, f"{number}", Stamp(number, number))
+            threads.submit(journal.remove, "99")
+            journal.sync()
+    journal.close()
+    kept = {"old", *map(str, range(100, 400))}
+    with closing(UploadJournal(tmp_path, "s3://copy")) as again:
+        assert again.copy_stamps().keys() == kept
+
+
+def fail_to_open(_: Path) -> BinaryIO:
+    raise OSError("disk is full")
