@@ -12,6 +12,7 @@ import json
 import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -36,6 +37,8 @@ MOST_ROWS: Final = 500_000  # largest number of rows to fuse: some seconds of wo
 # Largest number of rows in files near the box, according to the files' footers. Reading them takes
 # half a minute.
 LOOKED_ROWS: Final = 20_000_000
+# [s] Longest wait for the next part of an answer, four times the time for LOOKED_ROWS.
+SILENT_S: Final = 120.0
 IDLE_S: Final = 60.0  # [s] time for which an idle process waits for the next query
 # Number of answers after which a process ends, so that the memory it has accumulated is released.
 ANSWERS: Final = 100
@@ -82,7 +85,8 @@ class HistoricalMaps:
         for the numbers of the tiles that are part of the answer.
 
         Raises:
-            InputError: too many rows would have to be read, or the archive cannot be read.
+            InputError: too many rows would have to be read, the archive cannot be read, or the
+                process writes nothing for SILENT_S.
             ChildProcessError: the process died.
         """
         box = box_of(question)
@@ -117,13 +121,8 @@ class HistoricalMaps:
         if process := self._keep_process(None):
             with suppress(BrokenPipeError, ChildProcessError):  # if the process has just ended
                 return process, process.ask(question)
-            process.end()
         process = _Process(self._root)
-        try:
-            return process, process.ask(question)
-        except BaseException:
-            process.end()
-            raise
+        return process, process.ask(question)
 
     def _keep_process(self, process: _Process | None) -> _Process | None:
         """Store an idle process (or None) for the next query; return the process that was stored
@@ -145,20 +144,25 @@ class _Process:
         assert self._child.stdout
         self._in = self._child.stdin
         self.out = self._child.stdout
+        self._is_silent = False
 
     def ask(self, question: PastQuery) -> bytes:
         """Send a query about a past map to the process; return the head (tile number and length) of
-        the first reply.
+        the first reply. If this fails, the process is ended.
         """
-        self._in.write(encode_question(question))
-        self._in.flush()
-        return self.head()
+        try:
+            self._in.write(encode_question(question))
+            self._in.flush()
+            return self.head()
+        except BaseException:
+            self.end()
+            raise
 
     def head(self) -> bytes:
         """Return the head (tile number and length) of the next reply. Raise ChildProcessError if
         the process has ended.
         """
-        head = self.out.read(_HEAD.size)
+        head = self._read_bytes(_HEAD.size)
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")
         return head
@@ -167,10 +171,28 @@ class _Process:
         """Return a reply's payload of `size` bytes. Raise ChildProcessError if the process has
         ended before it was complete.
         """
-        payload = self.out.read(size)
+        payload = self._read_bytes(size)
         if len(payload) < size:
             raise ChildProcessError(f"the past map is incomplete ({self._child.wait()})")
         return payload
+
+    def _read_bytes(self, size: int) -> bytes:
+        """Return the next `size` bytes from the process, fewer if it has ended. Kill it if they do
+        not arrive within SILENT_S, because it holds up all later queries.
+        """
+        limit = threading.Timer(SILENT_S, self._kill_silent)
+        limit.start()
+        found = self.out.read(size)
+        limit.cancel()
+        if self._is_silent and len(found) < size:
+            raise InputError(
+                "at", f"the past map made no progress for {SILENT_S:.0f} s", "use a smaller bbox"
+            )
+        return found
+
+    def _kill_silent(self) -> None:
+        self._is_silent = True
+        self._child.kill()
 
     def end(self) -> None:
         """Kill the process that rebuilds past maps, and close its pipes."""

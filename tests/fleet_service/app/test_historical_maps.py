@@ -4,6 +4,7 @@ query which needs more rows is refused.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -183,3 +184,19 @@ def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
     left.close()  # type: ignore[attr-defined]  # a generator
     assert len(list(asker.ask(question(bbox=NEAR), lambda _: True))) == 1
     assert len(begun) == 2
+
+
+@pytest.mark.parametrize("was_idle", [False, True])
+def test_a_process_that_hangs_is_killed_and_the_asker_gets_an_error(
+    asker: historical_maps.HistoricalMaps,
+    begun: list[subprocess.Popen[bytes]],
+    monkeypatch: pytest.MonkeyPatch,
+    was_idle: bool,
+) -> None:
+    if was_idle:
+        list(asker.ask(question(bbox=NEAR), lambda _: True))
+        begun[0].send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(historical_maps, "SILENT_S", 0.1)  # a new process needs a second
+    with pytest.raises(InputError, match="at: the past map made no progress"):
+        list(asker.ask(question(bbox=NEAR), lambda _: True))
+    assert [child.poll() for child in begun] == [-signal.SIGKILL]
