@@ -72,9 +72,7 @@ class Intake:
         self.weather = WeatherInbox(root, config.name, shared.state.fusion, counts)
         self.reset()
         if config.weather is not None:
-            self._apply_weather(
-                self.weather.begin(config.weather, shared.state.weather, time.time_ns())
-            )
+            self._apply_weather(self.weather.begin(config.weather, time.time_ns()))
 
     def reset(self) -> None:
         """Continue the intake with a newly loaded state of the service. The recorded paths of

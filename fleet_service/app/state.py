@@ -17,7 +17,6 @@ import pyarrow as pa
 from fleet_service.archive.format.layout import DAY_NS, Cut
 from fleet_service.archive.format.load import skip_damaged
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
@@ -52,7 +51,6 @@ class ServiceState(NamedTuple):
         fusion, map, alerts: beliefs about the friction of all cells; the map and the active alerts
             made from them.
         streams: record of the batches (messages with records) that were admitted.
-        weather: all weather reports used.
         refused: number of checkpoints (saved states) that could not be loaded.
         public: cells that readers may see; None if they may see all cells.
     """
@@ -61,15 +59,16 @@ class ServiceState(NamedTuple):
     map: MapState
     alerts: Alerts
     streams: SequenceTrackers
-    weather: Reports
     refused: int
     public: PublicCells | None
 
     def drop_old(self) -> int:
-        """Drop cells that were not visited for KEPT_NS. Their belief has returned to the prior, the
-        belief before any measurement. Return the number of dropped cells.
+        """Drop cells that were not visited for KEPT_NS, and weather that is as old. The belief of
+        such cells has returned to the prior, the belief before any measurement. Return the number
+        of dropped cells.
         """
         newest = self.fusion.checkpoint or 0
+        self.fusion.drop_weather(newest - KEPT_NS)
         stale = self.fusion.untouched(newest - KEPT_NS)
         stale[sorted(self.alerts.slots)] = False
         dropped = int(stale.sum())
@@ -159,13 +158,19 @@ def load_state(
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)
+    first = first_day(root)
     # Weather comes first, because it affects how observations are fused.
-    used = archived_reports(root, damaged=damaged)
     fusion.update_weather(
-        archived_reports(root, known=begin.weather, damaged=damaged) if begin.cut else used
+        archived_reports(
+            root,
+            known=begin.weather,
+            damaged=damaged,
+            # A report affects the hours after it, but no day after the next.
+            acts_since=0 if first is None else (first - 1) * DAY_NS,
+        )
     )
     shown.mark_all_changed()
-    matters = Begin(first_day(root), begin.cut, until)
+    matters = Begin(first, begin.cut, until)
     heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
@@ -182,6 +187,6 @@ def load_state(
         for kind, rows in noting.result() or []:
             streams.restore(kind, rows)
     pa.default_memory_pool().release_unused()  # memory from reading the archive
-    memory = ServiceState(fusion, shown, alerts, streams, used, begin.refused, public)
+    memory = ServiceState(fusion, shown, alerts, streams, begin.refused, public)
     memory.drop_old()
     return memory

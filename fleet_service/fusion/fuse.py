@@ -216,7 +216,16 @@ class Fusion(BeliefMap):
         self.reports = Reports(*columns)
         # Beliefs are aged from the times of their last visits. Earlier weather has no effect.
         if self.checkpoint is not None:
-            self.reports = _drop_old_reports(self.reports, self._oldest())
+            times = self.live.time[: self.size]
+            oldest = int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
+            self.reports = _drop_old_reports(self.reports, oldest)
+        self._weather = weather_of(self.reports)
+
+    def drop_weather(self, before: int) -> None:
+        """Drop the weather reports whose validity ended before the time `before` [ns]. Beliefs of
+        cells without a later visit must have become the prior.
+        """
+        self.reports = _drop_old_reports(self.reports, before)
         self._weather = weather_of(self.reports)
 
     def _vote_weights_at(self, epoch: int) -> VoteWeights:
@@ -269,10 +278,6 @@ class Fusion(BeliefMap):
         return slots, absorb_votes(
             self.store.state, self._weather, arrivals, Votes(at, slots, share, most)
         )
-
-    def _oldest(self) -> int:
-        times = self.live.time[: self.size]
-        return int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
 
 
 def _make_arrivals(

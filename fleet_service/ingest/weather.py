@@ -27,6 +27,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive.format.files import SEGMENT, write_table
 from fleet_service.archive.format.layout import DAY_NS, read_epoch, with_term
 from fleet_service.archive.format.load import Damaged, load, skip_damaged
+from fleet_service.archive.format.row_filter import ValueRange
 from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import Fusion
@@ -34,7 +35,7 @@ from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
 from schemas.errors import InputError
 from schemas.runtime.durable import make_folder
-from schemas.thresholds import NS
+from schemas.thresholds import NS, US_STEP
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
@@ -97,13 +98,15 @@ class WeatherInbox:
                 self._counts.refused["weather"] += 1
         return self._archive_reports(found, now) if found else None
 
-    def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
+    def begin(self, path: Path, now: int) -> Reports | None:
         """Archive those reports of a weather file that may still affect the map at `now` [ns] and
-        are not in `known` (the reports used so far). Return them, or None if there are none.
+        are not in the archive yet. Return them, or None if there are none.
 
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.
+            OSError: the archive cannot be read.
         """
+        known = archived_reports(self._folder.parent, acts_since=self.fusion.next_epoch - VALID_NS)
         seen = set(zip(known.region.tolist(), known.time.tolist(), strict=True))
         found = []
         for region, report in read_file(path):
@@ -164,9 +167,11 @@ def archived_reports(
     received_until: int | None = None,
     known: Collection[str] = (),
     damaged: Damaged = skip_damaged,
+    acts_since: int = 0,
 ) -> Reports:
     """Return every report that a map used, in order of receipt, up to the time `received_until`
-    [ns]. Files whose names are in `known` are skipped.
+    [ns]. Reports that took effect before the time `acts_since` [ns], and files whose names are in
+    `known`, are skipped.
 
     `damaged` is called with each damaged file. The reports of such a file are missing, so the map
     is computed as if the weather of these regions were unknown.
@@ -175,11 +180,13 @@ def archived_reports(
         InputError: a file has a newer major version.
         OSError: the archive cannot be read.
     """
+    recent = [ValueRange("acts_from", acts_since // US_STEP)]
     for _ in range(_TURNS):
         try:
             paths = [path for path in weather_files(root) if path.name not in known]
             parts = [
-                load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths
+                load(path, tables.WEATHER_ARCHIVE, where=recent, whole=True, damaged=damaged)
+                for path in paths
             ]
             break
         except FileNotFoundError:  # another process has joined the file into a daily file

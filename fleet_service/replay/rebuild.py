@@ -131,15 +131,16 @@ def too_much() -> InputError:
     return InputError("at", "the query would read too much of the archive", "use a smaller bbox")
 
 
-def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
+def fusion_with_weather(root: Path, lateness_s: float, until: int, since: int = 0) -> Fusion:
     """Return a fusion (beliefs about the friction of all cells) that contains the weather received
-    until the time `until` [ns], and no observations.
+    until the time `until` [ns] that took effect at the time `since` [ns] or later, and no
+    observations.
 
     Raises:
         OSError: the archive cannot be read.
     """
     fusion = Fusion(lateness_s)
-    fusion.update_weather(archived_reports(root, received_until=until))
+    fusion.update_weather(archived_reports(root, received_until=until, acts_since=since))
     return fusion
 
 
@@ -162,9 +163,9 @@ def past_fusion(
         InputError: there are more rows than `most`.
         OSError: the archive cannot be read.
     """
-    fusion = fusion_with_weather(root, lateness_s, until)
-    begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
-    wanted = Since(begin, until=until, box=box, most=most)
+    day = until // layout.DAY_NS - layout.MAP_DAYS
+    fusion = fusion_with_weather(root, lateness_s, until, (day - 1) * layout.DAY_NS)
+    wanted = Since(Begin(day), until=until, box=box, most=most)
     heard = ignore_observations if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # a past map has no alerts

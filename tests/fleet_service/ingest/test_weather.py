@@ -19,6 +19,7 @@ import zenoh
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format.layout import DAY_NS
+from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.counts import ServiceCounts
 from fleet_service.fusion import Fusion
@@ -194,6 +195,29 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     day = start // DAY_NS
     assert (retire_files(root, day - 2), len(weather_files(root))) == (0, 1)
     assert (retire_files(root, day + 1), len(weather_files(root))) == (1, 0)
+
+
+def test_weather_that_no_longer_matters_is_not_loaded_or_kept(tmp_path: Path) -> None:
+    now = time.time_ns()
+    old = now - 60 * DAY_NS
+    recent = (now // SECOND - 7200) * SECOND
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for seq, begin in enumerate((old, recent), 1):
+            told = weather.encode(Report(begin, road_temperature=-1.0))
+            engine.intake.weather.enqueue(
+                WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+            )
+            engine.intake.update_weather(begin)
+            drive(engine, begin, seq)
+        right = beliefs(engine, now)
+        engine.drop_old()
+        assert (engine.state.fusion.reports.time >= recent).all()
+    compact(tmp_path)
+    drop_checkpoints(tmp_path)
+    assert len(archived_reports(tmp_path).time) == 2
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        assert (again.state.fusion.reports.time >= recent).all()
+        np.testing.assert_allclose(beliefs(again, now), right, atol=1e-6)
 
 
 def test_a_running_service_takes_weather_over_its_key(
