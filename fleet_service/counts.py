@@ -28,7 +28,7 @@ class ServiceCounts:
     The text of each other count describes its metric.
     """
 
-    late: int = _count("observations archived but not fused")
+    late: int = _count("observations not fused in time, but as old ones or not at all")
     implausible_moves: int = _count(
         "observations archived but not fused because their vehicle cannot have reached the place"
     )

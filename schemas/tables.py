@@ -87,7 +87,7 @@ BOOKKEEPING: Final = (
         "late",
         pa.bool_(),
         "-",
-        "true if later than the lateness window; fused as an old report if late_by > 0",
+        "true if not fused in time; fused as an old report if late_by > 0",
     ),
     Field("weight", F32, "-", "weight with which the fusion counted the row"),
     Field(
@@ -181,7 +181,7 @@ CELL_HOUR: Final = (
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
     Field("hour", US, "us since 1970, UTC", "start of the hour that contains leave_time"),
     Field("observations", I64, "-", "number of observations; add"),
-    Field("late", I64, "-", "number of observations that were too late to be fused; add"),
+    Field("late", I64, "-", "number of observations that were not fused in time; add"),
     Field("vehicles", I64, "-", "distinct vehicles of this row; cannot be added, see vehicle_bits"),
     Field(
         "vehicle_bits", I64, "64 bits", "vehicles, about -64 ln(share of zero bits); combine by OR"

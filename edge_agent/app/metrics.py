@@ -55,7 +55,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric(
             "late_batches",
             "counter",
-            "batches that arrived too late for the map",
+            "batches that came later than the service's lateness",
             _by_kind_name(counts.late),
             "kind",
         ),
