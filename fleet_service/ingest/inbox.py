@@ -37,7 +37,7 @@ from schemas.grid import cell_of
 from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS, US_STEP
-from schemas.wire import Kind
+from schemas.wire import MAX_BYTES, Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 
 # Limits for one step of the worker, so that a flood of messages delays alerts, answers and segments
@@ -94,7 +94,9 @@ class Inbox:
             key = str(sample.key_expr)
             payload = sample.payload
             encoding = str(sample.encoding)
-            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(
+            if len(payload) > MAX_BYTES:
+                self._counts.refused["payload"] += 1
+            elif sample.kind == zenoh.SampleKind.PUT and self._limits.allows(
                 key, len(payload), encoding
             ):
                 self.put(Message(kind, key, payload.to_bytes(), encoding))

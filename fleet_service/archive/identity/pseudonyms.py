@@ -24,6 +24,8 @@ from schemas.numeric import IntArray
 from schemas.runtime.durable import open_durably, sync_directory
 
 KEY_BYTES: Final = 32
+# Number of months whose pseudonyms are cached. Records of other months are rare.
+MONTHS_KNOWN: Final = 2
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
 _DAY_NS: Final = 86_400_000_000_000
 
@@ -49,7 +51,7 @@ class Pseudonyms:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._keys: dict[str, bytes] = {}
-        self._known: dict[tuple[str, str], str] = {}
+        self._known: dict[str, dict[str, str]] = {}  # by month, then by vehicle
         self._month_of_day: dict[int, str] = {}
 
     def of(self, vehicle: str, time: int) -> str:
@@ -59,10 +61,15 @@ class Pseudonyms:
             OSError: the key of the month can neither be read nor created.
         """
         month = self._month(time // _DAY_NS)
-        pseudonym = self._known.get((month, vehicle))
+        known = self._known.get(month)
+        if known is None:
+            known = self._known[month] = {}
+            if len(self._known) > MONTHS_KNOWN:
+                del self._known[min(self._known)]
+        pseudonym = known.get(vehicle)
         if pseudonym is None:
             digest = blake2b(vehicle.encode(), key=self._key(month), digest_size=_DIGEST_BYTES)
-            pseudonym = self._known[month, vehicle] = digest.hexdigest()
+            pseudonym = known[vehicle] = digest.hexdigest()
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:

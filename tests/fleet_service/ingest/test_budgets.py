@@ -126,6 +126,16 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
     assert engine.state.fusion.live.vehicles[: engine.state.fusion.size].max() == 1
 
 
+def test_pseudonyms_of_past_months_are_not_remembered(tmp_path: Path) -> None:
+    pseudonyms = Pseudonyms(tmp_path)
+    now = time.time_ns()
+    first = pseudonyms.of("car-001", now)
+    for number in range(1, 6):
+        assert pseudonyms.of("car-001", now + number * 31 * 86_400 * SECOND) != first
+    assert len(pseudonyms._known) == 2
+    assert pseudonyms.of("car-001", now) == first
+
+
 def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
     pseudonyms = Pseudonyms(tmp_path)
     witnesses = VehicleIds(tmp_path)

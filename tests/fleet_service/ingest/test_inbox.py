@@ -8,10 +8,12 @@ import threading
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+import zenoh
 
 from fleet_service.app.engine import Engine
 from fleet_service.counts import ServiceCounts
@@ -54,6 +56,26 @@ def test_what_waits_is_bounded_in_bytes_and_not_in_messages_only() -> None:
     for _ in range(2 * fits):
         queue.put(large)
     assert len(queue) in (waiting, waiting - 1), "what was taken made room"
+
+
+class Payload(bytes):
+    """Payload of a received message, which fails the test if it is copied."""
+
+    def to_bytes(self) -> bytes:
+        assert len(self) <= wire.MAX_BYTES, "copied"
+        return bytes(self)
+
+
+def test_a_message_above_the_largest_size_is_counted_and_not_copied() -> None:
+    queue, counts = inbox(10)
+    take = queue.callback(Kind.STATE)
+    for size in (wire.MAX_BYTES, wire.MAX_BYTES + 1):
+        sample = SimpleNamespace(
+            key_expr="", payload=Payload(size), encoding="", kind=zenoh.SampleKind.PUT
+        )
+        take(sample)  # type: ignore[arg-type]
+    assert len(queue) == 1
+    assert counts == ServiceCounts(refused=Counter(payload=1))
 
 
 def test_what_waits_is_bounded_in_messages_too_and_a_step_takes_so_many() -> None:
