@@ -94,9 +94,7 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
         readme.write_if_outdated(root)
         term = layout.read_epoch(root)
         for kind in Kind:
-            waiting = sorted(
-                segments.list_segments(root, kind), key=lambda path: layout.age_key(path.name)
-            )
+            waiting = segments.list_segments(root, kind)
             done = reading.compacted_partitions(
                 layout.compacted_files(root, kind), {path.name for path in waiting}
             )

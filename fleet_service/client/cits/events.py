@@ -76,11 +76,6 @@ class EventBook:
             self._restore_content(content)
 
     @property
-    def open_events(self) -> list[OpenEvent]:
-        """Return the hazard events that have not ended."""
-        return [event for event in self._events.values() if not event.ended]
-
-    @property
     def content(self) -> dict[str, Any]:
         """Return all hazard events in a form that JSON supports, to be saved to a file."""
         return {

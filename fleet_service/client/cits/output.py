@@ -70,11 +70,6 @@ class DenmOutput:
         """
         return time.monotonic() >= self._checked + CHECK_S
 
-    @property
-    def open_event_count(self) -> int:
-        """Return the number of hazard events that have not ended."""
-        return len(self._book.open_events)
-
     def mark_accepted(self, name: str) -> None:
         """Record that the interchange accepted the DENM (hazard message) with this name, so that it
         is not sent again.
