@@ -44,6 +44,7 @@ ASKED_S: Final = 2.0  # [s] period of the checks for a requested erasure or hand
 SOON_S: Final = 60.0
 # [s] A job that runs for longer counts as hanging. Compaction of a day's backlog takes minutes.
 HANGS_S: Final = 1800.0
+Work = Callable[[threading.Event], str | None]
 _NICE: Final = 10  # scheduling priority of the jobs' thread: lower than that of the worker
 
 
@@ -54,7 +55,7 @@ class Job(NamedTuple):
 
     name: str
     every_s: float
-    work: Callable[[threading.Event], str | None]
+    work: Work
 
 
 def archive_jobs(
@@ -63,103 +64,141 @@ def archive_jobs(
     """Return the jobs that maintain an archive, according to the settings. `moment` is a function
     that returns the service's time.
     """
+    work = ArchiveWork(engine, config, root, moment)
+    early_s = SOON_S if config.compact_s else 0.0
+    retention_s = DAY_S if config.raw_days else 0.0
+    follow_s = 0.0 if engine.copy is None else FOLLOW_S
+    asked_s = 0.0 if engine.holding.lease is None else ASKED_S
+    return [
+        Job("compaction", config.compact_s, with_disk_space(root, work.compact_segments)),
+        Job("early_compaction", early_s, with_disk_space(root, work.compact_early)),
+        Job("checkpoint", config.checkpoint_s, work.save_checkpoint),
+        Job("snapshot", config.snapshot_s, work.save_snapshot),
+        Job("retention", retention_s, with_disk_space(root, work.remove_old_rows)),
+        Job("inventory", INVENTORY_S, work.count_files),
+        Job("old_cells", DAY_S, work.drop_old_cells),
+        Job("following", follow_s, work.copy_files),
+        Job("handing_over", asked_s, work.hand_over),
+        Job("erasure", ASKED_S, work.erase_requested),
+    ]
 
-    def compaction(stop: threading.Event) -> str | None:
+
+def with_disk_space(root: Path, work: Work) -> Work:
+    """Return a function that runs the background job `work`. If the disk is full, it releases the
+    reserved disk space of the archive in `root` and runs `work` again.
+    """
+
+    def run_job(stop: threading.Event) -> str | None:
+        try:
+            return work(stop)
+        except (OSError, InputError):
+            if not disk_reserve.release(root):
+                raise
+            return work(stop)
+
+    return run_job
+
+
+class ArchiveWork:
+    """Work of the background jobs. Each public method does a job once and returns a line for the
+    operator, or None. Its argument is an event that ends the work early.
+
+    Args:
+        engine: service without network.
+        config: settings.
+        root: folder of the archive.
+        moment: function that returns the service's time.
+    """
+
+    def __init__(
+        self, engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]
+    ) -> None:
+        self._engine = engine
+        self._config = config
+        self._root = root
+        self._moment = moment
+
+    def compact_segments(self, stop: threading.Event) -> str | None:
+        """Move the rows of all segments (files of new rows) into sorted files."""
+        copy = self._engine.copy
         # If compaction ran now, the segments that are not yet in the bucket could never be copied.
         # A full disk is no reason to wait, because compaction makes room.
-        if engine.copy is not None and engine.copy.backoff.trouble is not None:
+        if copy is not None and copy.backoff.trouble is not None:
             return "compaction waits for the archive's copy"
-        disk_reserve.allocate(root)
-        weather.join_daily_files(root)
-        if not config.put_to and not any(segments.list_segments(root, kind) for kind in Kind):
+        disk_reserve.allocate(self._root)
+        weather.join_daily_files(self._root)
+        put_to = self._config.put_to
+        if not put_to and not self._count_segments():
             return None
-        words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
-        words += ["--put-to", config.put_to] if config.put_to else []
+        words = ["compact", "--archive", str(self._root), "--round-rows", str(ROUND_ROWS)]
+        words += ["--put-to", put_to] if put_to else []
         output = subprocess_job.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 
-    def early_compaction(stop: threading.Event) -> str | None:
-        waiting = sum(len(segments.list_segments(root, kind)) for kind in Kind)
-        return compaction(stop) if waiting > SEGMENTS_MOST else None
+    def compact_early(self, stop: threading.Event) -> str | None:
+        """Compact the archive (move new rows into sorted files) if too many segments wait."""
+        return self.compact_segments(stop) if self._count_segments() > SEGMENTS_MOST else None
 
-    def snapshot(_: threading.Event) -> str | None:
-        now = moment().now
-        table = engine.queries.whole_map(now)
+    def _count_segments(self) -> int:
+        return sum(len(segments.list_segments(self._root, kind)) for kind in Kind)
+
+    def save_snapshot(self, _: threading.Event) -> str | None:
+        """Write the present map to the archive, unless it is empty."""
+        now = self._moment().now
+        table = self._engine.queries.whole_map(now)
         if table.num_rows:
-            snapshots.write_snapshot(root, table, now)
+            snapshots.write_snapshot(self._root, table, now)
         return None
 
-    def checkpoint(stop: threading.Event) -> str | None:
-        engine.save_checkpoint(stop)
+    def save_checkpoint(self, stop: threading.Event) -> str | None:
+        """Save a checkpoint (state of the service, for a fast restart)."""
+        self._engine.save_checkpoint(stop)
         return None
 
-    def retention(_: threading.Event) -> str | None:
-        at = moment()
+    def remove_old_rows(self, _: threading.Event) -> str | None:
+        """Remove rows and weather that are older than the setting `raw_days`."""
+        at = self._moment()
         if not at.sure:
             return "retention waits: no report has confirmed the clock yet"
-        done = retire_rows(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
-        weather.retire_files(root, at.now // layout.DAY_NS - config.raw_days - 1)
+        raw_days = self._config.raw_days
+        done = retire_rows(self._root, raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
+        weather.retire_files(self._root, at.now // layout.DAY_NS - raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
-    def old_cells(stop: threading.Event) -> str | None:
+    def drop_old_cells(self, stop: threading.Event) -> str | None:
+        """Drop cells from memory that were not visited for a week."""
+        engine = self._engine
         dropped = engine.settlement.run_between_segments(engine.drop_old, stop)
         return f"dropped: {dropped} cells without a visit for a week" if dropped else None
 
-    def inventory(_: threading.Event) -> str | None:
-        engine.counts.files_set_aside = count_set_aside(root)
+    def count_files(self, _: threading.Event) -> str | None:
+        """Count the damaged files that were set aside."""
+        self._engine.counts.files_set_aside = count_set_aside(self._root)
         return None
 
-    def with_disk_space(
-        work: Callable[[threading.Event], str | None],
-    ) -> Callable[[threading.Event], str | None]:
-        """Return a function that runs the background job `work`. If the disk is full, it releases
-        the reserved disk space and runs `work` again.
-        """
-
-        def run_job(stop: threading.Event) -> str | None:
-            try:
-                return work(stop)
-            except (OSError, InputError):
-                if not disk_reserve.release(root):
-                    raise
-                return work(stop)
-
-        return run_job
-
-    def following(_: threading.Event) -> str | None:
-        if engine.copy is not None:
-            engine.copy.sync()
+    def copy_files(self, _: threading.Event) -> str | None:
+        """Upload the files that no acknowledgement depends on to the archive's copy."""
+        if self._engine.copy is not None:
+            self._engine.copy.sync()
         return None
 
-    def handing_over(stop: threading.Event) -> str | None:
-        holding = engine.holding
+    def hand_over(self, stop: threading.Event) -> str | None:
+        """Prepare the hand-over of the archive to another service, if one was requested."""
+        holding = self._engine.holding
         if not holding.to:
             return None
         try:
-            checkpoint(stop)
-            following(stop)
+            self.save_checkpoint(stop)
+            self.copy_files(stop)
         except BaseException:
             holding.to = ""  # the hand-over failed; the service keeps its archive
             raise
         holding.leaves = True
         return f"handing over: to {holding.to}"
 
-    return [
-        Job("compaction", config.compact_s, with_disk_space(compaction)),
-        Job(
-            "early_compaction",
-            SOON_S if config.compact_s else 0.0,
-            with_disk_space(early_compaction),
-        ),
-        Job("checkpoint", config.checkpoint_s, checkpoint),
-        Job("snapshot", config.snapshot_s, snapshot),
-        Job("retention", DAY_S if config.raw_days else 0.0, with_disk_space(retention)),
-        Job("inventory", INVENTORY_S, inventory),
-        Job("old_cells", DAY_S, old_cells),
-        Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),
-        Job("handing_over", ASKED_S if engine.holding.lease is not None else 0.0, handing_over),
-        Job("erasure", ASKED_S, lambda stop: erasing.handle_requests(engine, config, root, stop)),
-    ]
+    def erase_requested(self, stop: threading.Event) -> str | None:
+        """Erase the data for which an erasure was requested."""
+        return erasing.handle_requests(self._engine, self._config, self._root, stop)
 
 
 class BackgroundJobs:
