@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import segments
+from fleet_service.counts import ServiceCounts
 from schemas.config import ServiceConfig
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
@@ -43,9 +44,24 @@ def collect_metrics(
     engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path
 ) -> list[Metric]:
     """Return all metrics of a service with their current values."""
-    counts = engine.counts
-    report_lag_s = engine.intake.report_lag_s
-    away_s = 0.0 if engine.copy is None else engine.copy.backoff.away_s
+    return [
+        *_counter_metrics(engine.counts),
+        Metric(
+            "segments",
+            "gauge",
+            "segments waiting for compaction",
+            _per_kind(root, segments.list_segments),
+            "kind",
+        ),
+        *_load_metrics(engine, pulse, config),
+        *_storage_metrics(engine),
+        _serves_metric(config, 1.0),
+        *_map_metrics(engine),
+    ]
+
+
+def _counter_metrics(counts: ServiceCounts) -> list[Metric]:
+    """Return the counts since the start of the service as metrics."""
     single = [
         Metric(name, "counter", text, {"": getattr(counts, name)})
         for name, text in counts.texts().items()
@@ -77,13 +93,14 @@ def collect_metrics(
             "work",
         ),
         Metric("runs", "counter", "runs of background jobs", dict(counts.runs), "work"),
-        Metric(
-            "segments",
-            "gauge",
-            "segments waiting for compaction",
-            _per_kind(root, segments.list_segments),
-            "kind",
-        ),
+    ]
+
+
+def _load_metrics(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[Metric]:
+    """Return metrics of the received messages and of the worker (the thread that processes
+    them).
+    """
+    return [
         gauge("queue_messages", "waiting messages", pulse.queued),
         gauge("queue_capacity", "capacity of the queue", config.queue_batches),
         gauge("routers", "routers to which the session is connected", pulse.routers),
@@ -92,8 +109,15 @@ def collect_metrics(
         gauge(
             "report_lag_seconds",
             "time between the end of the newest visit and its arrival",
-            report_lag_s,
+            engine.intake.report_lag_s,
         ),
+    ]
+
+
+def _storage_metrics(engine: Engine) -> list[Metric]:
+    """Return metrics of the disk, the archive's copy and the lease (ownership of the archive)."""
+    away_s = 0.0 if engine.copy is None else engine.copy.backoff.away_s
+    return [
         gauge(
             "unsettled_batches",
             "admitted batches that are not on disk yet",
@@ -109,7 +133,12 @@ def collect_metrics(
             "time for which the service may acknowledge without renewing its lease",
             engine.holding.left_s,
         ),
-        _serves_metric(config, 1.0),
+    ]
+
+
+def _map_metrics(engine: Engine) -> list[Metric]:
+    """Return metrics of the map, the alerts and the archive's damaged files."""
+    return [
         gauge("cells", "cells and sectors with a belief", engine.state.fusion.size),
         gauge(
             "window_observations",
@@ -120,7 +149,7 @@ def collect_metrics(
         gauge(
             "damaged_files",
             "damaged files set aside, at the last count",
-            counts.files_set_aside,
+            engine.counts.files_set_aside,
         ),
     ]
 
