@@ -21,11 +21,13 @@ from fleet_service.archive.format import reading
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.identity.vehicle_ids import VehicleIds, read_numbers
 from fleet_service.archive.maintenance.retention import drop_checkpoints, forget_period
+from fleet_service.ingest import dedup
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, Bucket, NewCells
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Batch, Kind
+from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import SECOND, batch
 
 
@@ -91,6 +93,25 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
     assert len(set(table["vehicle"].to_pylist())) == len(set(table["boot"].to_pylist())) == 2
     assert sent[0].boot not in table["boot"].to_pylist()
     assert table["boot"].to_numpy().min() >= 0
+
+
+@pytest.mark.parametrize("with_checkpoint", [False, True])
+def test_a_sender_without_first_held_goes_on_in_a_new_month(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_checkpoint: bool
+) -> None:
+    monkeypatch.setattr(dedup, "MAX_GAPS", 3)
+    before, after = months(time.time_ns())
+    times = [before] * 5 + [after] * 10
+    sent = [message(batch("car-001", seq, at, [0.8])) for seq, at in enumerate(times, 1)]
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.intake.ingest(sent, after)
+        engine.settlement.flush()
+        assert (engine.counts.observations, engine.counts.too_many_gaps) == (15, 0)
+        if with_checkpoint:
+            save_checkpoint(engine)
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        again.intake.ingest(sent, after)
+        assert (again.counts.observations, again.counts.duplicates) == (0, 15)
 
 
 def test_batches_with_unhashed_starts_are_recognised_again(
