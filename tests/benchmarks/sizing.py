@@ -47,7 +47,11 @@ def sizing() -> list[Figure]:
         found = json.loads(done.stdout.splitlines()[-1])
         measured = found.pop("bytes")
         estimated = sum(split_memory(MemoryContent(**found)).values())
-        said = f"{measured / 1e6:.0f} MB measured, {estimated / 1e6:.0f} MB estimated; {found}"
+        content = ", ".join(f"{number} {name}" for name, number in found.items())
+        said = (
+            f"of the measured memory; {measured / 1e6:.0f} MB measured, {estimated / 1e6:.0f} MB "
+            f"estimated for {content}"
+        )
         error = abs(estimated / measured - 1.0)
         out.append(Figure(f"scale.calculator_error.v{vehicles}", error, said, BAR))
     return out

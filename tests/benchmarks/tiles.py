@@ -240,9 +240,13 @@ def tiles() -> list[Figure]:
             "bench.tiles.ack_p99_s", found["p99"], "s, publish to acknowledgement, 8 000 tiles", 1
         ),
         Figure("bench.tiles.ack_p50_s", found["p50"], "s"),
-        Figure("bench.tiles.acknowledged", found["acknowledged"], "of the batches", 1, "more"),
+        Figure(
+            "bench.tiles.acknowledged", found["acknowledged"], "share of the batches", 1, "more"
+        ),
         Figure("bench.tiles.rate", found["rate"], "visits/s offered", 0.95 * RATE, "more"),
-        Figure("bench.tiles.shown", float(len(puts)), "tiles that were put", 0.95 * TILES, "more"),
+        Figure(
+            "bench.tiles.shown", float(len(puts)), "tiles that were published", 0.95 * TILES, "more"
+        ),
         Figure(
             "bench.tiles.put_per_s",
             sum(puts.values()) / (WARM_S + MEASURED_S),
@@ -251,13 +255,13 @@ def tiles() -> list[Figure]:
         Figure(
             "bench.query.small_behind_all_p99_ms",
             float(np.quantile(small, 0.99)),
-            "ms, beside two for all",
+            "ms, while two clients query the whole map",
             100,
         ),
         Figure(
             "bench.query.all_tiles",
             float(got),
-            "tiles that the slower of them got",
+            "tiles that the slower client received",
             0.9 * TILES,
             "more",
         ),

@@ -22,9 +22,11 @@ BARS: Final = {
     "faults.kill.doubled": Bar("rows", 0),
     "faults.kill.unacknowledged_lost_at_end": Bar("batches", 0),
     "faults.kill.map_difference": Bar("of mu, its bounds, P(slippery)", 1e-6),
-    "faults.kill.upkeep": Bar("jobs that the kills met", 3, "more"),
+    "faults.kill.upkeep": Bar(
+        "kinds of background jobs that were interrupted by a kill", 3, "more"
+    ),
     "faults.kill.kills": Bar("processes killed", 200, "more"),
-    "faults.kill.offered_per_s": Bar("observations/s amid the kills", 5000, "more"),
+    "faults.kill.offered_per_s": Bar("observations/s during the kills", 5000, "more"),
     "faults.compaction.incomplete_reads": Bar("reads", 0),
     "faults.compaction.kills": Bar("kills", 5, "more"),
     "faults.compaction.reads": Bar("reads", 10, "more"),
@@ -97,8 +99,14 @@ BARS: Final = {
     "faults.model.states_checked": Bar("states", 1000, "more"),
     "faults.lease.acknowledged_by_two": Bar("batches, after a successor began to serve", 0),
     "faults.lease.refused": Bar("starts with another lease time", 20, "more"),
-    "faults.lease.control_unlike": Bar("likewise, if lease times are not compared", 1, "more"),
-    "faults.lease.control_endless": Bar("likewise, if no lease expires", 1, "more"),
+    "faults.lease.control_unlike": Bar(
+        "batches acknowledged after a successor began to serve, if lease times are not compared",
+        1,
+        "more",
+    ),
+    "faults.lease.control_endless": Bar(
+        "batches acknowledged after a successor began to serve, if no lease expires", 1, "more"
+    ),
     "faults.history.violations": Bar("batches lost or doubled on their way to a reader", 0),
     "faults.history.failovers": Bar("takeovers", 50, "more"),
     "faults.history.acknowledged": Bar("batches", 2000, "more"),
@@ -120,13 +128,16 @@ BARS: Final = {
     "faults.availability.attackers": Bar("kinds of attackers", 9, "more"),
     "faults.availability.log_bytes": Bar("bytes that the page logged meanwhile", 100_000),
     "faults.privacy.position_over_chance": Bar(
-        "of the puts a reader finds a lone car within 25 m, over a place drawn at random", 0.05
+        "share of updates by which a reader finds a lone car within 25 m, minus that of chance",
+        0.05,
     ),
-    "faults.privacy.street_over_chance": Bar("likewise, of the car's street among five", 0),
-    "faults.privacy.slippery_delay_s": Bar("s, over those of a map that shows every visit", 1),
-    "faults.privacy.puts": Bar("puts while a lone car drove", 200, "more"),
+    "faults.privacy.street_over_chance": Bar(
+        "as position_over_chance, for the car's street among five", 0
+    ),
+    "faults.privacy.slippery_delay_s": Bar("s later than on a map that shows every visit", 1),
+    "faults.privacy.puts": Bar("map updates while a lone car drove", 200, "more"),
     "faults.privacy.control_position": Bar(
-        "as the first, if every visit is shown at once", 0.5, "more"
+        "as position_over_chance, if every visit is shown at once", 0.5, "more"
     ),
     "faults.query.light_p99_ms": Bar("ms", 100),
     "faults.query.heavy_answers": Bar("whole maps of the slower of two", 2, "more"),
@@ -154,8 +165,8 @@ BARS: Final = {
     "faults.versions.map_difference": Bar("of a belief", 1e-6),
     "faults.versions.files": Bar("files of a newer version", 3, "more"),
     "cluster.lost": Bar("acknowledged batches, over all machines and an empty disk", 0),
-    "cluster.doubled": Bar("rows, likewise", 0),
-    "cluster.unacknowledged_lost": Bar("batches, likewise", 0),
+    "cluster.doubled": Bar("rows, over all machines and an empty disk", 0),
+    "cluster.unacknowledged_lost": Bar("batches, over all machines and an empty disk", 0),
     "cluster.takeover_s.kill": Bar("s to the next acknowledgement, the longest", 8),
     "cluster.takeover_s.freeze": Bar("s to the next acknowledgement, the longest", 12),
     "cluster.failovers": Bar(
@@ -182,7 +193,9 @@ BARS: Final = {
     "link.address_change.lost": Bar("samples", 0),
     "link.address_change.gap_s": Bar("s", 0.5),
     "link.address_change.samples": Bar("samples", 200, "more"),
-    "link.lossy.alert_p99_ms": Bar("ms at 2 % loss and 80 ms round trip, tiles beside it", 200),
+    "link.lossy.alert_p99_ms": Bar(
+        "ms at 2 % loss and 80 ms round trip, with tiles sent at the same time", 200
+    ),
     "link.lossy.alert_p99_ratio": Bar("over that with TLS", 0.6),
     "link.lossy.alerts_lost": Bar("alerts", 0),
     "link.udp_blocked.ready_s": Bar("s", 3),
@@ -190,7 +203,7 @@ BARS: Final = {
     "link.flood.honest_p99_ratio": Bar("with a flooding car over without", 1.2),
     "link.flood.sent_per_s": Bar("messages/s of the flooding car", 500, "more"),
     "faults.handover.lost": Bar("batches, over both machines and an empty disk", 0),
-    "faults.handover.doubled": Bar("rows, likewise", 0),
+    "faults.handover.doubled": Bar("rows, over both machines and an empty disk", 0),
     "faults.handover.pause_s": Bar("s without an acknowledgement, the longest", 5),
     "faults.handover.handovers": Bar("hand-overs under load", 20, "more"),
     "faults.handover.acknowledged": Bar("batches", 2000, "more"),

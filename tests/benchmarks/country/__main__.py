@@ -53,13 +53,15 @@ def main() -> int:
         shutil.copy(course / "course.npz", FOLDER)
     found += [
         Figure(
-            "country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory for a vehicle"
+            "country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory per vehicle"
         ),
-        Figure("country.cell_bytes", each.cell_bytes, "bytes of it for a cell's sector"),
+        Figure(
+            "country.cell_bytes", each.cell_bytes, "bytes of a service's memory per cell and sector"
+        ),
         Figure(
             "country.pair_bytes",
             each.pair_bytes,
-            "bytes of it for each of these that a vehicle visited lately",
+            "bytes of a service's memory per cell and sector that a vehicle visited recently",
         ),
     ]
     found += estimate_million({figure.name: figure.value for figure in found})

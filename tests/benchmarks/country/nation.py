@@ -183,7 +183,7 @@ def simulate_nation(
         ),
         Figure("country.not_fused", _not_fused(counts), "observations that were archived only"),
         Figure(
-            "country.archive_bytes", size / max(compacted, 1), "bytes of a compacted observation"
+            "country.archive_bytes", size / max(compacted, 1), "bytes per compacted observation"
         ),
     ]
 
@@ -290,7 +290,7 @@ def _make_wait_figures(put: FloatArray, wait: FloatArray, region: FloatArray) ->
         Figure(
             "country.region_p99_ratio",
             float(most.max() / most.min()),
-            "likewise: a checkpoint is a moment's",
+            "slowest region over the fastest; depends on when a checkpoint is written",
         ),
     ]
 
@@ -361,11 +361,13 @@ def _make_share_figures(looks: Sequence[Look], observations: int) -> list[Figure
         Figure("country.cores", float(spent[: len(SERVICES)].sum()), "cores of all services"),
         Figure("country.router_cores", float(spent[-2]), "cores of the router"),
         Figure("country.sender_cores", float(spent[-1]), "cores of the vehicles' sender"),
-        Figure("country.service_us", float(1e6 * per_row.mean()), "us of a service an observation"),
+        Figure(
+            "country.service_us", float(1e6 * per_row.mean()), "µs of a service per observation"
+        ),
         Figure(
             "country.router_us",
             float(1e6 * spent[-2] * apart * ROWS / rows.sum()),
-            "us of the router a batch",
+            "µs of the router per batch",
         ),
     ]
 

@@ -44,21 +44,21 @@ def estimate_million(found: Mapping[str, float]) -> list[Figure]:
             rate / ROWS * found["country.router_us"] * 1e-6,
             "cores of routers",
         ),
-        Figure("country.million.cells", cells, "cells' sectors"),
+        Figure("country.million.cells", cells, "pairs of cell and sector"),
         Figure(
             "country.million.cells_gb",
             cells * found["country.cell_bytes"] / 1e9,
-            "GB of memory for them",
+            "GB of memory for cells and sectors",
         ),
         Figure(
             "country.million.vehicles_gb",
             VEHICLES * found["country.vehicle_bytes"] / 1e9,
-            "GB for vehicles",
+            "GB of memory for vehicles",
         ),
         Figure(
             "country.million.pairs_gb",
             pairs * found["country.pair_bytes"] / 1e9,
-            "GB for where each was lately",
+            "GB of memory for recent visits of each vehicle",
         ),
-        Figure("country.million.gb_per_day", per_day, "GB of archive a day"),
+        Figure("country.million.gb_per_day", per_day, "GB of archive per day"),
     ]
