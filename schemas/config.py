@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import json
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
@@ -289,9 +291,9 @@ def nanoseconds(time: datetime) -> int:
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def load(path: Path | str | None, model: type[Model]) -> Model:
+def load(path: Path | str | None, model: type[Model], field: str = "config") -> Model:
     """Read a configuration file (JSON), and return its settings as an object of the class `model`.
-    If `path` is None, return the default settings.
+    If `path` is None, return the default settings. Error messages about the file call it `field`.
 
     Raises:
         InputError: the file cannot be read, or a setting is unknown or out of range.
@@ -302,18 +304,25 @@ def load(path: Path | str | None, model: type[Model]) -> Model:
         return model.model_validate_json(Path(path).read_bytes())
     except OSError as error:
         raise InputError(
-            "config", f"cannot read {path} ({error.strerror})", "give the path of a JSON file"
+            field, f"cannot read {path} ({error.strerror})", "give the path of a JSON file"
         ) from error
     except ValidationError as error:
-        raise explain(error, f"configuration {path}") from error
+        raise explain(error, f"configuration {path}", model) from error
 
 
-def explain(error: ValidationError, where: str) -> InputError:
-    """Convert the first validation error that pydantic reports to an InputError. It names the wrong
-    field, and asks for a correction in `where` (source of the values).
+def explain(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
+    """Convert an unknown name, or else the first validation error that pydantic reports, to an
+    InputError. It names the wrong field, and asks for a correction in `where` (source of the values
+    of the class `model`). For a misspelt name it proposes the most similar name.
     """
-    first = error.errors(include_url=False)[0]
+    found = error.errors(include_url=False)
+    first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
     field = ".".join(str(part) for part in first["loc"]) or "content"
+    if first["type"] == "extra_forbidden":
+        known = list(_known_names(model, first["loc"][:-1]))
+        similar = difflib.get_close_matches(str(first["loc"][-1]), known, 1)
+        fix = f"write {similar[0]!r}" if similar else f"remove it, or use one of {', '.join(known)}"
+        return InputError(field, "is not a known name", f"{fix} in the {where}")
     secret = "store" in first["loc"]
     given = "…" if secret else json.dumps(first["input"], default=str)
     shown = given if len(given) <= 60 else given[:57] + "..."
@@ -323,3 +332,23 @@ def explain(error: ValidationError, where: str) -> InputError:
         else f"{first['msg'][0].lower()}{first['msg'][1:]} (got {shown})"
     )
     return InputError(field, problem, f"correct it in the {where}")
+
+
+def _known_names(model: type[BaseModel], path: Sequence[int | str]) -> Iterator[str]:
+    """Yield the names that a JSON file may use at `path` (names and indices from the outermost
+    object to the inner one). Parts of the path that are no field, such as indices, are skipped.
+    """
+    for part in path:
+        fields = {field.alias or name: field for name, field in model.model_fields.items()}
+        if part in fields:
+            model = next(_models_of(fields[str(part)].annotation), model)
+    for name, field in model.model_fields.items():
+        yield field.alias or name
+
+
+def _models_of(annotation: object) -> Iterator[type[BaseModel]]:
+    """Yield the classes of settings within a type annotation, such as `dict[str, Settings]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models_of(part)

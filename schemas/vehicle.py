@@ -196,7 +196,7 @@ def load_vehicle(path: Path | str) -> Vehicle:
         fix = f"name a vehicle file; of a simulated drive, simulate --vehicle-out {path} writes it"
         raise InputError("vehicle", f"cannot read {path} ({error.strerror})", fix) from error
     except ValidationError as error:
-        raise explain(error, f"vehicle file {path}") from error
+        raise explain(error, f"vehicle file {path}", Vehicle) from error
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
     gyration = math.sqrt(vehicle.yaw_inertia / vehicle.mass)
     if not LEAST_GYRATION < gyration / wheelbase < MOST_GYRATION:

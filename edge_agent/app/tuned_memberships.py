@@ -130,7 +130,7 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
     try:
         document = Document.model_validate_json(text)
     except ValidationError as error:
-        raise explain(error, where) from error
+        raise explain(error, where, Document) from error
     for way in WAYS:
         if way not in document.scores:
             raise InputError(

@@ -192,4 +192,4 @@ def load_profile(name: str) -> tuple[Profile, Path]:
             "profile", f"cannot read {path} ({error.strerror})", f"name a file, or one of {known}"
         ) from error
     except ValidationError as error:
-        raise explain(error, f"profile {path}") from error
+        raise explain(error, f"profile {path}", Profile) from error

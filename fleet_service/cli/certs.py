@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "renew-days", f"is not less than the {days[0]:g} days of a certificate", "give fewer"
         )
-    fleet = load(arguments.fleet, Enrolment)
+    fleet = load(arguments.fleet, Enrolment, "fleet")
     try:
         from fleet_service.enrolment.enrol import Registry, Terms
     except ImportError as error:

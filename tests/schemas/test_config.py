@@ -1,0 +1,45 @@
+"""Tests of the configuration reader: its errors name the file, the wrong setting and the fix."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from fleet_service.enrolment.fleet import Enrolment
+from schemas.config import AgentConfig, ServiceConfig, load
+from schemas.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "message"),
+    [
+        (ServiceConfig, {"archiv": {}}, "^archiv: is not a known name; write 'archive' in the "),
+        (ServiceConfig, {"archive": {"pth": "x"}}, "^archive.pth: .*; write 'path' in the conf"),
+        (ServiceConfig, {"archive": {"copi": "x"}}, "^archive.copi: .*; write 'copy' in the conf"),
+        (AgentConfig, {"zenoh": {"xyz": 1}}, "^zenoh.xyz: .*use one of connect, config in the"),
+        (
+            Enrolment,
+            {"routers": {"router-a": {"host": ["h"], "port": 7447}}},
+            r"^routers.router-a.host: .*; write 'hosts' in the",
+        ),
+    ],
+)
+def test_a_misspelt_setting_is_reported_with_the_known_name(
+    tmp_path: Path, model: type[BaseModel], settings: dict[str, object], message: str
+) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps(settings))
+    with pytest.raises(InputError) as error:
+        load(path, model)
+    assert re.search(message, str(error.value)), str(error.value)
+
+
+def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="^config: cannot read .*nosuch.json"):
+        load(tmp_path / "nosuch.json", ServiceConfig)
+    with pytest.raises(InputError, match="^fleet: cannot read .*nosuch.json"):
+        load(tmp_path / "nosuch.json", Enrolment, "fleet")
