@@ -12,6 +12,8 @@ from pathlib import Path
 from schemas.errors import InputError
 from schemas.runtime.installing import install_command
 
+LAST_PORT = 65_535
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `gripmap demo`."""
@@ -57,8 +59,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo with the parsed options; return the exit code.
 
     Raises:
-        InputError: an optional package is missing, or a process of the demo did not start.
+        InputError: the port is out of range, an optional package is missing, or a process of the
+            demo did not start.
     """
+    if not 0 <= args.page_port <= LAST_PORT:
+        raise InputError("page-port", f"{args.page_port} is not a port", f"give 0 to {LAST_PORT}")
     try:
         from deploy.demo import processes, story
         from fleet_service.page import server  # noqa: F401 the page's process needs this package

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from schemas.errors import InputError
 
@@ -16,13 +16,9 @@ def prepare_path(field: str, path: Path) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        reason = (
-            "is a folder"
-            if path.is_dir()
-            else ""
-            if os.access(path.parent, os.W_OK)
-            else "no permission"
-        )
+        # Only a trial shows whether a file can be created: in /proc the permissions allow it.
+        with TemporaryFile(dir=path.parent):
+            reason = "is a folder" if path.is_dir() else ""
     except OSError as error:
         reason = error.strerror or str(error)
     if reason:

@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
+from schemas.runtime import commandline
 
+NEEDED = ("ax", "ay", "yaw_rate", "omega_fl", "delta_fl")
 MOST_NAMES = 30  # maximum number of signal names in an error message
 
 
@@ -46,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert the recordings to a signal log, write a draft of a profile (assignment of signals to
-    channels), or list the known profiles, as the options ask. Return 0.
+    channels), or list the known profiles, as the options ask. Return 1 if the log has none of the
+    signals that the estimators need, else 0.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import read_source, write_log
@@ -55,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.names import draft_profile
     from edge_agent.inputs.profile import load_profile, shipped_profiles
     from edge_agent.inputs.readers.dbc import database_of
+    from edge_agent.inputs.signal_log import require_no_estimates
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
@@ -84,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             "clock", f"{unknown[0]} is not one of the recordings", f"use {', '.join(names)}"
         )
+    for path, recording in zip(args.source, recordings, strict=True):
+        require_no_estimates(path, recording.signals)
     if profile is None:
         units = {
             name: series.unit
@@ -116,18 +122,14 @@ def run(args: argparse.Namespace) -> int:
     write_log(out, merged, profile, [source.name for source in args.source])
     for note in merged.notes:
         print(f"note: {note}")
-    lacking = [
-        name
-        for name in ("ax", "ay", "yaw_rate", "omega_fl", "delta_fl")
-        if name not in merged.columns
-    ]
+    lacking = [name for name in NEEDED if name not in merged.columns]
     if lacking:
         print(
             f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
             "profile"
         )
     print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
-    return 0
+    return commandline.FAILED if len(lacking) == len(NEEDED) else 0
 
 
 def _parse_shifts(given: list[str]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     """Simulate a manoeuvre and write its log, or list the manoeuvres; return 0."""
     from edge_agent.app.estimates_file import write_table
     from edge_agent.app.output_path import prepare_path
+    from edge_agent.inputs.signal_log import conversion_command
     from edge_agent.lab.simulation import MANOEUVRES, DriveSetup, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 
@@ -88,4 +90,9 @@ def run(args: argparse.Namespace) -> int:
             vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
         )
     print(f"{args.out}: {log.num_rows} samples of {args.manoeuvre}")
+    if args.out.suffix == ".csv":
+        print(
+            f"note: other commands read Parquet; convert it with {conversion_command(args.out)}",
+            file=sys.stderr,
+        )
     return 0

@@ -12,7 +12,7 @@ go backwards.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -38,6 +38,8 @@ from schemas.thresholds import NS
 # 2.4 MB of signals. This bounds the memory, and is long enough to make the cost per block
 # negligible.
 BLOCK_ROWS: Final = 16_384
+PARQUET: Final = b"PAR1"  # first bytes of a Parquet file
+LONGEST_HEADER: Final = 4096  # [bytes] of the first line of a CSV file that are read
 
 
 @dataclass(frozen=True)
@@ -94,11 +96,55 @@ def read_log(path: Path) -> SignalLog:
 
 
 def require_log(path: Path) -> None:
-    """Raise InputError if there is no file `path`. Commands call this before they look for the
+    """Raise an error if `path` is no signal log. Commands call this before they look for the
     vehicle file next to a log.
+
+    Raises:
+        InputError: there is no such file, it is not a Parquet file, or it contains estimates.
     """
     if not path.exists():
         raise InputError("log", f"{path} does not exist", "give the path of a signal log")
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            header = file.readline(LONGEST_HEADER)
+        is_parquet = header.startswith(PARQUET)
+        names = set(pq.read_schema(path).names) if is_parquet else _csv_names(header)
+    except (OSError, pa.ArrowException) as error:
+        raise _not_parquet(path, str(error).splitlines()[0]) from error
+    require_no_estimates(path, names)
+    if not is_parquet:
+        raise _not_parquet(path, "its first bytes are not PAR1")
+
+
+def require_no_estimates(path: Path, names: Collection[str]) -> None:
+    """Raise an error if `names`, the columns of the file `path`, are those of estimates.
+
+    Raises:
+        InputError: the file was written by `edge-agent replay`.
+    """
+    if "mu_lower" in names and "ax" not in names:
+        raise InputError(
+            "log",
+            f"{path} contains estimates, not signals",
+            "give the signal log from which they were estimated",
+        )
+
+
+def conversion_command(path: Path) -> str:
+    """Return the command that converts a recording to a signal log."""
+    return f"edge-agent import {path} --out {path.with_suffix('.parquet')}"
+
+
+def _not_parquet(path: Path, reason: str) -> InputError:
+    problem = f"{path} is not a Parquet file ({reason})"
+    return InputError("log", problem, f"convert it with {conversion_command(path)}")
+
+
+def _csv_names(header: bytes) -> set[str]:
+    """Return the column names in the first line of a CSV file."""
+    return {name.strip(' "') for name in header.decode(errors="replace").strip().split(",")}
 
 
 def _read_table(path: Path) -> pa.Table:
@@ -114,12 +160,7 @@ def _read_table(path: Path) -> pa.Table:
                 ]
             )
     except (OSError, pa.ArrowException) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            "log",
-            f"{path} is not a Parquet file ({reason})",
-            "convert it with edge-agent import",
-        ) from error
+        raise _not_parquet(path, str(error).splitlines()[0]) from error
 
 
 def _read_context(table: pa.Table) -> FloatArray | None:

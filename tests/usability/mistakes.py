@@ -40,6 +40,7 @@ EDGE: Final = (
     "replay {d}/log.parquet --vehicle {d}/car.json --out {d}/log.parquet",
     "replay {d}/log.parquet --vehicle {d}/car.json --out {d}/e.xlsx",
     "replay {d}/log.parquet --vehicle {d}/car.json --out /proc/none/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --out /proc/e.parquet",
     "replay {d}/log.parquet --vehicle {d}/car.json --estimator none --out {d}/e.parquet",
     "replay {d}/log.parquet --vehicle {d}/bad.json --out {d}/e.parquet",
     "replay {d}/log.parquet --vehicle {d}/car.json --memberships {d}/bad.json --out {d}/e.parquet",
