@@ -128,7 +128,11 @@ class Agent:
         """Process blocks of samples in real time until the source ends, the duration has passed or
         a signal (SIGTERM, Ctrl-C) arrives; then shut down.
 
-        Print one line with the counts of blocks and records, and return 0.
+        Print one line with the counts of blocks and records.
+
+        Returns:
+            0, or 1 if the source or the duration has ended and records are left in the outbox
+            without acknowledgement. After a signal such records are no failure.
         """
         config = self.options.config
         log_warnings(config.log, sys.stderr)
@@ -148,7 +152,7 @@ class Agent:
             self.source.end()
             drain_s = STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S
             close_publisher(publisher, self._progress, drain_s, **counts)
-        return 0
+        return 1 if publisher.count_unsettled() and not stop.is_set() else 0
 
     def _drive_until(self, stop: threading.Event) -> Publisher:
         options = self.options
@@ -165,8 +169,11 @@ class Agent:
         events = event_logger("agent", options.config.log, sys.stderr)
         who = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
         events.info(
-            f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s",
-            extra=values(event="ready", vehicles=len(options.names)),
+            f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s; records wait in "
+            f"{publisher.status.outbox_path} until they are acknowledged",
+            extra=values(
+                event="ready", vehicles=len(options.names), outbox=str(publisher.status.outbox_path)
+            ),
         )
         watch = SignalWatch()
         connect = options.config.zenoh.connect

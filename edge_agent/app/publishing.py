@@ -67,11 +67,18 @@ def close_publisher(
     on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
-    next start.
+    next start. Their number and the outbox's path are printed on stderr.
     """
     from edge_agent.app.live_loop import final_counts
 
     clean = publisher.close(drain_s)
+    if waiting := publisher.count_unsettled():
+        path = publisher.status.outbox_path
+        print_line(
+            f"{waiting} records without acknowledgement stay in {path}; the next start with this "
+            "outbox sends them",
+            sys.stderr,
+        )
     if not clean:
         print_line(
             "warning: a session did not close in time; exiting without closing it", sys.stderr

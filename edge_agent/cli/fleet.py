@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_agent.cli.options import add_estimator, memberships_of
+from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
 
 if TYPE_CHECKING:
     from schemas.wire.ahead import GripWarning
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="share of vehicles that receive the map and are warned (default 0)",
     )
     add_estimator(parser)
-    parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
+    add_connection(parser)
     parser.add_argument(
         "--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)"
     )
@@ -69,9 +69,8 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.lab.simulation.blocks import blocks
     from edge_agent.lab.simulation.listeners import WarnedDrivers
     from edge_agent.lab.truth_file import TruthRecorder
-    from schemas.config import AgentConfig, load
 
-    config = load(args.config, AgentConfig)
+    config = config_of(args)
     if args.truth:
         prepare_path("truth", args.truth)
     fleet = SimulatedFleet(

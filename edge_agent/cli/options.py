@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edge_agent.adaptation.memberships import Memberships
+    from schemas.config import AgentConfig
 
 
 def add_estimator(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +30,31 @@ def memberships_of(args: argparse.Namespace) -> Memberships | None:
     from edge_agent.app.tuned_memberships import load_tuned
 
     return load_tuned(args.memberships).memberships if args.memberships else None
+
+
+def add_connection(parser: argparse.ArgumentParser, purpose: str = "") -> None:
+    """Add the options `--config` and `--connect`; `purpose` ends both help texts."""
+    parser.add_argument("--config", type=Path, help=f"agent configuration (JSON){purpose}")
+    parser.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help=f"router, instead of the configuration's, e.g. tcp/127.0.0.1:7447{purpose}",
+    )
+
+
+def config_of(args: argparse.Namespace) -> AgentConfig:
+    """Return the agent's configuration given by `--config`, with the router of `--connect`.
+
+    Raises:
+        InputError: the file cannot be read, or a setting is unknown or out of range.
+    """
+    from schemas.config import AgentConfig, load
+
+    config = load(args.config, AgentConfig)
+    if args.connect is None:
+        return config
+    zenoh = config.zenoh.model_copy(update={"connect": [args.connect]})
+    return config.model_copy(update={"zenoh": zenoh})
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_agent.cli.options import add_estimator, memberships_of
+from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
 from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
 from schemas.thresholds import NS
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="publish a log that did not pass the signal doctor",
     )
-    parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
+    add_connection(parser, ", for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
     parser.add_argument(
         "--start",
@@ -96,16 +96,15 @@ def run(args: argparse.Namespace) -> int:
         tasks_of,
         vehicle_file_of,
     )
-    from edge_agent.app.estimates_file import EstimatesFile
+    from edge_agent.app.estimates_file import ENDINGS, EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
     from edge_agent.cli.common import require_valid_signals, warn_about_faults
     from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log, require_log
-    from schemas.config import AgentConfig, load
     from schemas.vehicle import load_vehicle
 
-    config = load(args.config, AgentConfig)
+    config = config_of(args)
     estimator = args.estimator or config.estimator
     memberships = memberships_of(args)
     several = len(args.log) > 1 or args.out.is_dir()
@@ -132,6 +131,8 @@ def run(args: argparse.Namespace) -> int:
     path = args.log[0]
     require_log(path)
     commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
+    if args.out.suffix:
+        commandline.ending_of("out", args.out, [*filter(None, ENDINGS), *REPORTS])
     vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
     if args.out.suffix in REPORTS and args.publish:
         raise InputError(

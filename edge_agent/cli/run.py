@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_agent.cli.options import add_estimator, memberships_of
+from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
 from schemas.runtime import progress_messages
 
 if TYPE_CHECKING:
@@ -43,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="publish signals that did not pass the signal doctor",
+        help="publish signals that did not pass the signal doctor, which checks a log and live "
+        "sources; no effect on a simulated vehicle and on plug-ins, which are not checked",
     )
     parser.add_argument(
         "--ahead", action="store_true", help="receive the map and warn of slippery road ahead"
@@ -74,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
-    parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
+    add_connection(parser)
     parser.add_argument(
         "--scenario", default="demo", help="scenario of the simulated vehicle (default demo)"
     )
@@ -101,12 +102,11 @@ def run(args: argparse.Namespace) -> int:
         from edge_agent.app.agent import Agent, AgentSource
         from edge_agent.cli.common import checked_name
         from edge_agent.inputs.live.sources import KINDS, is_live
-        from schemas.config import AgentConfig, load
         from schemas.errors import InputError
         from schemas.runtime import plugins
         from schemas.vehicle import load_vehicle
 
-    config = load(args.config, AgentConfig)
+    config = config_of(args)
     if args.route is not None and not args.ahead:
         raise InputError("route", "needs --ahead", "give both, or neither")
     if args.autoware is not None and not args.ahead:

@@ -74,6 +74,7 @@ class Outbox:
     or refused by the service).
 
     Attributes:
+        path: the outbox's file.
         held: index of the batches, without payloads; its counts may be read on any thread.
         schedule: which batches are in flight (sent and not answered), and when they are sent again.
         counts: numbers of records that were stored, settled or lost.
@@ -91,6 +92,7 @@ class Outbox:
         boot: int | None = None,
     ) -> None:
         self.boot = boot if boot is not None else secrets.randbelow(BOOT_LIMIT - 1) + 1
+        self.path = path
         self.capacity_bytes = capacity_bytes
         self.counts = OutboxCounts()
         self.held = HeldBatches(self.boot)

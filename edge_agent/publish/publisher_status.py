@@ -5,6 +5,7 @@ of batches on disk), and the acknowledgements.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from pathlib import Path
 
 from edge_agent.publish.ack_settlement import AckSettlement, Counts
 from edge_agent.publish.outbox import Outbox
@@ -31,6 +32,11 @@ class PublisherStatus:
         self._settlement = settlement
         self._clock = clock
         self.counts = counts
+
+    @property
+    def outbox_path(self) -> Path:
+        """The absolute path of the outbox's file."""
+        return self._outbox.path.absolute()
 
     @property
     def links(self) -> int:

@@ -115,6 +115,7 @@ LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
 PLANNER = "test_limits_for_a_planner_without_listening_are_a_mistake"
 LISTENS = "test_a_car_that_listens_prints_its_warnings_and_heeds_its_route"
 FIX = "test_a_fix_makes_the_drive_pass"
+CONNECT = "test_connect_replaces_the_router_and_unsent_records_are_reported"
 ELSEWHERE = {
     "simulate": {
         "--list": "test_simulate_lists_the_manoeuvres",
@@ -139,6 +140,7 @@ ELSEWHERE = {
         "--estimator": REPLAYED,
         "--out": REPLAYED,
         "--config": REPLAYED,
+        "--connect": CONNECT,
         "--publish": SENT_BY_REPLAY,
         "--trust": UNFIT,
         "--name": SENT_BY_REPLAY,
@@ -157,6 +159,7 @@ ELSEWHERE = {
     },
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {
+        "--connect": CONNECT,
         "--trust": UNFIT,
         "--profile": LIVE,
         "--dbc": LIVE,
@@ -168,6 +171,7 @@ ELSEWHERE = {
         "--kuksa": "test_command_writes_the_friction_to_the_databroker",
     },
     "fleet": {
+        "--connect": CONNECT,
         "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",
         "--winter": "test_a_share_of_winter_vehicles_beyond_one_is_refused",
     },

@@ -1,0 +1,113 @@
+"""Tests of the agent's commands: advice about files that are no signal logs, output that cannot be
+written, and the exit code when something is left to do.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+
+from edge_agent.cli import main
+from schemas import tables
+from tests.ports import free_ports
+
+Output = pytest.CaptureFixture[str]
+DRIVE = ["simulate", "slalom", "--duration", "1"]
+
+
+def write_drive(path: Path) -> list[str]:
+    """Simulate a drive, write its log and `car.json` next to it, and return the words that replay
+    needs.
+    """
+    car = path.with_name("car.json")
+    assert main([*DRIVE, "--out", str(path), "--vehicle-out", str(car)]) == 0
+    return ["replay", str(path), "--vehicle", str(car), "--estimator", "ckf"]
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+@pytest.mark.parametrize("command", ["check", "replay", "import"])
+def test_estimates_given_as_a_log_are_recognised(
+    tmp_path: Path, capsys: Output, ending: str, command: str
+) -> None:
+    path = tmp_path / f"estimates.{ending}"
+    table = pa.table({name: [0.0, 0.1] for name in tables.ESTIMATES_SCHEMA.names})
+    if ending == "csv":
+        pacsv.write_csv(table, path)
+    else:
+        pq.write_table(table, path)
+    out = tmp_path / ("out.parquet" if command == "import" else "out.html")
+    words = [command, str(path), "--out", str(out)]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert said == (
+        f"error: log: {path} contains estimates, not signals; give the signal log from which they "
+        "were estimated\n"
+    )
+
+
+def test_a_log_as_csv_comes_with_the_command_that_converts_it(
+    tmp_path: Path, capsys: Output
+) -> None:
+    path = tmp_path / "d.csv"
+    out = tmp_path / "d.parquet"
+    replay = write_drive(path)
+    command = f"edge-agent import {path} --out {out}"
+    assert command in capsys.readouterr().err
+    assert main(["check", str(path)]) == 2
+    assert command in capsys.readouterr().err
+    assert main([*replay, "--out", str(tmp_path / "e.parquet")]) == 2
+    assert command in capsys.readouterr().err
+    assert main(command.split()[1:]) == 0
+    assert {"ax", "omega_fl"} <= set(pq.read_schema(out).names)
+
+
+def test_import_without_any_signal_that_replay_needs_returns_1(
+    tmp_path: Path, capsys: Output
+) -> None:
+    path = tmp_path / "little.csv"
+    path.write_text("t,latitude,longitude\n0.0,57.7,11.9\n0.1,57.7,11.9\n0.2,57.7,11.9\n")
+    assert main(["import", str(path), "--out", str(tmp_path / "little.parquet")]) == 1
+    assert "no ax, ay, yaw_rate, omega_fl, delta_fl: replay needs them" in capsys.readouterr().out
+
+
+def test_replay_names_every_format_and_refuses_a_folder_without_files(
+    tmp_path: Path, capsys: Output
+) -> None:
+    replay = write_drive(tmp_path / "d.parquet")
+    capsys.readouterr()
+    assert main([*replay, "--out", str(tmp_path / "x.nosuch")]) == 2
+    assert capsys.readouterr().err.endswith(
+        "use one of .parquet, .csv, .mcap, .html, .png, .svg, .pdf\n"
+    )
+    for name in ("x.parquet", "x.html"):
+        assert main([*replay, "--out", f"/proc/{name}"]) == 2
+        assert capsys.readouterr().err == (
+            f"error: out: cannot write /proc/{name} (No such file or directory); name a file in a "
+            "writable folder\n"
+        )
+
+
+def test_connect_replaces_the_router_and_unsent_records_are_reported(
+    tmp_path: Path, capsys: Output
+) -> None:
+    """Nothing listens at the router given by `--connect`, so all records stay in the outbox, whose
+    path is printed at the start and at the end; the exit code is 1.
+    """
+    spool = tmp_path / "spool.sqlite"
+    config = tmp_path / "agent.json"
+    config.write_text(json.dumps({"zenoh": {"connect": ["tcp/host:1"]}, "spool": str(spool)}))
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    words = ["--config", str(config), "--connect", endpoint, "--estimator", "ckf"]
+    assert main(["fleet", "--vehicles", "1", "--duration", "1", *words]) == 1
+    seen = capsys.readouterr()
+    left = json.loads(seen.out.splitlines()[-1])["unsettled"]
+    assert left > 0
+    assert f"no session at {endpoint} yet" in seen.err
+    assert f"records wait in {spool} until they are acknowledged" in seen.err
+    assert re.search(rf"^{left} records without acknowledgement stay in {spool};", seen.err, re.M)
