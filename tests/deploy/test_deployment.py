@@ -34,10 +34,11 @@ ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 BIN = Path(sys.executable).parent
-PORTS = ("7447", "7448", "9464")
+PORTS = ("7447", "7448", "9464", "8080")
 INSTANCES = {
     "gripmap-router@": ["router-a", "router-b"],
     "gripmap-service": [""],
+    "gripmap-page": [""],
     "gripmap-agent@": ["car-001"],
 }
 MOST_EXPOSED = 3.0  # highest accepted exposure level of systemd, whose scale ends at 10
@@ -85,6 +86,10 @@ class Site:
     @property
     def address(self) -> str:
         return f"http://127.0.0.1:{self._ports[2]}"
+
+    @property
+    def page_address(self) -> str:
+        return f"http://127.0.0.1:{self._ports[3]}"
 
 
 def list_instances() -> Iterator[tuple[Path, str]]:
@@ -266,8 +271,9 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.campaign
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
-    """Two routers, a service and an agent must work together, and a client must be able to read the
-    map. They are started by the commands of the systemd units, with new certificates.
+    """Two routers, a service, the live page and an agent must work together, and a client must be
+    able to read the map. They are started by the commands of the systemd units, with new
+    certificates.
 
     At the end each process receives SIGTERM, as from systemd, and must end within ten seconds.
     """
@@ -320,6 +326,9 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
         until(count_rows, START_S)
         assert fetch_page(f"{site.address}/healthz")[0] == 200
         until(count_cells, START_S)
+        page_log = site.root / "gripmap-page.log"
+        until(lambda: "page: http" in page_log.read_text(), START_S)
+        until(lambda: json.loads(fetch_page(f"{site.page_address}/tiles")[2]), START_S)
         for process in reversed(running):
             began = time.monotonic()
             process.send_signal(signal.SIGTERM)
