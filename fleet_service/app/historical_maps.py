@@ -182,8 +182,10 @@ class _Process:
         """
         limit = threading.Timer(SILENT_S, self._kill_silent)
         limit.start()
-        found = self.out.read(size)
-        limit.cancel()
+        try:
+            found = self.out.read(size)
+        finally:
+            limit.cancel()
         if self._is_silent and len(found) < size:
             raise InputError(
                 "at", f"the past map made no progress for {SILENT_S:.0f} s", "use a smaller bbox"

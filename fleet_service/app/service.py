@@ -82,7 +82,9 @@ class Service:
         self._config = config
         self._root = root
         self._events = events
-        known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
+        known = None
+        if config.fleet is not None:
+            known = set(load(config.fleet, Enrolment, "fleet").vehicles)
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(
