@@ -55,16 +55,21 @@ class _Load(Generic[Batch]):
         segments (files of new rows) durable: on disk and, if `upload` is given, also in another
         storage.
         """
-        for kind, waiting in self.waiting.items():
-            if waiting:
-                rows = {
-                    name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]
-                }
-                self.segments.append(writer.write(kind, rows))
-                self.waiting[kind] = []
-        writer.sync()
-        if upload is not None:
-            upload(self.segments)
+        try:
+            for kind, waiting in self.waiting.items():
+                if waiting:
+                    rows = {
+                        name: np.concatenate([part[name] for part in waiting])
+                        for name in waiting[0]
+                    }
+                    self.segments.append(writer.write(kind, rows))
+                    self.waiting[kind] = []
+            writer.sync()
+        finally:
+            # A full disk must not stop the upload of segments that earlier attempts have written,
+            # because compaction, which frees disk space, waits for it.
+            if upload is not None:
+                upload(self.segments)
 
 
 class SegmentLog(Generic[Batch]):

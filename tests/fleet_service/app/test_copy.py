@@ -116,12 +116,13 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         )
 
 
+def fill_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fill_disk(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     config = settings(bucket)
     with closing(Engine(config, tmp_path)) as engine:
         assert engine.copy is not None
@@ -140,6 +141,32 @@ def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
         assert (compaction.work(threading.Event()) or "").startswith("compaction waits")
         tables = list(reading.read_tables(tmp_path, Kind.OBSERVATION, ["row"]))
         assert sum(table.num_rows for table in tables) == 2 * 3 * VEHICLES
+
+
+def test_segments_are_uploaded_after_an_outage_although_the_disk_is_full(
+    bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = settings(bucket)
+    with closing(Engine(config, tmp_path)) as engine:
+        assert engine.copy is not None
+        compaction, *_ = archive_jobs(engine, config, tmp_path, SteadyClock().moment)
+        bucket.stop()
+        take(engine, reports(0.8, 1, 1))
+        engine.settlement.flush()
+        assert engine.copy.backoff.trouble is not None
+        bucket.start()
+        with monkeypatch.context() as full:
+            full.setattr(segments.Writer, "write", fill_disk)
+            take(engine, reports(0.8, 2, 2))
+
+            def is_uploaded() -> bool:
+                engine.settlement.flush()
+                assert engine.settlement.failing
+                return engine.copy is not None and engine.copy.backoff.trouble is None
+
+            until(is_uploaded)
+            assert (compaction.work(threading.Event()) or "").startswith("compacted: ")
+        assert len(engine.settlement.flush()) == VEHICLES
 
 
 def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
