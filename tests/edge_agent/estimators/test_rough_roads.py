@@ -106,6 +106,16 @@ def test_late_steering_contradicts_the_model_and_restores_the_prior() -> None:
     assert not (run(t, signals, vehicle).health & Health.CONTRADICTION).any()
 
 
+@pytest.mark.parametrize("road", [0.85, 0.7])
+def test_belief_in_ice_from_wrong_steering_does_not_hide_the_contradiction(road: float) -> None:
+    t, signals, vehicle = drive("sine", road, seconds=30.0)
+    wrong = signals.copy()
+    wrong[:, DELTA] = np.roll(signals[:, DELTA], 40, axis=0) + 0.15 * np.sin(3.0 * t)[:, None]
+    said = run(t, wrong, vehicle)
+    assert said.mu_upper.min() < 0.5
+    assert said.health[-1, 0] & Health.CONTRADICTION
+
+
 def test_a_wheel_speed_that_is_decoded_wrong_is_refused() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=8.0)
     wrong = signals.copy()

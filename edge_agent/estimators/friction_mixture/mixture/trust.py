@@ -43,7 +43,7 @@ from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory, Trust
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import CALLED_SHARE, SLIPPERY_MU
 
 # [1] innovation variance over the stated one under a contradiction: errors are three times as large
 FACTOR = 9.0
@@ -121,12 +121,14 @@ def unexplained_share(memory: MixtureMemory, design: MixtureDesign) -> float:
     as a contradiction of the model, because neither a slide nor slippery road explains it.
 
     While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
-    model for a while. Tight turns at walking pace are outside the model's range and do not count
+    model for a while. Wrong signals also look like a slippery road, so the belief in it explains at
+    most CALLED_SHARE. Tight turns at walking pace are outside the model's range and do not count
     either.
     """
     speed = abs(memory.overall_mean[NodeState.VX])
     moving = min(max(speed / SLOW_M_S - 1.0, 0.0), 1.0)
-    return float(moving * (1.0 - memory.slip.held) * (1.0 - slippery_probability(memory, design)))
+    explained = CALLED_SHARE * slippery_probability(memory, design)
+    return float(moving * (1.0 - memory.slip.held) * (1.0 - explained))
 
 
 @compiled
