@@ -157,7 +157,7 @@ def test_the_list_of_a_service_is_read_when_it_is_made(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
     with (
-        pytest.raises(InputError, match="^config: cannot read"),
+        pytest.raises(InputError, match="^fleet: cannot read"),
         running(router, tmp_path, fleet=tmp_path / "none.json"),
     ):
         pass
