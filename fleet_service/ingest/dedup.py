@@ -72,7 +72,7 @@ class SequenceTracker:
         """
         if seq == self.low + 1:
             self.raise_to(seq + 1)
-        elif seq > self.low and not self._add_run(seq, seq):
+        elif seq > self.low and not self._add_above(seq):
             return False
         if time > self.newest:
             self.newest = time
@@ -99,14 +99,14 @@ class SequenceTracker:
             self.low = self.runs[place] - 1 if is_in_run else first_held - 1
             self.runs = self.runs[place + is_in_run :] or _NONE
 
-    def _add_run(self, first: int, last: int) -> bool:
-        """Add the numbers from `first` to `last`, and join runs that touch. Return False and add
+    def _add_above(self, seq: int) -> bool:
+        """Add a number above the watermark, and join runs that then touch. Return False and add
         nothing if this would exceed MAX_GAPS runs.
         """
-        begin = bisect_left(self.runs, first)
-        end = bisect_right(self.runs, last + 1)
-        limits = [first] if begin % 2 == 0 else []
-        limits += [last + 1] if end % 2 == 0 else []
+        begin = bisect_left(self.runs, seq)
+        end = bisect_right(self.runs, seq + 1)
+        limits = [seq] if begin % 2 == 0 else []
+        limits += [seq + 1] if end % 2 == 0 else []
         if len(self.runs) + len(limits) - (end - begin) > 2 * MAX_GAPS:
             return False
         if not isinstance(self.runs, list):

@@ -23,13 +23,13 @@ import zenoh
 
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import archive_jobs
+from fleet_service.app.jobs import Job, archive_jobs
 from fleet_service.archive.format import reading, segments
 from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
 from fleet_service.replication.bucket import CopyError
-from fleet_service.replication.replica import OWNER
+from fleet_service.replication.replica import OWNER, BucketReplica
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Batch, Kind
@@ -120,13 +120,22 @@ def fill_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+@contextmanager
+def compacted_engine(
+    bucket: BucketServer, root: Path
+) -> Iterator[tuple[Engine, BucketReplica, Job]]:
+    """Yield an engine (service without network), its bucket replica, and its compaction job."""
+    config = settings(bucket)
+    with closing(Engine(config, root)) as engine:
+        assert engine.copy is not None
+        compaction, *_ = archive_jobs(engine, config, root, SteadyClock().moment)
+        yield engine, engine.copy, compaction
+
+
 def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = settings(bucket)
-    with closing(Engine(config, tmp_path)) as engine:
-        assert engine.copy is not None
-        compaction, *_ = archive_jobs(engine, config, tmp_path, SteadyClock().moment)
+    with compacted_engine(bucket, tmp_path) as (engine, copy, compaction):
         take(engine, reports(0.8, 1, 1))
         engine.settlement.flush()
         with monkeypatch.context() as full:
@@ -136,7 +145,7 @@ def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
             assert engine.settlement.failing
             assert (compaction.work(threading.Event()) or "").startswith("compacted: ")
         assert len(engine.settlement.flush()) == VEHICLES
-        with suppress(CopyError), engine.copy.backoff.try_upload():
+        with suppress(CopyError), copy.backoff.try_upload():
             raise CopyError("no answer")
         assert (compaction.work(threading.Event()) or "").startswith("compaction waits")
         tables = list(reading.read_tables(tmp_path, Kind.OBSERVATION, ["row"]))
@@ -146,14 +155,11 @@ def test_compaction_waits_for_the_bucket_and_not_for_a_full_disk(
 def test_segments_are_uploaded_after_an_outage_although_the_disk_is_full(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = settings(bucket)
-    with closing(Engine(config, tmp_path)) as engine:
-        assert engine.copy is not None
-        compaction, *_ = archive_jobs(engine, config, tmp_path, SteadyClock().moment)
+    with compacted_engine(bucket, tmp_path) as (engine, copy, compaction):
         bucket.stop()
         take(engine, reports(0.8, 1, 1))
         engine.settlement.flush()
-        assert engine.copy.backoff.trouble is not None
+        assert copy.backoff.trouble is not None
         bucket.start()
         with monkeypatch.context() as full:
             full.setattr(segments.Writer, "write", fill_disk)
@@ -162,7 +168,7 @@ def test_segments_are_uploaded_after_an_outage_although_the_disk_is_full(
             def is_uploaded() -> bool:
                 engine.settlement.flush()
                 assert engine.settlement.failing
-                return engine.copy is not None and engine.copy.backoff.trouble is None
+                return copy.backoff.trouble is None
 
             until(is_uploaded)
             assert (compaction.work(threading.Event()) or "").startswith("compacted: ")
