@@ -10,7 +10,6 @@ from __future__ import annotations
 from datetime import UTC, date, datetime
 from typing import Any, Final
 
-import ibis
 import pyarrow as pa
 
 from fleet_service.analytics.engines import QueryEngine, Table, has_value
@@ -42,7 +41,7 @@ def expression(t: Table) -> Table:
         values=t.count(),
         vehicles=t.vehicle.nunique(),
         mu_p50=t.y.quantile(0.5),
-        share_slippery=ibis.ifelse(t.y < SLIPPERY_MU, 1.0, 0.0).mean(),
+        share_slippery=(t.y < SLIPPERY_MU).mean(),
     )
 
 
