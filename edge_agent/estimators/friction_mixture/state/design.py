@@ -4,7 +4,7 @@ constants and do not change while driving.
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -113,7 +113,7 @@ def design_of(
         width=width,
         prior=prior,
         sides=side_table(mu, prior, constants.physical.split_prior),
-        curve=curve_tables(curve or partial(magic_formulas, c=constants.physical.curve_c, e=0.0)),
+        curve=curve_tables(curve) if curve else _usual_curve(constants.physical.curve_c),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),
@@ -121,3 +121,11 @@ def design_of(
         scales=np.exp(np.array(memberships.ln_scales)),
         adaptive=adaptive,
     )
+
+
+@cache
+def _usual_curve(c: float) -> TyreCurve:
+    """Return the tables of the Magic Formula with shape factor `c`. They are kept, because
+    computing them takes as long as estimating a minute of a drive.
+    """
+    return curve_tables(partial(magic_formulas, c=c, e=0.0))
