@@ -137,11 +137,10 @@ NEIGHBOUR_GRIP: Final = 0.1
 # the first vote by slow and sudden change. So no vehicle controls a cell by passing it all day. The
 # vote counts again by 95 % (1 - e⁻³) in the mean time between changes.
 VOTE_RENEWAL_S: Final = CHANGE_S / 3.0
-# Two values this many standard deviations apart come from two different roads, or one is wrong.
+# Two values at least this many standard deviations apart come from two different roads, or one is
+# wrong. A value so far from the vehicle's own last value in the cell counts in full at once,
+# because the vehicle's bias cancels in the difference. Up to PEERS_AGREE the difference is noise.
 PEERS_DISAGREE: Final = 4.0
-# A value that differs from the vehicle's own last value in the cell counts again at once; the
-# vehicle's bias cancels in the difference. Up to PEERS_AGREE standard deviations the difference is
-# noise. From PEERS_DISAGREE on the vote counts in full.
 # Number of whole votes that a vehicle has in a cell per VOTE_RENEWAL_S, however often its values
 # change: one vote and one change. With 1.5, ice is found after four passes instead of three.
 VOTES: Final = 2.0
