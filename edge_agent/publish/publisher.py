@@ -24,6 +24,7 @@ from edge_agent.publish.ack_settlement import AckSettlement, Counts
 from edge_agent.publish.batching import Batcher, Draft
 from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.publisher_status import PublisherStatus
+from edge_agent.publish.resend_schedule import LONGEST_RESEND_S
 from edge_agent.publish.session_links import SessionLinks
 from edge_agent.publish.spool_file import is_damage
 from schemas.config import AgentConfig
@@ -168,12 +169,14 @@ class Publisher:
 
     def _recover_outbox(self) -> None:
         """Recover the readable content of an outbox (store of batches on disk) that was damaged
-        during use, and continue with the recovered outbox.
+        during use, and continue with the recovered outbox. After an error, wait, because the next
+        attempt reads the whole file again.
         """
         try:
             self._outbox.recover_file()
         except (sqlite3.Error, OSError) as error:
             log.warning("the damaged outbox cannot be repaired (%s); trying again", error)
+            self._closing.wait(LONGEST_RESEND_S)
 
     def _is_finished(self) -> bool:
         if not self._closing.is_set():

@@ -12,7 +12,7 @@ import logging
 import sqlite3
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final
 
@@ -139,10 +139,11 @@ def batch_checksum(name: Row, payload: bytes) -> int:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if a database error indicates a damaged file, and False otherwise, for example if
-    the disk is full or slow.
+    """Return True if a database error indicates a damaged file, or a file that a failed recovery
+    closed. Return False otherwise, for example if the disk is full or slow.
     """
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
+    closed = isinstance(error, sqlite3.ProgrammingError)
+    return closed or getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
 
 
 def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
@@ -156,6 +157,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
     """
     try:
         make_folder(path.parent)
+        _complete_recovery(path)
         try:
             return _open_database(path), None
         except sqlite3.DatabaseError as error:
@@ -179,34 +181,55 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
 
 
 def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
-    """Rename a damaged file, and copy its readable batches to a new file at `path`. Return the
-    database connection of the new file, and the path of the damaged one.
+    """Copy the readable batches of a damaged file to a new file, rename the damaged file, and put
+    the new file in its place. Return the database connection of the new file, and the path of the
+    damaged one.
+
+    After a crash or an error the damaged file is still in place, or `open_file` finds the complete
+    new file.
 
     Raises:
         sqlite3.Error, OSError: the disk does not accept the write.
     """
+    recovered = _recovered_path(path)
+    for ending in ("", "-journal"):  # of an earlier attempt
+        recovered.with_name(recovered.name + ending).unlink(missing_ok=True)
+    with closing(sqlite3.connect(recovered)) as database, database:
+        database.executescript(SCHEMA)
+        rows = _readable_batches(path)
+        database.executemany(
+            f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, "
+            "?, ?, ?, ?)",
+            rows,
+        )
+    sync_directory(path.parent)
     aside = next(
         p
         for n in range(1, 10_000)
         if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists()
     )
-    # Rename the main file last. After a crash in between, the file is found damaged again.
-    for ending in ("-wal", "-shm", ""):
+    for ending in ("", "-wal", "-shm"):
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
+    _complete_recovery(path)
+    log.warning("%d batches were saved from %s", len(rows), aside)
+    return _open_database(path), aside
+
+
+def _recovered_path(path: Path) -> Path:
+    """Return the path of the new file that replaces a damaged outbox file at `path`."""
+    return path.with_name(f"{path.name}.recovered")
+
+
+def _complete_recovery(path: Path) -> None:
+    """Rename the new file of a recovery to `path`, if the damaged file is no longer there."""
+    recovered = _recovered_path(path)
+    if path.exists() or not recovered.exists():
+        return
+    for ending in ("-wal", "-shm"):  # of the damaged file, after a crash
+        path.with_name(path.name + ending).unlink(missing_ok=True)
+    recovered.rename(path)
     sync_directory(path.parent)
-    database = _open_database(path)
-    saved = 0
-    with database:
-        for row in _readable_batches(aside):
-            database.execute(
-                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, "
-                "?, ?, ?, ?, ?)",
-                row,
-            )
-            saved += 1
-    log.warning("%d batches were saved from %s", saved, aside)
-    return database, aside
 
 
 def _open_database(path: Path) -> sqlite3.Connection:

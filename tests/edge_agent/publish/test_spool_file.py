@@ -6,10 +6,13 @@ from __future__ import annotations
 
 import random
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
+from edge_agent.publish import spool_file
 from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox, StoredBatch
 from schemas.errors import InputError
@@ -108,6 +111,80 @@ def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> 
     assert outbox.counts.damages == 1
     assert outbox.store([draft], 1.0)[0].seq == 3
     assert len(outbox.held) == BATCHES + 1
+    outbox.close()
+
+
+def damage_page(path: Path) -> None:
+    image = path.read_bytes()
+    path.write_bytes(image[: 5 * PAGE] + bytes(PAGE) + image[6 * PAGE :])
+
+
+def raise_full_disk(_: Path) -> NoReturn:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_start_after_a_failed_recovery_finds_the_batches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "spool.sqlite"
+    store_batches(path)
+    damage_page(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(spool_file, "_readable_batches", raise_full_disk)
+        with pytest.raises(InputError, match="No space left"):
+            Outbox(path, boot=6)
+    outbox = Outbox(path, boot=7)
+    assert outbox.counts.damages == 1
+    assert len(outbox.held) > BATCHES // 2
+    outbox.close()
+
+
+def test_a_recovery_interrupted_between_its_renames_is_completed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "spool.sqlite"
+    store_batches(path)
+    damage_page(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", stop_after_one_rename(Path.rename))
+        with pytest.raises(InputError, match="crash"):
+            Outbox(path, boot=6)
+    assert not path.exists()
+    (tmp_path / "spool.sqlite-wal").write_bytes(b"log of the damaged file" * 1000)
+    outbox = Outbox(path, boot=7)
+    assert len(outbox.held) > BATCHES // 2
+    outbox.close()
+
+
+def stop_after_one_rename(rename: Callable[[Path, Path], Path]) -> Callable[[Path, Path], Path]:
+    """Return a function that renames the first file, and raises at the next one that exists."""
+    done: list[Path] = []
+
+    def rename_once(path: Path, target: Path) -> Path:
+        if done and path.exists():
+            raise OSError("crash")
+        done.append(path)
+        return rename(path, target)
+
+    return rename_once
+
+
+def test_recovery_during_use_is_repeated_until_the_disk_accepts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "spool.sqlite"
+    store_batches(path)
+    outbox = Outbox(path, boot=6)
+    with monkeypatch.context() as patch:
+        patch.setattr(spool_file, "_readable_batches", raise_full_disk)
+        with pytest.raises(OSError, match="No space left"):
+            outbox.recover_file()
+    with pytest.raises(sqlite3.Error) as raised:
+        outbox.due_batches(0.0, 1)
+    assert spool_file.is_damage(raised.value), "the publisher would not try again"
+    outbox.recover_file()
+    assert len(outbox.held) == BATCHES
+    assert outbox.counts.damaged == 0
     outbox.close()
 
 
