@@ -113,7 +113,7 @@ class Pipeline:
         cell = located.cell[-1]
         sector = located.sector[-1]
         self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)
-        self._ends.advance(block.time, estimates.vx)
+        self._ends.advance(block.t, block.time, estimates.vx)
         return (
             estimates,
             self._ends.release_records(observations),

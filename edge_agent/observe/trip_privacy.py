@@ -10,6 +10,8 @@ are zero, every record is published immediately. The module is pure (no I/O).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from edge_agent.observe.observation_builder import RecordBlock
@@ -32,76 +34,77 @@ class TripEnds:
 
     def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
         self._metres = metres
-        self._ns = round(seconds * NS)
-        self._driven: FloatArray = np.zeros(vehicles)  # [m] distance up to the last sample
-        self._times: list[IntArray] = []
-        self._odometers: list[FloatArray] = []
-        self._began: IntArray | None = None
-        self._waiting: dict[Kind, RecordBlock] = {}
+        self._seconds = seconds
+        # Steady time [s] and distance [m] at the last sample of the previous and of this block.
+        self._t: FloatArray = np.zeros((0, vehicles))
+        self._driven: FloatArray = np.zeros((1, vehicles))
+        self._began: FloatArray | None = None
+        self._now: IntArray = np.zeros(vehicles, np.int64)  # [ns UTC] time of the last sample
+        self._waiting: dict[Kind, _PlacedRecords] = {}
 
     @property
     def _is_off(self) -> bool:
-        return self._metres == 0.0 and self._ns == 0
+        return self._metres == 0.0 and self._seconds == 0.0
 
-    def advance(self, time: IntArray, speed: FloatArray) -> None:
-        """Update the distance that each of N vehicles has driven with a block of samples: `time`
-        (T, N) [ns UTC] and `speed` (T, N) [m/s].
+    def advance(self, t: FloatArray, time: IntArray, speed: FloatArray) -> None:
+        """Update the distance that each of N vehicles has driven with a block of samples: steady
+        time `t` (T, N) [s], `time` (T, N) [ns UTC] and `speed` (T, N) [m/s].
+
+        Time and distance of the trip are those of the steady time, because the UTC time jumps when
+        the first position fix corrects it.
         """
         if self._is_off:
             return
         if self._began is None:
-            self._began = time[0].copy()
-            self._times.append(time[:1])
-            self._odometers.append(self._driven[None].copy())
-        before = np.vstack([self._times[-1][-1:], time])
-        odometer = self._driven + np.cumsum(np.abs(speed) * np.diff(before, axis=0) / NS, axis=0)
-        self._driven = odometer[-1]
-        self._times.append(time[-1:])
-        self._odometers.append(odometer[-1:])
-        self._drop_old_track()
+            self._began = t[0].copy()
+            self._t = t[:1].copy()
+        passed = np.vstack([self._t[-1:], t])
+        driven = self._driven[-1] + (np.abs(speed) * np.diff(passed, axis=0)).sum(axis=0)
+        self._t = passed[[0, -1]]
+        self._driven = np.vstack([self._driven[-1], driven])
+        self._now = time[-1]
 
     def release_records(self, records: RecordBlock) -> RecordBlock:
-        """Return the records that may be published now. They come from `records` and from the
-        records that waited since earlier calls; the others wait on.
+        """Return the records that may be published now. They come from `records`, which lie in the
+        last block of samples, and from the records that waited since earlier calls; the others wait
+        on.
         """
         if self._is_off or self._began is None:
             return records
-        waiting = self._waiting.get(records.kind)
-        both = records if waiting is None else _join_blocks(waiting, records)
-        time: IntArray = both.columns[_TIME[records.kind]]
-        driven = self._distance_at(time, both.vehicle)
-        now = self._times[-1][-1][both.vehicle]
-        begun = (driven >= self._metres) & (time - self._began[both.vehicle] >= self._ns)
-        passed = (self._driven[both.vehicle] - driven >= self._metres) & (now - time >= self._ns)
-        self._waiting[records.kind] = _select_rows(both, begun & ~passed)
-        return _select_rows(both, begun & passed)
+        both = self._place_records(records)
+        if records.kind in self._waiting:
+            both = _join_records(self._waiting[records.kind], both)
+        vehicle = both.records.vehicle
+        begun = (both.driven >= self._metres) & (both.t - self._began[vehicle] >= self._seconds)
+        passed = (self._driven[-1, vehicle] - both.driven >= self._metres) & (
+            self._t[-1, vehicle] - both.t >= self._seconds
+        )
+        waiting = begun & ~passed
+        self._waiting[records.kind] = _PlacedRecords(
+            _select_rows(both.records, waiting), both.t[waiting], both.driven[waiting]
+        )
+        return _select_rows(both.records, begun & passed)
 
-    def _drop_old_track(self) -> None:
-        """Delete the stored times and distances of the vehicles that are older than the oldest
-        waiting record, because they are no longer needed.
+    def _place_records(self, records: RecordBlock) -> _PlacedRecords:
+        """Return the records of the last block with their place in the trip. The distance is
+        interpolated between the ends of the blocks of samples.
         """
-        waiting = [
-            r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)
-        ]
-        oldest = min(waiting, default=self._times[-1].min())
-        while len(self._times) > 2 and self._times[1].max() <= oldest:
-            del self._times[0], self._odometers[0]
+        vehicle = records.vehicle
+        t = self._t[-1, vehicle] - (self._now[vehicle] - records.columns[_TIME[records.kind]]) / NS
+        begin, end = self._t[:, vehicle]
+        before, after = self._driven[:, vehicle]
+        share = np.clip((t - begin) / np.maximum(end - begin, np.finfo(np.float64).tiny), 0.0, 1.0)
+        return _PlacedRecords(records, t, before + (after - before) * share)
 
-    def _distance_at(self, time: IntArray, vehicle: IntArray) -> FloatArray:
-        """Return the distances (n,) [m] that n vehicles had driven since the start of the trip.
-        Element i is the distance of the vehicle with index `vehicle[i]` at `time[i]` [ns UTC]. It
-        is interpolated between the ends of the blocks of samples.
-        """
-        times = np.vstack(self._times)
-        odometers = np.vstack(self._odometers)
-        out = np.empty(len(time))
-        for n in np.unique(vehicle).tolist():
-            rows = vehicle == n
-            since = times[0, n]
-            out[rows] = np.interp(
-                (time[rows] - since) / NS, (times[:, n] - since) / NS, odometers[:, n]
-            )
-        return out
+
+class _PlacedRecords(NamedTuple):
+    """Records with their places in the trip, (n,) each: the steady time `t` [s], and the distance
+    `driven` since the beginning of the trip [m].
+    """
+
+    records: RecordBlock
+    t: FloatArray
+    driven: FloatArray
 
 
 def _select_rows(
@@ -111,11 +114,17 @@ def _select_rows(
     return RecordBlock(records.kind, columns, records.vehicle[rows], records.urgent[rows])
 
 
-def _join_blocks(first: RecordBlock, second: RecordBlock) -> RecordBlock:
+def _join_records(first: _PlacedRecords, second: _PlacedRecords) -> _PlacedRecords:
+    one = first.records
+    other = second.records
     columns = {
-        name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns
+        name: np.concatenate([column, other.columns[name]]) for name, column in one.columns.items()
     }
     vehicle, urgent = (
-        np.concatenate([getattr(r, n) for r in (first, second)]) for n in ("vehicle", "urgent")
+        np.concatenate([getattr(r, n) for r in (one, other)]) for n in ("vehicle", "urgent")
     )
-    return RecordBlock(first.kind, columns, vehicle, urgent)
+    return _PlacedRecords(
+        RecordBlock(one.kind, columns, vehicle, urgent),
+        np.concatenate([first.t, second.t]),
+        np.concatenate([first.driven, second.driven]),
+    )

@@ -4,6 +4,8 @@ everything in between.
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def list_passed_times(ends: TripEnds, seconds: int, block_s: float = 0.5) -> lis
     for block in range(round(seconds / block_s)):
         t = (block * block_s + 0.1 * np.arange(1, steps + 1))[:, None]
         time = np.rint(t * NS).astype(np.int64)
-        ends.advance(time, np.full(time.shape, SPEED))
+        ends.advance(time / NS, time, np.full(time.shape, SPEED))
         out += (
             ends.release_records(states(time[time % NS == 0].ravel())).columns["time"] / NS
         ).tolist()
@@ -58,5 +60,31 @@ def test_who_stands_still_has_not_left_home() -> None:
     ends = TripEnds(1, 50.0, 0.0)
     for k in range(1, 100):
         time = np.array([[k * NS]])
-        ends.advance(time, np.zeros((1, 1)))
+        ends.advance(time / NS, time, np.zeros((1, 1)))
         assert not len(ends.release_records(states(time[0])).vehicle)
+
+
+@pytest.mark.parametrize("clock_off_s", [-1e9, 3600.0])
+def test_a_clock_corrected_at_the_first_fix_does_not_change_the_trip_ends(
+    clock_off_s: float,
+) -> None:
+    ends = TripEnds(1, 50.0, 0.0)
+    published = []
+    for second in range(40):
+        off_ns = round(clock_off_s * NS) if second < 3 else 0
+        time = np.array([[2_000_000_000 * NS + second * NS + off_ns]])
+        ends.advance(np.array([[float(second)]]), time, np.full((1, 1), SPEED))
+        found = ends.release_records(states(time[0] if second >= 3 else time[0, :0]))
+        published += (found.columns["time"] // NS - 2_000_000_000).tolist()
+    assert published == list(range(5, 35))
+
+
+def test_waiting_records_take_no_more_memory_while_the_vehicle_stands() -> None:
+    ends = TripEnds(1, 50.0, 0.0)
+    sizes = []
+    for second in range(1000):
+        time = np.array([[second * NS]])
+        ends.advance(time / NS, time, np.full((1, 1), SPEED if second < 20 else 0.0))
+        ends.release_records(states(time[0] if second < 20 else time[0, :0]))
+        sizes.append(len(pickle.dumps(ends)))
+    assert sizes[-1] == sizes[30], "the effort per block would grow with the time of standing"
