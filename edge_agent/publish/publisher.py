@@ -79,6 +79,7 @@ class Publisher:
         )
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._waiting: list[Draft] = []
+        self._disk_error = ""  # last error of the outbox, until a batch is stored
         self._closing = threading.Event()
         self._deadline = float("inf")
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
@@ -120,7 +121,7 @@ class Publisher:
 
     def close(self, within_s: float) -> bool:
         """Send the remaining records, wait at most `within_s` seconds for acknowledgements, and
-        stop.
+        stop. Records that the disk has not accepted by then are dropped.
 
         Return False if a thread did not stop in time; it then continues to run.
         """
@@ -131,7 +132,11 @@ class Publisher:
         closer = threading.Thread(target=self._links.close, name="closer", daemon=True)
         closer.start()
         closer.join(CLOSE_GRACE_S)
-        if self._sender.is_alive() or closer.is_alive():
+        if self._sender.is_alive():
+            return False
+        for kind in Kind:
+            self.counts.dropped[kind] = self.counts.offered[kind] - self.counts.published[kind]
+        if closer.is_alive():
             return False
         try:
             self._outbox.close()
@@ -150,7 +155,8 @@ class Publisher:
                 if is_damage(error):
                     self._recover_outbox()
                 else:
-                    log.warning("the outbox cannot be read or written (%s); trying again", error)
+                    text = "the outbox cannot be read or written"
+                    self._disk_error = _log_if_changed(text, error, self._disk_error)
                 self._stopped.wait(TICK_S)
             except Exception:  # the sender must continue after any error
                 self.counts.failures += 1
@@ -164,8 +170,8 @@ class Publisher:
             self._outbox.reset_in_flight(vehicle, self._clock())
         self._waiting += self._batcher.take_due(self._clock(), everything=self._closing.is_set())
         self._store_and_send()
+        self._resend_due()  # before the deletion, which a full disk may refuse
         self._outbox.delete_settled()
-        self._resend_due()
 
     def _recover_outbox(self) -> None:
         """Recover the readable content of an outbox (store of batches on disk) that was damaged
@@ -208,9 +214,8 @@ class Publisher:
         try:
             batches = self._outbox.store(self._waiting, self._clock())
         except sqlite3.Error as error:
-            log.warning(
-                "the outbox refuses %d batches (%s); trying again", len(self._waiting), error
-            )
+            text = f"the outbox refuses {len(self._waiting)} batches"
+            self._disk_error = _log_if_changed(text, error, self._disk_error)
             for draft in self._waiting[:-WAITING_LIMIT]:
                 self.counts.dropped[draft.kind] += draft.records
             self._waiting = self._waiting[-WAITING_LIMIT:]
@@ -221,6 +226,7 @@ class Publisher:
             log.exception("a batch cannot be written")
             self._drop_unwritable()
             return
+        self._disk_error = ""
         for draft in self._waiting:
             self.counts.published[draft.kind] += draft.records
         self._waiting = []
@@ -249,3 +255,12 @@ class Publisher:
         limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(there))
         for batch in self._outbox.due_batches(self._clock(), limit, there) if there else ():
             self.counts.resent_batches += self._links.put_batch(batch)
+
+
+def _log_if_changed(text: str, error: sqlite3.Error, last: str) -> str:
+    """Log an error of the outbox if its message differs from `last`, because each round tries
+    again. Return its message.
+    """
+    if str(error) != last:
+        log.warning("%s (%s); trying again", text, error)
+    return str(error)

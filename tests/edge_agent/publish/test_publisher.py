@@ -15,7 +15,7 @@ import pytest
 from edge_agent.app.live_loop import Progress
 from edge_agent.app.metrics import health_problems
 from edge_agent.observe.observation_builder import RecordBlock
-from edge_agent.publish.batching import Batcher
+from edge_agent.publish.batching import Batcher, Draft
 from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, keys
@@ -270,6 +270,40 @@ def test_a_full_disk_is_waited_for(
         assert seqs == set(range(1, len(seqs) + 1))
 
 
+def test_records_that_the_disk_never_accepted_count_as_dropped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
+    config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
+    outbox = Outbox(config.spool)
+    outbox._file.begin_transaction().execute("PRAGMA query_only = ON")
+    publisher = Publisher(NAMES, outbox, config, "test")
+    publisher.start()
+    observations, _ = drive()
+    publisher.offer(observations)
+    assert publisher.close(within_s=0.5)
+    assert publisher.count_unsettled() == 0, "the outbox does not contain them"
+    assert publisher.status.dropped_records == len(observations.vehicle)
+    assert caplog.text.count("the outbox refuses") == 1, "each round tries again"
+
+
+def test_stored_batches_are_sent_though_the_disk_refuses_to_delete(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
+    config = settings(router, tmp_path)
+    stored = 60
+    outbox = Outbox(config.spool, boot=1)
+    draft = drafts_of(drive()[0])[0]
+    outbox.store([draft] * stored, 0.0)
+    outbox.close()
+    outbox = Outbox(config.spool, first_resend_s=config.resend_s)
+    outbox._file.begin_transaction().execute("PRAGMA query_only = ON")
+    publisher = Publisher(NAMES, outbox, config, "test")
+    publisher.start()
+    service.wait(lambda batches: len({batch.seq for batch in batches}) == stored)
+    publisher.close(within_s=0.1)
+
+
 def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
@@ -291,6 +325,12 @@ def test_many_sessions_open_together(router: Router, tmp_path: Path) -> None:
     publisher = publisher_of(settings(router, tmp_path), names)
     until(lambda: publisher.status.links == 36)
     assert publisher.close(within_s=1.0)
+
+
+def drafts_of(records: RecordBlock) -> list[Draft]:
+    batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=5)
+    batcher.add(records, 0.0)
+    return batcher.take_due(0.0, everything=True)
 
 
 def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[tuple[str, int]]:
