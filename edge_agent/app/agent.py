@@ -131,8 +131,8 @@ class Agent:
         Print one line with the counts of blocks and records.
 
         Returns:
-            0, or 1 if the source or the duration has ended and records are left in the outbox
-            without acknowledgement. After a signal such records are no failure.
+            0, or 1 if the source or the duration has ended and records were lost or are left in
+            the outbox without acknowledgement. After a signal such records are no failure.
         """
         config = self.options.config
         log_warnings(config.log, sys.stderr)
@@ -145,16 +145,22 @@ class Agent:
         ):
             if address:
                 print_line(f"metrics: {address}/metrics", sys.stderr)
-            publisher = self._drive_until(stop)
-            counts = {
-                name: value for part in self.parts for name, value in part.close_part().items()
-            }
-            self.source.end()
-            drain_s = STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S
-            close_publisher(publisher, self._progress, drain_s, **counts)
-        return 1 if publisher.count_unsettled() and not stop.is_set() else 0
+            options = self.options
+            publisher = open_publisher(options.names, config, self.estimator, self._attach_session)
+            self._publisher = publisher
+            counts: dict[str, float] = {}
+            try:
+                self._drive_until(stop, publisher)
+                for part in self.parts:
+                    counts |= part.close_part()
+                self.source.end()
+            finally:  # an error must not lose the records that are not in the outbox yet
+                drain_s = STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S
+                close_publisher(publisher, self._progress, drain_s, **counts)
+        left = publisher.count_unsettled() or publisher.status.dropped_records
+        return 1 if left and not stop.is_set() else 0
 
-    def _drive_until(self, stop: threading.Event) -> Publisher:
+    def _drive_until(self, stop: threading.Event, publisher: Publisher) -> None:
         options = self.options
         source = self.source
         pipeline = Pipeline(
@@ -162,10 +168,6 @@ class Agent:
             len(options.vehicles),
             options.config,
         )
-        publisher = open_publisher(
-            options.names, options.config, self.estimator, self._attach_session
-        )
-        self._publisher = publisher
         events = event_logger("agent", options.config.log, sys.stderr)
         who = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
         events.info(
@@ -204,7 +206,6 @@ class Agent:
             ),
             self._progress,
         )
-        return publisher
 
     def _attach_session(self, name: str, session: zenoh.Session) -> None:
         for part in self.parts:

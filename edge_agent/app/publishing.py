@@ -67,13 +67,20 @@ def close_publisher(
     on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
-    next start. Their number and the outbox's path are printed on stderr.
+    next start. Their number, the number of lost records and the outbox's path are printed on
+    stderr.
     """
     from edge_agent.app.live_loop import final_counts
 
     clean = publisher.close(drain_s)
+    path = publisher.status.outbox_path
+    if lost := publisher.status.dropped_records:
+        print_line(
+            f"{lost} records are lost, because {path} was full or its disk refused them; see "
+            "spool_mb",
+            sys.stderr,
+        )
     if waiting := publisher.count_unsettled():
-        path = publisher.status.outbox_path
         print_line(
             f"{waiting} records without acknowledgement stay in {path}; the next start with this "
             "outbox sends them",

@@ -264,8 +264,8 @@ def _publish_log(
     keep: Callable[[Block, Estimates], None],
 ) -> int:
     """Estimate a log that begins at `start_ns` [ns UTC], and publish the resulting records. `keep`
-    is called with each block of samples and its estimates. Return 1 if a record was refused or not
-    acknowledged, else 0.
+    is called with each block of samples and its estimates. Return 1 if a record was refused, lost
+    or not acknowledged, else 0.
     """
     from edge_agent.app.live_loop import Progress
     from edge_agent.app.publishing import close_publisher
@@ -289,7 +289,7 @@ def _publish_log(
             else "the reasons are above"
         )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
-    return 1 if refused or publisher.count_unsettled() else 0
+    return 1 if refused or publisher.count_unsettled() or publisher.status.dropped_records else 0
 
 
 def _start_time(given: str | None, log: SignalLog) -> int:

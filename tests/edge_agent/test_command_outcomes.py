@@ -111,3 +111,21 @@ def test_connect_replaces_the_router_and_unsent_records_are_reported(
     assert f"no session at {endpoint} yet" in seen.err
     assert f"records wait in {spool} until they are acknowledged" in seen.err
     assert re.search(rf"^{left} records without acknowledgement stay in {spool};", seen.err, re.M)
+
+
+@pytest.mark.parametrize("command", ["fleet", "replay"])
+def test_records_lost_by_a_full_outbox_are_reported(
+    tmp_path: Path, capsys: Output, command: str
+) -> None:
+    config = tmp_path / "agent.json"
+    config.write_text(json.dumps({"spool": str(tmp_path / "spool.sqlite"), "spool_mb": 1e-5}))
+    words = ["fleet", "--vehicles", "1", "--duration", "1", "--estimator", "ckf"]
+    if command == "replay":
+        log = tmp_path / "d.parquet"
+        words = [*write_drive(log), "--out", str(tmp_path / "e.parquet"), "--publish", "--trust"]
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    assert main([*words, "--config", str(config), "--connect", endpoint]) == 1
+    seen = capsys.readouterr()
+    counts = json.loads(seen.out.splitlines()[-1])
+    assert counts["unsettled"] == 0
+    assert f"{counts['dropped']} records are lost, because" in seen.err

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge_agent.app import agent
 from edge_agent.app.live_loop import STATUS_EVERY_S, LoopOptions, Progress, run_live_loop
 from edge_agent.estimators import create
 from edge_agent.inputs.block import Block
@@ -25,8 +26,10 @@ from edge_agent.lab.truth_file import TruthRecorder
 from edge_agent.observe.cell_tracker import NOWHERE, locate_vehicles, new_tracks
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.pipeline import Pipeline
+from edge_agent.publish.outbox import Outbox
 from schemas import grid
-from schemas.config import AgentConfig
+from schemas.config import AgentConfig, ZenohSettings
+from schemas.errors import InputError
 from schemas.wire import Kind
 
 VEHICLES = 3
@@ -178,6 +181,29 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     for name in plain.taken[0].columns.keys() - {"abs_active", "air_temperature"}:
         one, other = (b.column(Kind.OBSERVATION, name) for b in (plain, basket))
         assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), name
+
+
+def test_records_are_stored_if_the_source_of_samples_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, parts = fleet_blocks(10)
+    spool = tmp_path / "spool.sqlite"
+    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
+    config = AgentConfig(zenoh=nobody, spool=spool, flush_s=60.0)
+
+    def blocks() -> Iterator[Block]:
+        yield from parts
+        raise InputError("source", "failed", "repair it")
+
+    monkeypatch.setattr(agent, "ENDED_DRAIN_S", 0.2)
+    driver = agent.Agent(
+        agent.AgentOptions(fleet.vehicles, fleet.names, config, "ckf"), agent.AgentSource(blocks())
+    )
+    with pytest.raises(InputError, match="source: failed"):
+        driver.drive()
+    outbox = Outbox(spool)
+    assert outbox.held.count_records(fleet.names, Kind.STATE) >= len(fleet.names)
+    outbox.close()
 
 
 class WaitingClock(threading.Event):
