@@ -362,8 +362,9 @@ def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: flo
             along = (DRIVEN_SHARE if visit.ax > 0.0 else 1.0) * visit.ax
             felt = max(felt, WHEEL_SHARE * np.hypot(along, visit.ay) / GRAVITY + FELT_STD)
         visit.felt = felt
-    visit.travelled += sample.speed * dt
-    visit.from_fix += sample.speed * dt
+    if visit.samples > 0:  # the way to the first sample, perhaps a long gap, lies before the visit
+        visit.travelled += sample.speed * dt
+        visit.from_fix += sample.speed * dt
 
 
 def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:

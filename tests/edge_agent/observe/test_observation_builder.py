@@ -196,13 +196,13 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
 
-def observe_grip(observed: np.ndarray, east: np.ndarray) -> list[float]:
+def observe_grip(observed: np.ndarray, east: np.ndarray, fix_every: int = 10) -> list[float]:
     """Return the used grip reported for each visit (passage of a cell) of a car. The car drives
-    east along `east` (T, 1) [m] at 100 samples per second; its acceleration shows a used grip of
-    `observed` (T,).
+    east along `east` (T, 1) [m] at 100 samples per second, and every `fix_every`-th sample has a
+    position; its acceleration shows a used grip of `observed` (T,).
     """
     flat = np.zeros_like(east)
-    block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
+    block = ground(east, flat, flat, rate_hz=100.0, fix_every=fix_every)
     reported = estimates(len(east), 1, used=0.9)
     signals = block.signals.copy()
     signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
@@ -237,6 +237,16 @@ def test_grip_felt_at_the_border_of_a_cell_may_be_of_its_neighbour() -> None:
     assert plain == pytest.approx(WHEEL_SHARE * 0.1 + FELT_STD, abs=1e-3)
     assert near == pytest.approx(plain, abs=0.15)
     assert far > WHEEL_SHARE * 0.55
+
+
+def test_first_visit_with_one_fix_reports_the_grip_used_near_the_fix() -> None:
+    """A receiver of 1 Hz gives one position per cell. The time before the first visit, or without
+    reception, must not count as a way driven since that position.
+    """
+    east = np.arange(450)[:, None] * 0.1
+    first, second, *_ = observe_grip(np.full(450, 0.6), east, fix_every=100)
+    assert first == pytest.approx(second)
+    assert second > WHEEL_SHARE * 0.55
 
 
 def test_the_noise_of_accelerometers_is_no_grip() -> None:
