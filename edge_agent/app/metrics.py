@@ -65,7 +65,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "records given up because only later batches were acknowledged",
             {"": status.unanswered_records},
         ),
-        Metric("resent_batches", "counter", "records sent again", {"": counts.resent_batches}),
+        Metric("resent_batches", "counter", "batches sent again", {"": counts.resent_batches}),
         Metric(
             "bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}
         ),

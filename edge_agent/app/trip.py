@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -30,6 +29,7 @@ from edge_agent.inputs.correct import Corrector
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.profile import Profile
 from schemas.numeric import FloatArray
+from schemas.runtime.durable import open_durably
 from schemas.vehicle import Vehicle
 
 PART_S: Final = 600.0  # [s] length of a section, 9 MB of signals
@@ -224,13 +224,9 @@ def _read_state(path: Path, identity: str) -> Known:
 
 def _write_state(path: Path, known: Known) -> None:
     """Write the stored knowledge about a car to its file, atomically."""
-    part = path.with_suffix(".part")
     try:
-        with part.open("w", encoding="utf-8") as file:
-            file.write(known.model_dump_json(indent=1) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        with open_durably(path) as file:
+            file.write(known.model_dump_json(indent=1).encode() + b"\n")
     except OSError as error:
         log.warning(
             "%s cannot be written (%s): what was learned from this part of the trip is lost",
