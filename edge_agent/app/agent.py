@@ -12,6 +12,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -79,12 +80,14 @@ class AgentSource(NamedTuple):
         health_problems: function that returns one message per problem of the source, for the health
             check.
         end: function that the agent calls when its loop over the blocks has ended.
+        clock: returns the steady time [s] by which the blocks come in real time.
     """
 
     blocks: Iterator[Block]
     is_admitted: Callable[[], bool] = lambda: True
     health_problems: Callable[[], list[str]] = list
     end: Callable[[], None] = lambda: None
+    clock: Callable[[], float] = time.monotonic
 
 
 class AgentPart(Protocol):
@@ -201,6 +204,7 @@ class Agent:
             LoopOptions(
                 on_status=partial(print_status, publisher=publisher, events=events),
                 duration_s=options.duration_s,
+                clock=source.clock,
                 is_admitted=source.is_admitted,
                 after=after_block,
             ),
@@ -227,12 +231,12 @@ class Agent:
         compiled before the loop starts.
         """
         t = np.zeros((1, 1))
-        time = np.zeros((1, 1), dtype=np.int64)
+        dates = np.zeros((1, 1), dtype=np.int64)
         signals = np.full((1, 1, len(CHANNELS)), np.nan)
         options = self.options
         with progress_messages.show_status("starting the estimator"):
             bank = bank_of(self.estimator, options.vehicles[:1], options.memberships)
-            Pipeline(bank, 1, options.config).step(Block(t, time, signals))
+            Pipeline(bank, 1, options.config).step(Block(t, dates, signals))
 
 
 @contextmanager

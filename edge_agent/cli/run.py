@@ -222,6 +222,7 @@ def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig)
             trip.is_admitted,
             lambda: [*rows.health_problems(), *trip.health_problems()],
             trip.learn_rest,
+            clock.now,
         )
         options = _agent_options(args, trip.vehicle, name, config)
         return Agent(options, source, _make_parts(args, name, config)).drive()

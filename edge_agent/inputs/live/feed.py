@@ -39,18 +39,27 @@ Heard: TypeAlias = tuple[float, Any]
 log = logging.getLogger(__name__)
 
 
+def _steady_seconds() -> float:
+    """Return the time [s] of a clock that never jumps. It includes the time for which the host was
+    suspended, where the system counts it; `monotonic` of Linux does not.
+    """
+    if hasattr(time, "CLOCK_BOOTTIME"):
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
+
+
 @dataclass(frozen=True)
 class HostClock:
     """Clock of the host (this computer). It stores the UTC time [ns] at which it was started, and
-    the reading of a monotonic clock [s] at that moment.
+    the reading of a steady clock [s] at that moment.
     """
 
     start_ns: int = field(default_factory=time.time_ns)
-    steady_s: float = field(default_factory=time.monotonic)
+    steady_s: float = field(default_factory=_steady_seconds)
 
     def now(self) -> float:
         """Return the time [s] since the start of the host's clock."""
-        return time.monotonic() - self.steady_s
+        return _steady_seconds() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
         """Return the time [s] from the start of the host's clock to the instant `stamp_ns` [ns

@@ -197,7 +197,8 @@ def test_records_are_stored_if_the_source_of_samples_fails(
 
     monkeypatch.setattr(agent, "ENDED_DRAIN_S", 0.2)
     driver = agent.Agent(
-        agent.AgentOptions(fleet.vehicles, fleet.names, config, "ckf"), agent.AgentSource(blocks())
+        agent.AgentOptions(fleet.vehicles, fleet.names, config, "ckf"),
+        agent.AgentSource(blocks(), clock=count(0.0, 10.0).__next__),
     )
     with pytest.raises(InputError, match="source: failed"):
         driver.drive()

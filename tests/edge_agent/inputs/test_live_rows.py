@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -140,6 +141,18 @@ def test_a_host_that_slept_leaves_rows_out(clock: Steered) -> None:
     assert after.t[0, 0] - before.t[-1, 0] > 59.0
     assert rows.skipped == pytest.approx(6000, abs=20)
     blocks.close()
+
+
+@pytest.mark.skipif(
+    not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended"
+)
+def test_the_clock_of_the_host_goes_on_while_the_host_is_suspended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    host = HostClock()
+    awake = time.clock_gettime
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: awake(clock) + 3600.0)
+    assert host.now() == pytest.approx(3600.0, abs=60.0)
 
 
 def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> None:
