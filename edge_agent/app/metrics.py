@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from edge_agent.app.live_loop import Progress
-from edge_agent.publish.ack_settlement import CLOCK_OFF_S
+from edge_agent.publish.ack_settlement import CLOCK_OFF_S, describe_clock
 from edge_agent.publish.publisher import Publisher
 from schemas.runtime.link_watch import link_metrics
 from schemas.runtime.metrics import Metric, gauge
@@ -128,10 +128,7 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     if status.fill_share > FULL:
         found.append("the outbox is full: the oldest states are dropped first")
     if abs(status.clock_behind_s) > CLOCK_OFF_S:
-        found.append(
-            f"the clock is {status.clock_behind_s:.0f} s behind the service's: reports arrive "
-            "late or are refused"
-        )
+        found.append(describe_clock(status.clock_behind_s))
     if status.stranded_records:
         found.append(
             f"{status.stranded_records} records are stored under a previous vehicle name; "

@@ -116,8 +116,16 @@ class AckSettlement:
             return
         behind = (reported - self._wall()) / NS
         if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
-            log.warning(
-                "the clock is %.0f s behind the service's: reports arrive late or are refused",
-                behind,
-            )
+            log.warning(describe_clock(behind))
         self.clock_behind_s = behind
+
+
+def describe_clock(behind_s: float) -> str:
+    """Return the sentence for the user about a clock that is `behind_s` seconds behind the
+    service's; negative if it is ahead.
+    """
+    side = "behind" if behind_s > 0.0 else "ahead of"
+    return (
+        f"the clock is {abs(behind_s):.0f} s {side} the service's: reports arrive late or are "
+        "refused"
+    )

@@ -5,6 +5,7 @@ and be settled (removed from the outbox) by an answer.
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -235,11 +236,14 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     until(lambda: abs(publisher.status.clock_behind_s - 130.0) < 10.0)
     assert any("clock" in trouble for trouble in health_problems(publisher, Progress()))
     assert "behind the service's" in caplog.text
+    service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() - 3600 * NS))
+    until(lambda: publisher.status.clock_behind_s < 0.0)
+    assert re.search(r"is 36\d\d s ahead of", " ".join(health_problems(publisher, Progress())))
     service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
     until(lambda: abs(publisher.status.clock_behind_s) < 10.0)
     # An old service sends acknowledgements without a time.
     service.put_ack("car-a", encode_ack("car-a", [settled]))
-    until(lambda: publisher.counts.late[mine.kind] == 3)
+    until(lambda: publisher.counts.late[mine.kind] == 4)
     assert health_problems(publisher, Progress()) == []
     publisher.close(within_s=0.1)
 
