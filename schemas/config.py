@@ -75,10 +75,14 @@ class AgentConfig(MonitoringSettings):
         default=SLIPPERY_MU, description="a visit with an upper bound below this is sent at once"
     )
     position_std: Positive = Field(
-        default=1.5, description="standard deviation of the satellite receiver's position [m]"
+        default=1.5,
+        le=100.0,
+        description="standard deviation of the satellite receiver's position [m]",
     )
     yaw_std: Positive = Field(
-        default=0.02, description="standard deviation of the satellite receiver's course [rad]"
+        default=0.02,
+        le=10.0,
+        description="standard deviation of the satellite receiver's course [rad]",
     )
     spool: Path = Field(
         default=Path("spool.sqlite"),

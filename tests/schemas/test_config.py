@@ -10,6 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from fleet_service.enrolment.fleet import Enrolment
+from schemas import tables
 from schemas.config import AgentConfig, ServiceConfig, load
 from schemas.errors import InputError
 
@@ -43,3 +44,17 @@ def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path)
         load(tmp_path / "nosuch.json", ServiceConfig)
     with pytest.raises(InputError, match="^fleet: cannot read .*nosuch.json"):
         load(tmp_path / "nosuch.json", Enrolment, "fleet")
+
+
+@pytest.mark.parametrize("name", ["position_std", "yaw_std"])
+def test_an_accuracy_that_a_service_rejects_is_refused_at_the_start(
+    tmp_path: Path, name: str
+) -> None:
+    limits = next(field.range for field in tables.OBSERVATION if field.name == name)
+    assert limits is not None
+    path = tmp_path / "agent.json"
+    path.write_text(json.dumps({name: limits[1]}))
+    load(path, AgentConfig)
+    path.write_text(json.dumps({name: 1.01 * limits[1]}))
+    with pytest.raises(InputError, match=name):
+        load(path, AgentConfig)
