@@ -1,9 +1,11 @@
-"""Names of the columns of a signal log, and steering angles for wheels without a column."""
+"""Names of the columns of a signal log, and values for missing columns and readings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
+
+import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
@@ -28,3 +30,11 @@ def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
     for wheel in (2, 3):
         if missing[wheel]:
             signals[:, S.DELTA + wheel] = 0.0
+
+
+def remove_null_positions(signals: FloatArray) -> None:
+    """Set positions at exactly 0° latitude and 0° longitude in `signals` (T, 18) to NaN. Many
+    receivers send these values while they have no fix.
+    """
+    place = slice(S.LATITUDE, S.LONGITUDE + 1)
+    signals[(signals[:, place] == 0.0).all(axis=1), place] = np.nan

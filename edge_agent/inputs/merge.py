@@ -23,7 +23,14 @@ from edge_agent.inputs.context import context_values, held_readings
 from edge_agent.inputs.log_columns import GROUND
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
-from edge_agent.inputs.units import QUANTITY, ZEROS, to_si, unit_of_channel
+from edge_agent.inputs.units import (
+    QUANTITY,
+    SPEED,
+    ZEROS,
+    standard_spelling,
+    to_si,
+    unit_of_channel,
+)
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, CONTEXT
@@ -184,10 +191,11 @@ def _align_clocks(
     for place, recording in enumerate(recordings):
         shift = shifts.get(recording.name, 0.0)
         if place == reference or base is None or recording.start_ns is None:
-            if place != reference and base is None and recording.start_ns is not None:
-                start_ns = recording.start_ns
             if place != reference:
-                shift += spans[reference][0] - spans[place][0]
+                later = spans[reference][0] - spans[place][0]
+                if base is None and recording.start_ns is not None:
+                    start_ns = recording.start_ns - round(later * NS)
+                shift += later
                 notes.append(
                     f"{recording.name}: no common date; assumed to begin when "
                     f"{recordings[reference].name} does"
@@ -254,8 +262,9 @@ def make_channel(
         values = values + np.interp(first.t, part.t, part.values)
     if channel.wrap is not None:
         values = np.mod(values, channel.wrap)
-    factor = 1.0
-    if name != GROUND:
+    if name == GROUND:
+        factor = SPEED.get(standard_spelling(first.unit), 1.0)
+    else:
         unit = channel.unit or unit_of_channel(name, first.unit) or next(iter(QUANTITY[name]))
         known = to_si(name, unit, radius)
         if known is None:

@@ -7,7 +7,7 @@ missing reading in any column. A front wheel without a steering column gets the 
 front wheel; for rear wheels without a column the angle is zero. Context signals
 (`schemas.signals.CONTEXT`) are optional. `timestamp` is an Arrow timestamp, or a number: integer
 [ns] or float [s] since 1970 UTC. Time may repeat (the estimator reports this in `health`) but not
-go backwards.
+go backwards. A position at exactly 0°, 0° is a missing reading.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from edge_agent.inputs.log_columns import (
     NEEDED,
     REAR_STEERING,
     fill_steering,
+    remove_null_positions,
 )
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -91,6 +92,7 @@ def read_log(path: Path) -> SignalLog:
     fill_steering(
         signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
     )
+    remove_null_positions(signals)
     ground = _float_column(table, GROUND) if GROUND in table.column_names else None
     return SignalLog(t, signals, start_ns, ground, _read_context(table))
 
@@ -235,10 +237,16 @@ def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: 
     values = np.asarray(column.to_numpy(zero_copy_only=False))
     if pa.types.is_floating(kind):
         first = float(values[0])
-        return np.asarray(values - first, dtype=np.float64), round(first * NS) if np.isfinite(
-            first
-        ) else None
-    return (values - values[0]) / NS, int(values[0])
+        t = np.asarray(values - first, dtype=np.float64)
+        start_ns = round(first * NS) if np.isfinite(first) else None
+    else:
+        t = (values - values[0]) / NS
+        start_ns = int(values[0])
+    if start_ns is not None and abs(start_ns) > np.iinfo(np.int64).max:
+        raise InputError(
+            "timestamp", "is beyond the year 2262", "write ns as int64, or seconds as float64"
+        )
+    return t, start_ns
 
 
 def _check_log(table: pa.Table, signals: FloatArray) -> None:

@@ -211,6 +211,10 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
         make_log_writer(delta_fl=_LOST, delta_fr=_LOST),
         "^delta_fl: has no reading in any row; record",
     ),
+    "nanoseconds as float": (
+        make_log_writer(t=None, timestamp=1.7e18 + 1e7 * np.arange(5)),
+        "^timestamp: is beyond the year 2262; write ns as int64",
+    ),
     "time goes back": (
         make_log_writer(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])),
         "^t: goes back at row 3; sort the log",

@@ -23,7 +23,7 @@ import numpy as np
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
-from edge_agent.inputs.log_columns import GROUND, fill_steering
+from edge_agent.inputs.log_columns import GROUND, fill_steering, remove_null_positions
 from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, make_channel, sample_at_rows
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
@@ -167,6 +167,7 @@ class LiveRows:
             else:
                 signals[:, CHANNELS.index(name)] = sample_at_rows(series, t, sparse=False)
         self._place_fixes(fixes, t, signals)
+        remove_null_positions(signals)
         self._fill_steering(signals)
         time = self._start_ns() + np.rint(t * NS).astype(np.int64)
         return Block(

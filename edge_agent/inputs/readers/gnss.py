@@ -124,6 +124,8 @@ def read_gnss(path: Path) -> Recording:
                 continue
             if fix is not None and (not fixes or fix.time > fixes[-1].time):
                 fixes.append(fix)
+            elif fix is not None and fix.time < fixes[-1].time:
+                broken += 1
     if not fixes:
         raise InputError(
             "source", f"{path} holds no position with a time", "record RMC sentences, or gpsd's TPV"
@@ -134,5 +136,9 @@ def read_gnss(path: Path) -> Recording:
         name: Series(t, np.array([getattr(fix, name) for fix in fixes]), unit)
         for name, unit in UNITS.items()
     }
-    notes = [f"{path.name}: {broken} broken lines left out"] if broken else []
+    notes = (
+        [f"{path.name}: {broken} lines left out: broken, or earlier than a line before"]
+        if broken
+        else []
+    )
     return Recording(path.name, signals, start, notes=notes)

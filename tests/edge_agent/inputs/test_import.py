@@ -204,7 +204,7 @@ def test_gpsd_reports_are_the_same_fixes_as_sentences(
     (tmp_path / "a.gpsd").write_text("\n".join([*lines, '{"class":"TPV"', "\0"]))
     again = read_gnss(tmp_path / "a.gpsd")
     assert again.start_ns == fixes.start_ns
-    assert again.notes == ["a.gpsd: 1 broken lines left out"]
+    assert again.notes == ["a.gpsd: 1 lines left out: broken, or earlier than a line before"]
     for name, series in fixes.signals.items():
         assert np.allclose(series.values, again.signals[name].values)
         assert np.allclose(series.t, again.signals[name].t)

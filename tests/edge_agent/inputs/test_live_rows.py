@@ -177,6 +177,15 @@ def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> N
     blocks.close()
 
 
+def test_a_fix_at_zero_degrees_is_no_position(clock: Steered) -> None:
+    receiver = Scripted("receiver", clock)
+    blocks = rows_of(clock, Scripted("bus", clock), receiver).blocks()
+    next(blocks)
+    receiver.tell(clock.now(), latitude=0.0, longitude=0.0, speed=0.0, course=0.0)
+    assert all(np.isnan(next(blocks).signals[:, 0, S.LATITUDE]).all() for _ in range(5))
+    blocks.close()
+
+
 def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> None:
     bus = Scripted("bus", clock)
     receiver = Scripted("receiver", clock)
