@@ -33,7 +33,7 @@ from edge_agent.inputs.units import (
 )
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, CONTEXT
+from schemas.signals import CHANNELS, CONTEXT, FLAGS
 from schemas.thresholds import NS
 
 # Channels that the recording of a position receiver fills without a profile.
@@ -116,6 +116,11 @@ def merge_recordings(
         one, jitter = make_channel(name, channel, recordings[place], radius, ratio)
         series[name] = Series(one.t + offsets[place] - channel.delay_s, one.values)
         source = recordings[place].name
+        stated = recordings[place].signals[channel.signals[0]].unit
+        guessed = channel.unit is None and stated and name not in (GROUND, *FLAGS)
+        if guessed and unit_of_channel(name, stated) is None:
+            taken = next(iter(QUANTITY[name]))
+            notes.append(f"{name}: its unit {stated!r} is unknown; taken as {taken}")
         origins[name] = {
             "source": source,
             "signals": channel.signals,
@@ -292,7 +297,9 @@ def make_channel(
                 f"the signal of its sign, {channel.sign.signal}, is missing",
                 "name the signal of the sign",
             )
-        values = np.where(_hold_last(flag, first.t) == channel.sign.negative, -values, values)
+        signs = _hold_last(flag, first.t)
+        values = np.where(signs == channel.sign.negative, -values, values)
+        values = np.where(np.isfinite(signs), values, np.nan)
     values = values + channel.offset
     for gate, good in channel.gates.items():
         if gate in recording.signals:

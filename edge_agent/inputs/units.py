@@ -62,6 +62,7 @@ SPELLINGS: Final = {
     "degreescelsius": "degC",
     "unit_degrecelsi": "degC",
     "°f": "degF",
+    "f": "degF",
     "degf": "degF",
     "fahrenheit": "degF",
     "k": "K",

@@ -73,7 +73,8 @@ def test_import_without_any_signal_that_replay_needs_returns_1(
     path = tmp_path / "little.csv"
     path.write_text("t,latitude,longitude\n0.0,57.7,11.9\n0.1,57.7,11.9\n0.2,57.7,11.9\n")
     assert main(["import", str(path), "--out", str(tmp_path / "little.parquet")]) == 1
-    assert "no ax, ay, yaw_rate, omega_fl, delta_fl: replay needs them" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "no ax, ay, yaw_rate, omega_fl, omega_fr, omega_rl, omega_rr, delta_fl: replay" in said
 
 
 def test_replay_names_every_format_and_refuses_a_folder_without_files(

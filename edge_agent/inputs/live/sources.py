@@ -131,7 +131,9 @@ def _open_can(
     # A name such as can1 contains the number of the bus, an address does not.
     number = re.fullmatch(r"[a-zA-Z]+(\d{1,3})", channel)
     given_bus = options.pop("bus", number[1] if number else "")
-    bus = int(given_bus) if given_bus.isdigit() else None
+    if given_bus and not given_bus.isdecimal():
+        raise InputError("source", f"{source!r}: the bus is not a number", "write it like ?bus=0")
+    bus = int(given_bus) if given_bus else None
     given = {name: _parse_option(value) for name, value in options.items()}
     return CanFeed(
         source,

@@ -34,17 +34,17 @@ Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
 @dataclass
 class Frames:
     """CAN frames of one identifier on one bus: times of arrival [s as logged], and data bytes. Each
-    frame is padded to LONGEST bytes; `shortest` is the least length before padding.
+    frame is padded to LONGEST bytes; `lengths` are the lengths before padding.
     """
 
     times: list[float] = field(default_factory=list)
     data: bytearray = field(default_factory=bytearray)
-    shortest: int = LONGEST
+    lengths: list[int] = field(default_factory=list)
 
     def add(self, time: float, data: bytes | bytearray) -> None:
         """Append one received CAN frame with its time of arrival [s] and its data bytes."""
         self.times.append(time)
-        self.shortest = min(self.shortest, len(data))
+        self.lengths.append(len(data))
         self.data += data[:LONGEST].ljust(LONGEST, b"\0")
 
     def to_columns(self) -> tuple[FloatArray, Bytes]:
@@ -90,16 +90,37 @@ def decode_log(
     ).items():
         times, data = log[key].to_columns()
         how = database[message]
-        names = [
-            s for s in messages[message] if how.signals[s].last_byte < max(log[key].shortest, 1)
-        ]
+        lengths = np.array(log[key].lengths)
+        names = [s for s in messages[message] if how.signals[s].last_byte < lengths.max()]
         t = np.rint((times - first) * MICRO) / MICRO
         order = np.argsort(t, kind="stable")
         for signal, values in how.decode(data, names).items():
+            values[how.signals[signal].last_byte >= lengths] = np.nan  # a frame that was cut
             recording.signals[f"{message}.{signal}"] = Series(
                 t[order], values[order], how.signals[signal].unit
             )
     return recording
+
+
+def require_steady_clock(path: Path, log: Log) -> Log:
+    """Return the frames of a CAN log if the clock of its recorder was not set back.
+
+    Frames in the order of their times then alternate between the parts of the log before and after
+    this moment. Parts in a wrong order that do not overlap in time are no problem.
+
+    Raises:
+        InputError: the clock was set back, so that the true order of the frames is unknown.
+    """
+    for frames in log.values():
+        order = np.argsort(frames.times, kind="stable")
+        back = np.flatnonzero(np.diff(frames.times) < 0.0)
+        if np.sum(np.diff(order) < 0) > len(back):
+            raise InputError(
+                "source",
+                f"{path}: its clock was set back at {frames.times[back[0]]:.3f} s",
+                "cut the log there",
+            )
+    return log
 
 
 def no_database(path: Path) -> InputError:
@@ -129,7 +150,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
                 log[bus_of(message.channel), message.arbitration_id, message.is_extended_id].add(
                     time, message.data
                 )
-    return log, float(first) if np.isfinite(first) else 0.0
+    return require_steady_clock(path, log), float(first) if np.isfinite(first) else 0.0
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 a number, a name or None

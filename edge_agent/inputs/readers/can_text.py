@@ -10,7 +10,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Final
 
-from edge_agent.inputs.readers.can_log import Frames, Log
+from edge_agent.inputs.readers.can_log import Frames, Log, require_steady_clock
 from schemas.errors import InputError
 
 MICRO: Final = 1e-6
@@ -72,7 +72,7 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
             first = time if first is None else first
             if identifier in wanted:
                 log[bus, identifier, extended].add(time, data)
-    return log, first or 0.0
+    return require_steady_clock(path, log), first or 0.0
 
 
 def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
@@ -101,4 +101,4 @@ def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
             f"{path} holds no frame that can be read",
             "save the trace as PCAN 1.1 or later",
         )
-    return log, first
+    return require_steady_clock(path, log), first

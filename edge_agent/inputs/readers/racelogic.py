@@ -10,7 +10,7 @@ Both have these units:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -36,15 +36,16 @@ def is_vbo(path: Path) -> bool:
     return "[column names]" in head and ("[header]" in head or head.startswith("file created on"))
 
 
-def has_vbo_columns(names: Sequence[str]) -> bool:
-    """Return True if a table has the columns of a VBO file."""
-    lower = {name.strip().lower() for name in names}
-    return {"sats", "time", "lat", "long"} <= lower or {
-        "satellites",
-        "time",
-        "latitude",
-        "longitude",
-    } <= lower
+def has_vbo_columns(columns: Mapping[str, FloatArray]) -> bool:
+    """Return True if a table has the columns of a VBO file, (T,) each. Columns with these names
+    whose positions are in degrees are those of another logger.
+    """
+    lower = {name.lower(): values for name, values in columns.items()}
+    for names in (("sats", "lat", "long"), ("satellites", "latitude", "longitude")):
+        if {"time", *names} <= lower.keys():
+            north, west = (np.abs(np.nan_to_num(lower[name])).max() for name in names[1:])
+            return bool(north == 0.0 or north > 90.0 or west > 180.0)
+    return False
 
 
 def read_vbo(path: Path) -> Recording:

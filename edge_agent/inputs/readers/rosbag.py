@@ -32,7 +32,7 @@ def is_bag(path: Path) -> bool:
     """Return True if the path is a bag: by its suffix, or because it is a folder with a bag's
     metadata.
     """
-    return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
 @contextmanager

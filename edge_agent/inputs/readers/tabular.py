@@ -7,11 +7,12 @@ column may contain its unit: `speed [km/h]`.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -73,17 +74,20 @@ def read_table(path: Path, time: str | None = None, time_unit: str | None = None
 
 
 def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | None) -> Recording:
-    table = pq.ParquetFile(path).read() if kind == "Parquet" else _read_csv(path)
+    table, notes = (pq.ParquetFile(path).read(), []) if kind == "Parquet" else _read_csv(path)
     if not table.num_rows:
         raise InputError(
             "source", f"{path} has no rows", "give a recording with at least one sample"
         )
-    if has_vbo_columns(table.column_names):
-        found = {name: _parse_numbers(table[name]) for name in table.column_names}
-        return convert_vbo(
-            path, {name: values for name, values in found.items() if values is not None}, {}
-        )
     table = table.rename_columns(_make_distinct(table.column_names))
+    numbers = {
+        name: values
+        for name in table.column_names
+        if (values := _parse_numbers(table[name])) is not None
+    }
+    stripped = {name.strip(): values for name, values in numbers.items()}
+    if has_vbo_columns(stripped):
+        return convert_vbo(path, stripped, {})
     named = _plain_names(table.column_names)
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
@@ -97,24 +101,54 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
             f"is missing or goes back at row {int(back[0]) + 1}",
             "sort the recording by time",
         )
-    recording = Recording(path.name, {}, start_ns, rows=True)
+    recording = Recording(path.name, {}, start_ns, rows=True, notes=notes)
+    left = []
     for name, whole in named.items():
-        if name != column and (values := _parse_numbers(table[whole])) is not None:
+        if name == column:
+            continue
+        if whole in numbers:
             unit = _UNIT.match(whole)
-            recording.signals[name] = Series(t, values, unit["unit"] if unit else "")
+            recording.signals[name] = Series(t, numbers[whole], unit["unit"] if unit else "")
+        elif not pa.types.is_null(table[whole].type):
+            left.append(name)
+    if left:
+        notes.append(f"{path.name}: left out, not only numbers: {', '.join(left[:MOST_NAMES])}")
     return recording
 
 
-def _read_csv(path: Path) -> pa.Table:
+def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
+    """Return the table in a CSV file, and notes on rows that were left out.
+
+    Raises:
+        InputError: most rows have another number of columns than the first line.
+    """
     with path.open("rb") as file:
-        lines = [
-            file.readline(65_536).decode("utf-8", errors="replace") for _ in range(LONGEST_PREAMBLE)
-        ]
+        head = b"".join(file.readline(65_536) for _ in range(LONGEST_PREAMBLE))
+    encoding = _guess_encoding(head)
+    lines = head.decode(encoding, errors="replace").splitlines() or [""]
     if RACECHRONO in lines[0].lower():
-        return _read_racechrono(path, lines)
+        return _read_racechrono(path, lines), []
     mark = max(",;\t", key=lines[0].count)
-    table = pc_csv.read_csv(path, parse_options=pc_csv.ParseOptions(delimiter=mark))
-    if mark == ";":  # files separated by semicolons may use decimal commas
+    cut = []
+
+    def skip_row(row: pc_csv.InvalidRow) -> Literal["skip"]:
+        cut.append(row)
+        return "skip"
+
+    table = pc_csv.read_csv(
+        path,
+        read_options=pc_csv.ReadOptions(encoding=encoding),
+        parse_options=pc_csv.ParseOptions(delimiter=mark, invalid_row_handler=skip_row),
+        convert_options=pc_csv.ConvertOptions(strings_can_be_null=True),
+    )
+    if len(cut) > table.num_rows:
+        raise InputError(
+            "source",
+            f"{path}: a row has {cut[0].actual_columns} columns, the first line has "
+            f"{cut[0].expected_columns}",
+            "export it with the column names in the first line",
+        )
+    if mark != ",":  # the numbers may have decimal commas
         for index, name in enumerate(table.column_names):
             if pa.types.is_string(table[name].type):
                 text = pc.replace_substring(table[name], ",", ".")
@@ -122,7 +156,21 @@ def _read_csv(path: Path) -> pa.Table:
                     table = table.set_column(index, name, pc.cast(text, pa.float64()))
                 except pa.ArrowInvalid:
                     continue
-    return table
+    notes = [f"{path.name}: {len(cut)} incomplete rows left out"] if cut else []
+    return table, notes
+
+
+def _guess_encoding(head: bytes) -> str:
+    """Return the encoding of a text that begins with `head`: UTF-16 if it begins with the mark of
+    this encoding, UTF-8 if it is valid, else that of Windows for western languages.
+    """
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
 
 
 def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
@@ -279,4 +327,5 @@ def _parse_numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow colu
         or pa.types.is_boolean(column.type)
     ):
         return None
-    return np.array(pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
+    values = pc.cast(column, pa.float64(), safe=False)  # a 64-bit counter loses its last bits
+    return np.array(values.to_numpy(zero_copy_only=False), dtype=np.float64)

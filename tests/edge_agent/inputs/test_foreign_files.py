@@ -213,6 +213,96 @@ def test_columns_with_the_same_name_are_all_kept(tmp_path: Path) -> None:
     assert signals["ax 4"].values[0] == pytest.approx(3.0)
 
 
+def test_decimal_commas_with_empty_cells_are_numbers(tmp_path: Path) -> None:
+    text = "t;ax;latitude\n0,00;1,5;\n0,01;1,25;48,5\n"
+    for mark in (";", "\t"):
+        path = write(tmp_path / "a.csv", text.replace(";", mark))
+        recording = read_source(path, None, None)
+        assert np.allclose(recording.signals["ax"].values, [1.5, 1.25])
+        assert np.allclose(recording.signals["latitude"].values, [np.nan, 48.5], equal_nan=True)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_table_in_another_encoding_is_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes("t,yaw_rate [°/s]\n0.0,1.0\n0.1,2.0\n".encode(encoding))
+    assert read_source(path, None, None).signals["yaw_rate"].unit == "°/s"
+
+
+def test_table_that_ends_within_a_row_is_read_and_noted(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "t,ax,ay\n0.0,1.0,0.0\n0.1,1.0,0.0\n0.2,1.")
+    recording = read_source(path, None, None)
+    assert np.allclose(recording.signals["ax"].t, [0.0, 0.1])
+    assert recording.notes == ["a.csv: 1 incomplete rows left out"]
+
+
+def test_table_with_a_preamble_is_refused_with_its_columns(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "Car 7\nt,ax,ay\n0.0,1.0,0.0\n0.1,1.0,0.0\n")
+    with pytest.raises(InputError, match="a row has 3 columns, the first line has 1"):
+        read_source(path, None, None)
+
+
+def test_column_that_is_not_only_numbers_is_noted(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "t,ax,ay\n0.0,1.0,-\n0.1,1.0,0.5\n")
+    recording = read_source(path, None, None)
+    assert recording.signals.keys() == {"ax"}
+    assert recording.notes == ["a.csv: left out, not only numbers: ay"]
+
+
+@pytest.mark.parametrize("time", ["0.0", "2026-11-29T10:00:00.0Z"])
+def test_positions_in_degrees_are_not_taken_for_racelogic(tmp_path: Path, time: str) -> None:
+    text = f"time,latitude,longitude,satellites\n{time},48.0,11.0,8\n"
+    recording = read_source(write(tmp_path / "a.csv", text), None, None)
+    assert recording.signals["longitude"].values[0] == 11.0
+
+
+def test_a_cut_frame_does_not_remove_its_signal(tmp_path: Path) -> None:
+    text = "(1.00) can0 0AA#1027\n(1.01) can0 0AA#1127\n(1.02) can0 0AA#11\n"
+    recording = read_source(write(tmp_path / "a.log", text), None, DATABASE)
+    values = recording.signals["Wheels.Speed"].values
+    assert np.allclose(values, [100.0, 100.01, np.nan], equal_nan=True)
+
+
+def test_a_clock_that_was_set_back_is_refused(tmp_path: Path) -> None:
+    times = [1.0, 1.01, 1.02, 1.03, 1.005, 1.015, 1.025]
+    lines = [f"({time:.3f}) can0 0AA#1027" for time in times]
+    with pytest.raises(InputError, match="set back at 1.030 s; cut the log there"):
+        read_source(write(tmp_path / "a.log", "\n".join(lines)), None, DATABASE)
+    parts = [*lines[4:], *(line.replace("(1.", "(0.") for line in lines[:4])]
+    assert len(read_source(write(tmp_path / "b.log", "\n".join(parts)), None, DATABASE).signals)
+
+
+def test_a_unit_that_is_not_known_is_noted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "t,ax [mg],air_temperature [F]\n0.0,100,23\n0.1,100,23\n"
+    out = tmp_path / "o.parquet"
+    main(["import", str(write(tmp_path / "a.csv", text)), "--out", str(out)])
+    assert "note: ax: its unit 'mg' is unknown; taken as m/s^2" in capsys.readouterr().out
+    assert pq.read_table(out)["air_temperature"][0].as_py() == pytest.approx(-5.0)
+
+
+def test_import_names_each_missing_wheel(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "t,ax,ay,yaw_rate,delta_fr,omega_fl\n0.0,1,1,1,1,1\n0.1,1,1,1,1,1\n"
+    source = write(tmp_path / "a.csv", text)
+    assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 0
+    assert "note: no omega_fr, omega_rl, omega_rr: replay" in capsys.readouterr().out
+
+
+def test_a_clock_that_jumps_by_years_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dbc = 'BO_ 170 I: 2 X\n SG_ ax : 0|16@1+ (0.01,0) [0|0] "m/s^2" X\n'
+    write(tmp_path / "a.dbc", dbc)
+    times = [0.0, 0.01, *(1.7e9 + 0.01 * k for k in range(20))]
+    log = write(tmp_path / "a.log", "\n".join(f"({time:.2f}) can0 0AA#1027" for time in times))
+    more = ["--dbc", str(tmp_path / "a.dbc"), "--out", str(tmp_path / "o.parquet")]
+    assert main(["import", str(log), *more]) == 2
+    assert "cut it into shorter recordings" in capsys.readouterr().err
+
+
 def test_a_suffix_in_capitals_is_parquet(tmp_path: Path) -> None:
     pq.write_table(pa.table({"t": [0.0, 0.01], "ax": [1.0, 2.0]}), tmp_path / "a.PARQUET")
     assert read_source(tmp_path / "a.PARQUET", None, None).signals["ax"].values[1] == 2.0

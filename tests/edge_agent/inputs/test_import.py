@@ -329,9 +329,9 @@ def test_a_profile_is_checked(tmp_path: Path, change: dict[str, Any], named: str
 
 
 def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
-    t = np.arange(4) / 10.0
+    t = np.arange(5) / 10.0
     pq.write_table(
-        pa.table({"t": t, "r": [1.0, 1.0, 1.0, 1.0], "s": [0, 1, 0, 1], "ok": [0, 0, 1, 1]}),
+        pa.table({"t": t, "r": [1.0] * 5, "s": [0, 1, 0, 1, None], "ok": [0, 0, 1, 1, 0]}),
         tmp_path / "a.parquet",
     )
     channel = {
@@ -350,7 +350,7 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
     )
     two = np.radians(2.0)
     assert np.allclose(
-        column(table, "yaw_rate"), [two + 0.5, 0.5 - two, np.nan, np.nan], equal_nan=True
+        column(table, "yaw_rate"), [two + 0.5, 0.5 - two, np.nan, np.nan, np.nan], equal_nan=True
     )
 
 

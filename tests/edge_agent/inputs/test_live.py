@@ -192,6 +192,7 @@ def test_databroker_is_queried_and_old_values_are_no_readings(
         ("ros2:?domain=x", "vss", "domain"),
         ("ros2:", "vss", "topic"),
         ("can:virtual/a?bus", "toyota", "options"),
+        ("can:virtual/a?bus=x", "toyota", "bus is not a number"),
         ("vss:?token=/nowhere", None, "token|nowhere"),
         ("can:virtual/a", "no such profile", "profile"),
         ("ros2:?messages=/nowhere", "vss", "topic"),
