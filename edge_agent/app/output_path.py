@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryFile
 
 from schemas.errors import InputError
 
 
-def prepare_path(field: str, path: Path) -> Path:
+def prepare_path(field: str, path: Path, kept: Iterable[Path] = ()) -> Path:
     """Create the folder that will contain the file `path`, if it does not exist; return the path.
+    `kept` are files that must not be overwritten.
 
     Raises:
-        InputError: the path is a folder, or its folder cannot be written.
+        InputError: the path is a folder or one of `kept`, or its folder cannot be written.
     """
+    if path.resolve() in {one.resolve() for one in kept}:
+        raise InputError(field, f"{path} is another file of this command", "name another file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Only a trial shows whether a file can be created: in /proc the permissions allow it.

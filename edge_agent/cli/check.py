@@ -77,13 +77,15 @@ def run(args: argparse.Namespace) -> int:
             )
         )
     if args.out is not None:
-        prepare_path("out", args.out).write_text(
+        prepare_path("out", args.out, (args.log, file)).write_text(
             report_page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
         )
     mended = list_corrections(diagnosis)
     if args.fix is not None and mended:
         profile, corrected, left = apply_findings(mended, profile_of(args.log), vehicle)
-        prepare_path("fix", args.fix).write_text(profile.to_json(), encoding="utf-8")
+        prepare_path("fix", args.fix, (args.log, file)).write_text(
+            profile.to_json(), encoding="utf-8"
+        )
         if corrected != vehicle:
             prepare_path("vehicle", file).write_text(
                 corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
@@ -94,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
                 "in another way"
             )
         _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
+    elif args.fix is not None:
+        _print_stderr(f"{args.fix}: not written: there is nothing to correct")
     return 0 if diagnosis.is_passed else NOT_PASSED
 
 

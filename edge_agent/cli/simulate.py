@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     )
     write_table("out", args.out, log)
     if args.vehicle_out is not None:
-        prepare_path("vehicle-out", args.vehicle_out).write_text(
+        prepare_path("vehicle-out", args.vehicle_out, [args.out]).write_text(
             vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
         )
     print(f"{args.out}: {log.num_rows} samples of {args.manoeuvre}")

@@ -130,3 +130,10 @@ def test_records_lost_by_a_full_outbox_are_reported(
     counts = json.loads(seen.out.splitlines()[-1])
     assert counts["unsettled"] == 0
     assert f"{counts['dropped']} records are lost, because" in seen.err
+
+
+def test_simulate_does_not_write_the_vehicle_over_its_log(tmp_path: Path, capsys: Output) -> None:
+    path = tmp_path / "drive.parquet"
+    assert main([*DRIVE, "--out", str(path), "--vehicle-out", str(path)]) == 2
+    assert "vehicle-out: " in capsys.readouterr().err
+    assert pq.read_table(path).num_rows

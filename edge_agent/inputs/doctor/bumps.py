@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import wheel_median
+from edge_agent.inputs.doctor.drive import JOINED_S, wheel_median
 from edge_agent.inputs.doctor.lags import correlate_by_spectra
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S
@@ -45,7 +45,9 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
         * vehicle.wheel_radius
     )
     speed = wheel_median(rims)
-    way = np.concatenate([[0.0], np.cumsum(np.maximum(speed[:-1], 0.0) * np.diff(t))])
+    steps = np.diff(t)
+    steps = np.where(steps > JOINED_S, 0.0, steps)  # nothing is known of the way in a gap
+    way = np.concatenate([[0.0], np.cumsum(np.maximum(speed[:-1], 0.0) * steps)])
     way, rows = np.unique(way, return_index=True)
     at = np.arange(0.0, way[-1], STEP_M)
     fast = np.interp(at, way, speed[rows]) > FAST_M_S

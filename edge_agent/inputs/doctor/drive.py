@@ -170,6 +170,8 @@ class EvenTimes:
     def __init__(self, t: FloatArray, longest: float = LONGEST_S) -> None:
         self.t = t
         self.at = np.arange(t[0], min(t[-1], t[0] + longest), 1.0 / RATE_HZ)
+        if len(self.at) < 2:  # a derivative needs two samples; the log has no reading at the second
+            self.at = t[0] + np.arange(2) / RATE_HZ
         self._near = _is_between(t, self.at) if len(t) > 1 else np.zeros(len(self.at), bool)
 
     def interpolate_channel(self, x: FloatArray) -> FloatArray:

@@ -43,6 +43,7 @@ from edge_agent.inputs.doctor.slip import (
     share_of_parts,
     spread_of_parts,
 )
+from edge_agent.inputs.log_columns import GROUND
 from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
@@ -163,8 +164,12 @@ def diagnose(
             continue
         told = verdict.is_settled(quantity) and quantity not in diagnosis.doubts
         (diagnosis.sound if told else diagnosis.unknown).append(channel)
+    received = ground is not None and np.isfinite(ground).any()
+    diagnosis.findings += _find_receiver_scale(
+        GROUND if received else "latitude", verdict, found["ground"]
+    )
     found_wrong = {finding.channel for finding in diagnosis.findings}
-    if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw"}:
+    if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw", GROUND}:
         (diagnosis.sound if found["ground"].is_known else diagnosis.unknown).append("latitude")
     return diagnosis
 
@@ -176,6 +181,10 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     diagnosis as faults.
     """
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    if len(t) > 1 and np.percentile(np.diff(t), 60) == 0.0:
+        words = "most samples repeat a time: does the column lack the fraction of a second?"
+        diagnosis.findings.append(Finding("t", "repeats", words))
+        return t, True
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
         for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0)):
             if 1.0 / FASTEST_HZ <= step * factor <= 1.0 / SLOWEST_HZ:
@@ -276,6 +285,19 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
                 confidence=verdict.margins[quantity],
             )
         )
+
+
+def _find_receiver_scale(channel: str, verdict: Verdict, ground: Fit) -> list[Finding]:
+    """Return a finding if the receiver's speed, from the signal `channel`, differs throughout the
+    drive from that of the wheels by more than slip explains. A fault of the wheel speeds in
+    `verdict` is taken into account. `ground` is the fit of both speeds.
+    """
+    fault = verdict.faults["v"]
+    share = abs(ground.gain) * (1.0 if fault is None else fault.factor)
+    if not ground.is_known or not is_steady(ground) or abs(np.log(share)) < STEADY:
+        return []
+    words = f"the receiver is {share:.3g} times as fast as the wheels: its unit?"
+    return [Finding(channel, "scale", words)]
 
 
 def _holds_throughout(

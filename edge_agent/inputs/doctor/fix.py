@@ -10,6 +10,7 @@ from typing import Final
 from edge_agent.inputs.doctor.clocks import FILTER_BEARS_S, late_devices
 from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
 from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.units import SPEED
 from schemas.signals import per_wheel
 from schemas.vehicle import Vehicle
 
@@ -66,26 +67,30 @@ def apply_findings(
     channels = dict(profile.channels)
     left = list[Finding]()
     update: dict[str, object] = {}
+    # The radius of the vehicle file has no effect on wheel speeds that are recorded at the rim.
+    at_rim = any(channels[name].unit in SPEED for name in per_wheel("omega") if name in channels)
     for finding in findings:
-        if finding.kind in EXCHANGED:
+        names = [
+            name for name in OF_DEVICE.get(finding.channel, (finding.channel,)) if name in channels
+        ]
+        if finding.kind in EXCHANGED and names:
             for one, other in EXCHANGED[finding.kind]:
                 if one in channels and other in channels:
                     channels[one], channels[other] = channels[other], channels[one]
         elif finding.channel == "t" and finding.kind in ("ms", "us", "ns"):
             update["time_unit"] = finding.kind
-        elif (finding.channel, finding.kind) == ("omega", "radius"):
+        elif (finding.channel, finding.kind) == ("omega", "radius") and not at_rim:
             vehicle = vehicle.model_copy(
                 update={"wheel_radius": vehicle.wheel_radius * finding.scale}
             )
-        elif finding.channel == "yaw":
+        elif finding.channel == "yaw" and names:
             channels["yaw"] = _correct_yaw(channels["yaw"], finding.kind)
-        elif finding.scale != 1.0 or finding.offset or finding.delay_s:
-            for name in OF_DEVICE.get(finding.channel, (finding.channel,)):
-                if name in channels:
-                    channels[name] = _correct_channel(channels[name], finding)
+        elif names and (finding.scale != 1.0 or finding.offset or finding.delay_s):
+            for name in names:
+                channels[name] = _correct_channel(channels[name], finding)
         else:
             left.append(finding)
-    if vehicle.wheel_radius != profile.wheel_radius and profile.wheel_radius is not None:
+    if profile.wheel_radius not in (None, vehicle.wheel_radius) and not at_rim:
         update["wheel_radius"] = vehicle.wheel_radius
     return profile.model_copy(update=update | {"channels": channels}), vehicle, left
 

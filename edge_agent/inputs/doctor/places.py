@@ -82,7 +82,7 @@ def has_exchanged_position(t: FloatArray, signals: FloatArray, drive: EvenDrive)
     if np.isfinite(latitude).sum() < 10:
         return False
     if np.nanmax(np.abs(latitude)) > 90.0:
-        return True
+        return bool(np.nanmax(np.abs(longitude)) <= 90.0)
     if np.nanmax(np.abs(longitude)) > 90.0:
         return False
     good = (np.abs(drive.v) > CREEP * drive.fast) & np.isfinite(drive.v_ground) & (drive.v != 0.0)

@@ -15,7 +15,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.cli import main
+from edge_agent.inputs.doctor.diagnosis import Finding
+from edge_agent.inputs.doctor.drive import prepare_drive
 from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.doctor.fix import apply_findings
+from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.lab.simulation import SimulatedFleet, simulate_manoeuvre
 from edge_agent.lab.simulation.friction import ICE, SNOW, WET
 from edge_agent.lab.simulation.scenarios import scenario_named
@@ -80,6 +84,45 @@ def test_a_sound_drive_passes_with_its_tilts_offsets_and_lags(rough: Recorded) -
     assert set(said.sound) == {"ax", "ay", "yaw_rate", "delta", "omega", "latitude"}
 
 
+@pytest.mark.parametrize("unit", [np.pi / 180.0, 60.0])
+def test_positions_in_another_unit_are_a_fault(rough: Recorded, unit: float) -> None:
+    signals = rough.signals.copy()
+    signals[:, S.LATITUDE : S.LONGITUDE + 1] *= unit
+    said = diagnose(rough.t, signals, rough.vehicle)
+    assert [(one.channel, one.kind) for one in said.findings] == [("latitude", "scale")]
+
+
+def test_speed_over_ground_in_another_unit_is_a_fault(rough: Recorded) -> None:
+    even = prepare_drive(*rough)
+    ground = 3.6 * np.interp(rough.t, even.t, np.nan_to_num(even.v))
+    said = diagnose(*rough, ground)
+    assert [(one.channel, one.kind) for one in said.findings] == [("gnss_speed", "scale")]
+
+
+def test_time_stamps_in_whole_seconds_are_a_fault(rough: Recorded) -> None:
+    said = diagnose(np.floor(rough.t), rough.signals, rough.vehicle)
+    assert [(one.channel, one.kind) for one in said.findings] == [("t", "repeats")]
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_a_log_of_a_few_rows_tells_nothing(rough: Recorded, rows: int) -> None:
+    said = diagnose(rough.t[:rows], rough.signals[:rows], rough.vehicle)
+    assert not said.findings
+    assert not said.sound
+
+
+@pytest.mark.parametrize("row", [2, 7000])
+def test_a_gap_of_decades_does_not_fill_the_memory(rough: Recorded, row: int) -> None:
+    t = np.where(np.arange(len(rough.t)) < row, rough.t, rough.t + 1.7e9)
+    assert not diagnose(t, rough.signals, rough.vehicle).findings
+
+
+def test_a_fault_of_a_channel_without_rule_is_not_corrected(rough: Recorded) -> None:
+    profile = Profile(name="own", channels={"ax": Channel(signal="ax")})
+    faults = [Finding("yaw", "sign", ""), Finding("t", "minutes", "", 60.0)]
+    assert apply_findings(faults, profile, rough.vehicle) == (profile, rough.vehicle, faults)
+
+
 def test_a_standing_car_tells_nothing_and_does_not_pass(rough: Recorded) -> None:
     still = rough.signals[:3000].copy()
     still[:, : S.LATITUDE] = 0.0
@@ -108,6 +151,26 @@ def test_a_fix_makes_the_drive_pass(
         main(["import", log[0], "--profile", str(profile), "--vehicle", log[2], "--out", good]) == 0
     )
     assert main(["check", good, *log[1:]]) == 0
+
+
+def test_a_scale_of_speeds_at_the_rim_is_corrected_in_the_profile(rough: Recorded) -> None:
+    rule = Channel(signal="speed", unit="km/h")
+    profile = Profile(name="own", wheel_radius=0.3, channels={"omega_fl": rule})
+    faults = [Finding("omega", "radius", "", scale=0.8)]
+    fixed, vehicle, left = apply_findings(faults, profile, rough.vehicle)
+    assert fixed.channels["omega_fl"].scale == 0.8
+    assert (fixed.wheel_radius, vehicle, left) == (0.3, rough.vehicle, [])
+
+
+@pytest.mark.parametrize("option", ["--out", "--fix"])
+def test_check_does_not_overwrite_its_log(
+    rough: Recorded, tmp_path: Path, capsys: Output, option: str
+) -> None:
+    log = write(tmp_path / "bad.parquet", PLANTED["a_y flipped"].spoil(rough))
+    before = Path(log[0]).read_bytes()
+    assert main(["check", *log, option, log[0]]) == 2
+    assert "is another file of this command" in capsys.readouterr().err
+    assert Path(log[0]).read_bytes() == before
 
 
 def test_what_the_doctor_found_is_json_for_a_program(
