@@ -187,10 +187,8 @@ def _posterior_of(
     """
     sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
-    around = (
-        ROBUST * float(np.median(np.abs(values - centre))) if len(values) > 2 else 2.0 * FLOOR[kind]
-    )
-    spread = max(around, FLOOR[kind])
+    around = ROBUST * float(np.median(np.abs(values - centre)))
+    spread = max(around, FLOOR[kind] * (1.0 if len(values) > 2 else 2.0))
     std = float(np.hypot(spread / np.sqrt(len(values)), bias))
     share = USUAL[kind] ** 2 / (USUAL[kind] ** 2 + std**2)
     if unknown:

@@ -47,8 +47,11 @@ def run(args: argparse.Namespace) -> int:
     from schemas.vehicle import load_vehicle
 
     vehicle = load_vehicle(args.vehicle).model_copy(update={"calibration": None})
+    out = prepare_path("out", args.out, args.log)
     drives = []
     for path in args.log:
+        if args.log.count(path) > 1:
+            raise InputError("log", f"{path} is given twice", "give each drive once")
         log = read_log(path)
         signals = scale_axles(log.signals, vehicle)
         faults = [] if args.trust else diagnose(log.t, signals, vehicle, log.ground).findings
@@ -63,9 +66,9 @@ def run(args: argparse.Namespace) -> int:
     text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
         indent=1, exclude_none=True
     )
-    prepare_path("out", args.out).write_text(text + "\n", encoding="utf-8")
+    out.write_text(text + "\n", encoding="utf-8")
     print("\n".join(report_lines(found)))
-    print(f"{args.out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
+    print(f"{out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
     return 0
 
 

@@ -209,6 +209,17 @@ def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> N
     assert np.array_equal(np.concatenate(parted), whole, equal_nan=True)
 
 
+def test_two_drives_that_disagree_are_less_sure(smooth: Recorded) -> None:
+    alike = weigh_estimates([{"yaw_rate": 0.01}, {"yaw_rate": 0.01}], smooth.vehicle)
+    apart = weigh_estimates([{"yaw_rate": 0.0}, {"yaw_rate": 0.02}], smooth.vehicle)
+    assert alike is not None
+    assert apart is not None
+    assert apart.yaw_rate is not None
+    assert alike.yaw_rate is not None
+    assert apart.yaw_rate[1] > 1.5 * alike.yaw_rate[1]
+    assert apart.yaw_rate[0] < 0.5 * alike.yaw_rate[0], "drawn to the usual value"
+
+
 def test_of_two_calibrations_the_surer_value_holds() -> None:
     one = Calibration(drives=3, ax=(0.3, 0.05), ay=(0.1, 0.2))
     other = Calibration(drives=9, ax=(0.2, 0.1), yaw_rate=(0.01, 0.001))
@@ -239,10 +250,15 @@ def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output
 ) -> None:
     log = write(tmp_path / "a.parquet", spoil_drive(smooth))
+    copy = write(tmp_path / "copy.parquet", spoil_drive(smooth))
     car = tmp_path / "car.json"
     better = tmp_path / "better.json"
     car.write_text(smooth.vehicle.model_dump_json(exclude_none=True))
-    assert main(["calibrate", log, log, "--vehicle", str(car), "--out", str(better)]) == 0
+    assert main(["calibrate", log, log, "--vehicle", str(car), "--out", str(better)]) == 2
+    assert "is given twice" in capsys.readouterr().err
+    assert main(["calibrate", log, copy, "--vehicle", str(car), "--out", log]) == 2
+    assert "out: " in capsys.readouterr().err
+    assert main(["calibrate", log, copy, "--vehicle", str(car), "--out", str(better)]) == 0
     assert "steer_offset" in capsys.readouterr().out
     learned = load_vehicle(better)
     assert learned.calibration is not None
