@@ -106,6 +106,12 @@ def run(args: argparse.Namespace) -> int:
                 "write a profile that names them",
             )
         target = prepare_path("draft", args.draft or out.with_suffix(".profile.json"))
+        if target.exists() and target.read_bytes() != profile.to_json().encode():
+            raise InputError(
+                "draft",
+                f"{target} exists and may have been edited",
+                "use it with --profile, or name another file with --draft",
+            )
         target.write_text(profile.to_json(), encoding="utf-8")
         print(
             f"{target}: drafted from names, {len(profile.channels)} channels; check it before use"

@@ -272,6 +272,20 @@ def test_a_clock_that_was_set_back_is_refused(tmp_path: Path) -> None:
     assert len(read_source(write(tmp_path / "b.log", "\n".join(parts)), None, DATABASE).signals)
 
 
+def test_import_keeps_a_draft_that_was_edited(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "t,ax,ay\n0.0,1.0,0.0\n0.1,1.0,0.0\n"
+    command = ["import", str(write(tmp_path / "a.csv", text)), "--out", str(tmp_path / "o.parquet")]
+    assert [main(command), main(command)] == [0, 0]
+    draft = tmp_path / "o.profile.json"
+    edited = draft.read_text().replace('"signal": "ax"', '"signal": "ax", "unit": "g"')
+    draft.write_text(edited)
+    assert main(command) == 2
+    assert "use it with --profile" in capsys.readouterr().err
+    assert draft.read_text() == edited
+
+
 def test_a_unit_that_is_not_known_is_noted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
