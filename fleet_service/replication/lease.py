@@ -20,7 +20,9 @@ is alive. The clocks of different machines are never compared.
 
 A service may take over at once if the lease was released, and otherwise when it has seen the same
 turn for `lease_s`. If the holder had a token and the token has disappeared, HINT · `lease_s`
-suffices. HINT is a constant between 0.5 and 1.
+suffices. HINT is a constant between 0.5 and 1. A service may also take over at once from an earlier
+start of its own folder. A take-over from another folder uses a new identity, which the folder
+stores only when it has joined. So an interrupted take-over counts as one by another folder.
 
 **No acknowledged data are lost.** Let A be the holder, and let B create the next number at time T.
 
@@ -69,25 +71,19 @@ from __future__ import annotations
 import json
 import logging
 import secrets
-import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from fleet_service.archive.format import layout
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Term
 from schemas.errors import InputError
-from schemas.runtime.durable import open_durably
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
-# File in the archive with the identity of this folder. It stays the same over restarts.
-HOLDER: Final = "holder.json"
 TURNS: Final = 6  # number of renewals per lease time
 # Share of `lease_s` after which a holder without a token may be replaced. It is more than one half,
 # because a holder acknowledges for `lease_s / 2` after its last renewal.
@@ -163,8 +159,8 @@ class Lease:
     `start_renewal`, and finally `release`.
 
     Args:
-        holder: identity of this folder, see `holder_of`. This process has locked the folder, so no
-            other process uses this identity.
+        holder: identity of this folder, see `folder_identity`. This process has locked the folder,
+            so no other process uses this identity.
         bucket: bucket of the copy; it must not repeat requests.
         service: name of the service.
         lease_s: time [s] after which a lease that is not renewed may be taken over.
@@ -197,6 +193,13 @@ class Lease:
         which is a number in the names of this owner's files.
         """
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
+
+    @property
+    def holder(self) -> str:
+        """Return the identity in this service's lease object. After a take-over from another folder
+        it is a new one, and this folder must store it with `save_holder` when it has joined.
+        """
+        return self._holder if self._mine is None else self._mine.holder
 
     @property
     def former_holders(self) -> tuple[str, ...]:
@@ -258,38 +261,16 @@ class Lease:
                 `lease_s`.
             CopyError: the bucket cannot be reached, and this service is no standby.
         """
-        seen: LeaseRecord | None = None
-        since = time.monotonic()
+        watch = _HolderWatch(self._lease_s)
         ahead = 0.0
         logged = ""
-        stood = False
         while not stop.is_set():
             line = ""
             if standby is not None:
                 standby.alive()
             try:
-                found = self._read_newest()
-                if found is not None and found != seen:
-                    if standby is None and seen is not None and found.number == seen.number:
-                        problem = (
-                            f"is served by {found.service} on another machine or in another folder"
-                        )
-                        raise InputError(
-                            "archive.copy", problem, "stop it, or start with --standby"
-                        )
-                    stood = stood and seen is not None and found.number == seen.number
-                    seen = found
-                    since = time.monotonic()
-                stands = standby is not None and found is not None and standby.stands(found.service)
-                stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
-                stood = stood or stands
-                free = found is None or (
-                    found.to in ("", self.service)
-                    and (found.released or self._was_held_here(found))
-                )
-                if not free and found is not None:
-                    _check_settings(found, self._lease_s)
-                if free or time.monotonic() - since >= stale_s:
+                found = _read_newest_record(self._bucket)
+                if self._can_take(found, watch, standby):
                     if (standby is None or standby.may()) and self._create_next(found, epoch, stop):
                         return True
                 elif standby is not None and found is not None:
@@ -365,55 +346,93 @@ class Lease:
             if self.lost:
                 return
 
-    def _was_held_here(self, found: LeaseRecord) -> bool:
-        """Return True if this folder's service had the lease (ownership of the archive) with the
-        record `found` before its last restart.
-        """
-        return found.holder == self._holder
+    def _can_take(
+        self, found: LeaseRecord | None, watch: _HolderWatch, standby: Standby | None
+    ) -> bool:
+        """Return True if this service may take over the lease (ownership of the archive), whose
+        newest record is `found`.
 
-    def _read_newest(self) -> LeaseRecord | None:
-        names = [name for name in self._bucket.list_names(FOLDER) if name.endswith(".json")]
-        content = self._bucket.get(max(names)) if names else None
-        if content is None:
-            return None
-        found = _parse_record(max(names), content)
-        if found is not None:
-            return found
-        former = sorted(names)[-2] if len(names) > 1 else ""
-        previous = self._bucket.get(former) if former else None
-        last = None if previous is None else _parse_record(former, previous)
-        return _unknown_holder(max(names), content, last)
+        Raises:
+            InputError: a live service has the lease, and this service is no standby or has another
+                `lease_s`.
+        """
+        if found is None:
+            return True
+        if standby is None and watch.has_renewed(found):
+            problem = f"is served by {found.service} on another machine or in another folder"
+            raise InputError("archive.copy", problem, "stop it, or start with --standby")
+        watch.update(found, has_token=standby is not None and standby.stands(found.service))
+        was_held_here = found.holder == self._holder
+        if found.to in ("", self.service) and (found.released or was_held_here):
+            return True
+        _check_settings(found, self._lease_s)
+        return watch.is_stale
 
     def _create_next(
         self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event
     ) -> bool:
         """Create the lease object with the next number in the bucket; in this way, this service
-        takes over the archive. Return False if another service was faster.
+        takes over the archive. Return False if another service was faster, or if `stop` is set.
         """
-        number = 1 if found is None else found.number + 1
-        epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
-        before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
+        succeeds = found is not None and found.holder != self._holder
         mine = LeaseRecord(
-            number=number,
-            holder=self._holder,
+            number=1 if found is None else found.number + 1,
+            holder=secrets.token_hex(8) if succeeds else self._holder,
             service=self.service,
-            epoch=epoch,
+            epoch=max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1),
             turn=0,
             released=False,
-            before=before,
+            before=() if found is None else tuple(dict.fromkeys((*found.before, found.service))),
             lease_s=self._lease_s,
         )
         began = elapsed_seconds()
         if not self._bucket.create(mine.name, mine.content):
             return False
+        is_renewed = found is not None and self._bucket.get(found.name) != found.content
+        # A holder that renewed its lease meanwhile may acknowledge for half of `lease_s`.
+        if is_renewed and stop.wait(self._lease_s):
+            return False
+        # Only now may `release` let another service take over at once.
         self._mine = mine
         self._renewed = began
-        self.succeeds = found is not None and found.holder != self._holder
-        if found is not None and self._bucket.get(found.name) != found.content:
-            # The previous holder renewed the lease meanwhile, so it may acknowledge for half of
-            # `lease_s`.
-            stop.wait(self._lease_s)
+        self.succeeds = succeeds
         return True
+
+
+class _HolderWatch:
+    """Observation of the holder of a lease (ownership of the archive) by a waiting service."""
+
+    def __init__(self, lease_s: float) -> None:
+        self._lease_s = lease_s
+        self._seen: LeaseRecord | None = None
+        self._since = time.monotonic()
+        self._had_token = False
+        self._has_token = False
+
+    def has_renewed(self, found: LeaseRecord) -> bool:
+        """Return True if the lease record has changed since the last `update`, and the lease number
+        has not.
+        """
+        seen = self._seen
+        return seen is not None and found != seen and found.number == seen.number
+
+    def update(self, found: LeaseRecord, *, has_token: bool) -> None:
+        """Record the newest lease record, and whether its holder has a liveliness token."""
+        if found != self._seen:
+            self._had_token = self._had_token and self.has_renewed(found)
+            self._seen = found
+            self._since = time.monotonic()
+        self._has_token = has_token
+        self._had_token = self._had_token or has_token
+
+    @property
+    def is_stale(self) -> bool:
+        """Return True if the holder has not renewed its lease for so long that another service may
+        take over.
+        """
+        has_lost_token = self._had_token and not self._has_token
+        stale_s = self._lease_s * (HINT if has_lost_token else 1.0)
+        return time.monotonic() - self._since >= stale_s
 
 
 def elapsed_seconds() -> float:
@@ -421,39 +440,6 @@ def elapsed_seconds() -> float:
     was suspended.
     """
     return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
-
-
-def holder_of(root: Path, url: str) -> tuple[str, bool]:
-    """Return the identity of a folder, and True if the folder was used with this bucket before. A
-    copied or moved folder gets a new identity.
-
-    Raises:
-        OSError: the folder cannot be read or written.
-    """
-    path = root / HOLDER
-    place = {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino}
-    identity: dict[str, Any] = {}
-    if path.exists():
-        with suppress(ValueError):
-            identity = json.loads(path.read_bytes())
-    if not place.items() <= identity.items() or "holder" not in identity:
-        known = identity.get("copy") == url
-        identity = {**place, "holder": secrets.token_hex(8)}
-        with open_durably(path) as file:
-            file.write(json.dumps(identity).encode())
-        return str(identity["holder"]), known
-    return str(identity["holder"]), True
-
-
-def forget_holder(root: Path) -> None:
-    """Remove the identity of a folder that is used without a lease (ownership in a bucket). Such a
-    folder contains data that no bucket has, so it must not be synchronised with a bucket.
-
-    Raises:
-        OSError: the identity cannot be removed.
-    """
-    (root / HOLDER).unlink(missing_ok=True)
-    (root / layout.EPOCH_FILE).unlink(missing_ok=True)
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
@@ -467,6 +453,25 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
         raise InputError(
             "archive.lease_s", problem, "give all services of an archive the same value"
         )
+
+
+def _read_newest_record(bucket: ObjectBucket) -> LeaseRecord | None:
+    """Return the record of the newest lease (ownership of the archive) in the bucket; None if there
+    is none.
+
+    Raises:
+        CopyError: the bucket does not answer.
+    """
+    names = sorted(name for name in bucket.list_names(FOLDER) if name.endswith(".json"))
+    content = bucket.get(names[-1]) if names else None
+    if content is None:
+        return None
+    found = _parse_record(names[-1], content)
+    if found is not None:
+        return found
+    previous = bucket.get(names[-2]) if len(names) > 1 else None
+    last = None if previous is None else _parse_record(names[-2], previous)
+    return _unknown_holder(names[-1], content, last)
 
 
 def _parse_record(name: str, content: bytes) -> LeaseRecord | None:

@@ -16,7 +16,8 @@ from fleet_service.archive.format import layout
 from fleet_service.archive.format.files import lock_archive
 from fleet_service.archive.maintenance import compaction
 from fleet_service.replication.bucket import CopyError, ObjectBucket
-from fleet_service.replication.lease import Lease, Standby, forget_holder, holder_of
+from fleet_service.replication.folder_identity import forget_holder, holder_of, save_holder
+from fleet_service.replication.lease import Lease, Standby
 from fleet_service.replication.replica import BucketReplica, open_replica
 from fleet_service.replication.replica_files import FOLDERS
 from schemas.config import ServiceConfig
@@ -195,6 +196,7 @@ def _acquire_under_lease(
                 )
             copy.bucket.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
             if _sync_folder(config, root, copy, lease, stop, say):
+                save_holder(root, url, lease.holder)
                 layout.write_epoch(root, lease.term.epoch)
                 return Ownership(lock_file, copy, lease)
             lease.release()

@@ -284,6 +284,7 @@ class ServiceHistory:
         self._bucket = VirtualBucket(self._world, self._random)
         self._processes: dict[str, _Process] = {}
         self._acknowledged: set[int] = set()
+        self._holders = {name: name for name in NAMES}
         self._fences: dict[int, frozenset[str]] = {}
         self.events: list[Event] = []
         self.refused = 0
@@ -347,7 +348,8 @@ class ServiceHistory:
     def _serve_once(self, process: _Process) -> None:
         """Wait for the lease (ownership of the archive), and serve until it is lost or released."""
         name = process.name
-        lease = Lease(name, cast(ObjectBucket, self._bucket), name, process.lease_s)
+        holder = self._holders[name]
+        lease = Lease(holder, cast(ObjectBucket, self._bucket), name, process.lease_s)
         stop = VirtualStop(self._world)
         standby = Standby(lambda: True, self._has_token, lambda: None, lambda: None)
         try:
@@ -381,6 +383,7 @@ class ServiceHistory:
         names = self._find_counted(self._bucket.list_names("batches"))
         lease.assert_not_superseded()
         self._fences[number] = frozenset(names)
+        self._holders[lease.service] = lease.holder
         batches = _batches_of(names)
         self.events.append(Event("serves", number, batches))
         return set(batches)

@@ -21,7 +21,8 @@ from fleet_service.archive.maintenance import compaction
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.replication.bucket import CopyError, ObjectBucket
-from fleet_service.replication.lease import Lease, holder_of
+from fleet_service.replication.folder_identity import holder_of
+from fleet_service.replication.lease import Lease
 from fleet_service.replication.ownership import Ownership, acquire_archive, open_exclusive
 from fleet_service.replication.replica import BucketReplica
 from schemas.config import ServiceConfig, ZenohSettings
@@ -255,6 +256,35 @@ def test_folder_served_without_its_bucket_is_not_synchronised(
     with pytest.raises(InputError, match="is not the archive of"):
         Machine(one.root, bucket)
     assert len(rows_in(one.root, Kind.OBSERVATION)) == 5
+
+
+def test_interrupted_take_over_removes_unacknowledged_rows_next_time(
+    bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder keeps rows that were never acknowledged and that another service has received
+    again. They must not count after a full disk interrupted the folder's take-over.
+    """
+    one = Machine(tmp_path / "one", bucket)
+    one.write(0)
+    with monkeypatch.context() as cut:
+        cut.setattr(one.log, "_upload", lambda _: None)
+        one.write(1)
+    one.close()
+    two = Machine(tmp_path / "two", bucket)
+    two.write(1)
+    before = sorted(rows_in(two.root, Kind.OBSERVATION))
+    two.close()
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as full:
+        full.setattr(BucketReplica, "sync_under_lease", fail)
+        with pytest.raises(OSError, match="full"):
+            Machine(one.root, bucket)
+    back = Machine(one.root, bucket)
+    assert sorted(rows_in(back.root, Kind.OBSERVATION)) == before
+    back.close()
 
 
 @pytest.mark.campaign

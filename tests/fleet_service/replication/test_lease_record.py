@@ -8,6 +8,8 @@ from __future__ import annotations
 import gzip
 import json
 import threading
+import time
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -139,6 +141,77 @@ def test_failed_renewal_uses_its_turn_up(monkeypatch: pytest.MonkeyPatch) -> Non
     holder.release()
     turns = [json.loads(one)["turn"] for one in (*written, *bucket.objects.values())]
     assert turns == [1, 3]
+
+
+class VirtualStop(threading.Event):
+    """Event whose waits take no real time. They advance the virtual clock of the lease module, and
+    a wait of at least `long_s` sets the event.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, long_s: float = 1e9) -> None:
+        super().__init__()
+        self._now_s = 0.0
+        self._long_s = long_s
+        clock = SimpleNamespace(
+            monotonic=lambda: self._now_s, clock_gettime=lambda _: self._now_s, time=time.time
+        )
+        monkeypatch.setattr("fleet_service.replication.lease.time", clock)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self._now_s += timeout
+        if timeout >= self._long_s:
+            self.set()
+        return self.is_set()
+
+
+class LateRenewalBucket(MemoryBucket):
+    """Bucket to which `holder` writes a renewal just before another service creates a lease. If
+    `is_cut`, it does not answer the next request.
+    """
+
+    def __init__(self, *, is_cut: bool) -> None:
+        super().__init__()
+        self._is_cut = is_cut
+        self._fails = False
+        self.holder = lease_on(self, "one", 4.0)
+        assert self.holder._create_next(None, lambda: 0, threading.Event())
+
+    def get(self, name: str) -> bytes | None:
+        fails = self._fails
+        self._fails = False
+        if fails:
+            raise CopyError("no answer")
+        return super().get(name)
+
+    def create(self, name: str, content: bytes) -> bool:
+        if len(self.objects) == 1 and self.holder.term.number:
+            self.holder.renew()
+            self._fails = self._is_cut
+        return super().create(name, content)
+
+
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_former_holder_stops_before_the_successor_starts(
+    monkeypatch: pytest.MonkeyPatch, is_cut: bool
+) -> None:
+    stop = VirtualStop(monkeypatch)
+    bucket = LateRenewalBucket(is_cut=is_cut)
+    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: None)
+    assert lease_on(bucket, "two", 4.0).wait(stop, print, lambda: 0, standby)
+    assert not bucket.holder.may_acknowledge
+
+
+def test_take_over_stopped_before_its_check_releases_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stop = VirtualStop(monkeypatch, long_s=4.0)
+    bucket = LateRenewalBucket(is_cut=False)
+    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: None)
+    lease = lease_on(bucket, "two", 4.0)
+    assert not lease.wait(stop, print, lambda: 0, standby)
+    lease.release()
+    assert not any(json.loads(content)["released"] for content in bucket.objects.values())
 
 
 def test_damaged_fence_is_an_error_of_the_copy() -> None:
