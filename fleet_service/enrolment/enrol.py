@@ -91,13 +91,13 @@ class Registry:
             if self._good(name, hosts, signer.certificate):
                 done.kept.append(name)
             else:
-                self._refuse_revoked(name, signer.certificate)
+                self._refuse_revoked(name)
                 ca.issue_certificate(signer, name, hosts, self._terms.days, self._now).write(
                     self._folder / name
                 )
                 done.made.append(name)
         done.revoked += self._revoke(self.leaving(fleet))
-        self._trust()
+        self._write_trusted()
         for name in fleet.routers:
             text = json.dumps(router_configuration(fleet, name, self._used_at), indent=1)
             ca.write_atomically(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
@@ -155,7 +155,7 @@ class Registry:
             and list(names) == ca.alternative_names(name, hosts)
         )
 
-    def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
+    def _refuse_revoked(self, name: str) -> None:
         """Raise an error for a revoked name whose old certificate is still valid. The access list
         contains only names, so enrolling the name again would make the old, possibly stolen
         certificate valid again.
@@ -164,7 +164,7 @@ class Registry:
         if (
             lost is None
             or lost.not_valid_after_utc < self._now
-            or not ca.is_signed_by(lost, signer)
+            or not any(ca.is_signed_by(lost, signer) for signer in self._trusted())
         ):
             return
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
@@ -178,10 +178,7 @@ class Registry:
         """Return the names that have a certificate of this authority but are not in the enrolment
         file; `enrol` would revoke them.
         """
-        found = (
-            ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
-        )
-        signers = [signer for signer in found if signer is not None]
+        signers = self._trusted()
         return [
             path.stem
             for path in sorted(self._folder.glob("*.pem"))
@@ -212,9 +209,13 @@ class Registry:
                     path.rename(self._revoked / path.name)
         return gone
 
-    def _trust(self) -> None:
+    def _trusted(self) -> list[x509.Certificate]:
+        """Return the certificates of the authorities that all participants trust."""
         found = (
             ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
         )
-        trusted = [certificate for certificate in found if certificate is not None]
-        ca.write_atomically(self._folder / "trust.pem", b"".join(map(ca.to_pem, trusted)), 0o644)
+        return [certificate for certificate in found if certificate is not None]
+
+    def _write_trusted(self) -> None:
+        trusted = b"".join(map(ca.to_pem, self._trusted()))
+        ca.write_atomically(self._folder / "trust.pem", trusted, 0o644)

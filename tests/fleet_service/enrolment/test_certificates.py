@@ -106,6 +106,15 @@ def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> No
     assert gone in at(folder, 366.0).enrol(make_enrolment()).made
 
 
+def test_revoked_name_is_refused_as_long_as_its_authority_is_trusted(folder: Path) -> None:
+    fewer = make_enrolment(vehicles=list(VEHICLES[1:]))
+    at(folder).enrol(fewer, "next")
+    at(folder).enrol(fewer, "switch")
+    with pytest.raises(InputError, match=f"^fleet: '{VEHICLES[0]}' was revoked"):
+        at(folder).enrol(make_enrolment())
+    assert VEHICLES[0] in at(folder).enrol(make_enrolment(), "drop").made
+
+
 def test_change_of_authority_takes_three_steps_with_both_trusted(folder: Path) -> None:
     (first,) = read_trusted(folder)
     assert not at(folder).enrol(make_enrolment(), "next").made, (
