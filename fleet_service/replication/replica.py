@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
-from typing import Final
+from typing import Final, NamedTuple
 
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Term, largest_epoch
@@ -36,6 +36,15 @@ SLOW_S: Final = 300.0  # [s] limit of other requests: compacted files have tens 
 # [s] Longest time of one call of `upload_segments`, so that it can report its progress.
 TURN_S: Final = 20.0
 _AT_ONCE: Final = 8  # number of concurrent requests
+
+
+class _Uploaded(NamedTuple):
+    """Result of an upload: number of changed objects. `is_complete` is False if a listed file was
+    removed before its upload; the file that replaces it may then be missing from the bucket.
+    """
+
+    changed: int
+    is_complete: bool
 
 
 class BucketReplica:
@@ -132,14 +141,18 @@ class BucketReplica:
         return max(largest_epoch(self._slow.list_sizes()), largest_epoch(self._files.list_files()))
 
     def prefetch(self) -> None:
-        """Download files that a later `sync_under_lease` will need. A standby (waiting service)
-        calls this in advance, while another service still owns the bucket.
+        """Download files that a later `sync_under_lease` will need, and remove those that the
+        bucket no longer has. A standby (waiting service) calls this in advance, while another
+        service still owns the bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete, for example because the owner's
                 compaction has removed files meanwhile.
         """
-        self._transfer.download_missing(self.bucket.list_valid())
+        there = self.bucket.list_valid()
+        for name in self._journal.copy_stamps().keys() - there.keys():
+            self._files.path_of(name).unlink(missing_ok=True)
+        self._transfer.download_missing(there)
 
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
         """Remove files of the archive's folder that the bucket does not contain with the same size.
@@ -190,7 +203,7 @@ class BucketReplica:
             CopyError: the work is incomplete; the next call continues.
             OSError: the journal (list of uploaded files) cannot be written.
         """
-        return self._upload_changes(with_log=False)
+        return self._upload_changes(with_log=False).changed
 
     def _upload_in_time(self, paths: Sequence[Path]) -> None:
         deadline = time.monotonic() + TURN_S
@@ -205,13 +218,14 @@ class BucketReplica:
                     list(self._pool.map(self._upload_quickly, some))
             # Compaction has moved the rows of a segment into files that are uploaded later.
             except FileNotFoundError:
-                self._upload_changes(with_log=True)
+                if not self._upload_changes(with_log=True).is_complete:
+                    raise CopyError("the archive was compacted during the upload") from None
                 return
 
     def _upload_quickly(self, path: Path) -> None:
         self._transfer.upload_file(path, self._quick)
 
-    def _upload_changes(self, *, with_log: bool) -> int:
+    def _upload_changes(self, *, with_log: bool) -> _Uploaded:
         if not self.bucket.may_write():
             raise CopyError("this service may have lost the lease")
         if not self._following.acquire(timeout=QUICK_S):
@@ -242,7 +256,7 @@ class BucketReplica:
                 self._slow.delete(name)
                 self._journal.remove(name)
             self._journal.sync()
-            return len(new) - len(vanished) + len(removed)
+            return _Uploaded(len(new) - len(vanished) + len(removed), not vanished)
         finally:
             self._following.release()
 

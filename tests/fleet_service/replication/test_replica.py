@@ -162,6 +162,49 @@ def test_segment_compacted_before_its_upload_is_settled_by_the_result(
         assert any(name.startswith("observations/") for name in there(bucket))
 
 
+def test_segment_compacted_during_its_upload_is_not_settled(
+    bucket: BucketServer, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A compaction goes on while the files of its first segments are uploaded. The other segments
+    are then settled only when the bucket has the files that replace them.
+    """
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(fill_log(root, None)):
+        written = segments.list_segments(root, Kind.OBSERVATION)
+        written[0].unlink()
+        list_files = copy._files.list_files
+
+        def compact_after_listing() -> dict[str, Stamp]:
+            found = list_files()
+            compact(root)
+            return found
+
+        with monkeypatch.context() as slow:
+            slow.setattr(copy._files, "list_files", compact_after_listing)
+            with pytest.raises(CopyError, match="compacted during the upload"):
+                copy._upload_in_time(written)
+        copy.upload_segments(written)
+        assert there(bucket) == list_copied_files(root)
+
+
+def test_standby_removes_files_that_the_bucket_no_longer_has(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
+    root = tmp_path / "archive"
+    standby = tmp_path / "standby"
+    copy = make(root)
+    with closing(fill_log(root, copy)):
+        waiting = make(standby)
+        (own := standby / "inbox" / "never-uploaded.parquet").write_bytes(b"")
+        compact(root)
+        copy.sync()
+        waiting.prefetch()
+        assert own.exists()
+        own.unlink()
+        assert list_copied_files(standby) == list_copied_files(root)
+
+
 def test_an_empty_disk_has_all_of_it_again(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
