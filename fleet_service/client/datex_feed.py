@@ -8,22 +8,19 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Protocol
 
 import zenoh
 
 from fleet_service.client.datex import Supplier, make_publication, same_but_for_time
 from fleet_service.client.map_client import is_place_served, is_served, open_connected
 from fleet_service.client.stretches import StretchAlert, Stretches
-from fleet_service.client.watching import GATHER_S, standing_alerts
+from fleet_service.client.watching import GATHER_S, REFRESH_S, standing_alerts
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.durable import open_durably
-
-# [s] Period of the queries for all active alerts, and longest time between two publications.
-REFRESH_S: Final = 60.0
 
 
 class DatexFile:

@@ -97,7 +97,8 @@ class Stretches:
         self._standing: dict[tuple[int, int], Alert] = {}
         self._known: dict[str, StretchAlert] = {}
         self._members: dict[str, set[int]] = {}
-        self._last: Alert | None = None
+        # messages since the last `take_changes` that ended the alert of a cell
+        self._ended: dict[int, Alert] = {}
 
     def apply_alert(self, alert: Alert) -> None:
         """Record that the alert of a cell was raised or cleared; a repeated call
@@ -106,9 +107,8 @@ class Stretches:
         place = (alert.cell, alert.sector)
         if alert.raised:
             self._standing[place] = alert
-        else:
-            self._standing.pop(place, None)
-        self._last = alert
+        elif self._standing.pop(place, None) is not None:
+            self._ended[alert.cell] = alert
 
     def replace_alerts(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
         """Replace the active alerts with the alerts in `standing`. Alerts that are not in it end
@@ -142,16 +142,24 @@ class Stretches:
                 out.append(self._make_stretch(name, group))
             elif self._members[name] != _cells_of(group):
                 out.append(replace(self._make_stretch(name, group), state="changed"))
-        for name in [name for name in self._known if name not in found]:
-            ended = self._known.pop(name)
-            last = self._last
-            del self._members[name]
-            if last is not None:
-                out.append(replace(ended, state="cleared", time=last.time, reason=last.reason))
+        out += [self._end_stretch(name) for name in list(self._known) if name not in found]
+        self._ended.clear()
         for name, group in found.items():
             self._known[name] = self._make_stretch(name, group)
             self._members[name] = _cells_of(group)
         return out
+
+    def _end_stretch(self, name: str) -> StretchAlert:
+        """Return the alert that ends a stretch of road, and forget the stretch."""
+        known = self._known.pop(name)
+        cells = self._members.pop(name)
+        ends = [self._ended[cell] for cell in cells & self._ended.keys()]
+        if ends:
+            last = max(ends, key=lambda one: one.time)
+            return replace(known, state="cleared", time=last.time, reason=last.reason)
+        is_joined = any(cell in cells for cell, _ in self._standing)
+        reason = "joined another stretch" if is_joined else "no longer reported by the service"
+        return replace(known, state="cleared", reason=reason)
 
     def _group_by_stretch(self) -> dict[str, list[Alert]]:
         """Return the active alerts of cells, grouped by the id of their road stretch."""

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable
+from queue import SimpleQueue
 from typing import Final, NamedTuple
 
 import pyarrow as pa
@@ -20,6 +22,8 @@ from schemas.runtime import presence, zenoh_session
 from schemas.wire.tile import decode_tile
 
 GATHER_S: Final = 0.3  # [s] time for which alerts of neighbouring cells are merged
+# [s] Period of the queries for all active alerts, and longest time between two DATEX publications.
+REFRESH_S: Final = 60.0
 
 
 class WatchOptions(NamedTuple):
@@ -51,67 +55,101 @@ def watch_map(
     Raises:
         InputError: the box is not valid.
     """
-    asked = query.parse({} if options.bbox is None else {"bbox": options.bbox})
-    box = asked.bbox
-    stretches = Stretches()
-    lock = threading.Lock()
-    away = set[str]()
-
-    def tile_if_near(key: str) -> int | None:
-        tile = keys.parse(key).quadint
-        if tile is None or box is None:
-            return tile
-        return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None
-
-    def print_tile(sample: zenoh.Sample) -> None:
-        tile = tile_if_near(str(sample.key_expr))
-        if tile is not None:
-            print_line(_tile_line(tile, decode_tile(sample.payload.to_bytes()), options.as_json))
-
-    def apply_alert(alert: wire.Alert) -> None:
-        with lock:
-            stretches.apply_alert(alert)
-
-    def apply_sample(sample: zenoh.Sample) -> None:
-        if tile_if_near(str(sample.key_expr)) is not None:
-            apply_alert(wire.decode_alert(sample.payload.to_bytes()))
-
-    def print_changes() -> None:
-        with lock:
-            found = stretches.take_changes()
-        for alert in found:
-            print_line(
-                json.dumps({"event": "alert", **alert.to_json_values()})
-                if options.as_json
-                else alert.to_line()
-            )
-            on_alert(alert)
-
-    def print_services() -> None:
-        nonlocal away
-        here = {token.region for token in services.active}
-        left = {token.region for token in services.lost_tokens} - here
-        now = set(regions.unserved_expressions(asked, here)) if asked.bbox else left
-        if now != away and (here or services.lost_tokens):
-            _print_regions(print_line, now - away, away - now, as_json=options.as_json)
-            away = now
-
+    watch = _Watch(options, print_line, on_alert)
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
     with session, presence.track_tokens(session) as services:
         if not options.only_alerts:
-            session.declare_subscriber(f"{keys.ROOT}/map/**", print_tile)
-        session.declare_subscriber(f"{keys.ROOT}/alert/**", apply_sample)
-        for alert in standing_alerts(session):  # after subscribing, so that no alert is missed
-            if tile_if_near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
-                apply_alert(alert)
+            session.declare_subscriber(f"{keys.ROOT}/map/**", watch.print_tile)
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", watch.queue_alert)
+        watch.query_alerts(session, services)  # after subscribing, so that no alert is missed
         print_line(json.dumps({"event": "watching"}) if options.as_json else "watching")
-        print_services()
+        watch.print_services(services)
+        looked = time.monotonic()
         while not stop.wait(GATHER_S):
-            print_changes()
-            print_services()
-        print_changes()
+            if time.monotonic() > looked + REFRESH_S:
+                watch.query_alerts(session, services)
+                looked = time.monotonic()
+            watch.print_alerts()
+            watch.print_services(services)
+        watch.print_alerts()
+
+
+class _Watch:
+    """State of one watch: the active alerts, and the regions without a service. Received messages
+    are queued by Zenoh's threads; all other methods are called from one thread.
+    """
+
+    def __init__(
+        self,
+        options: WatchOptions,
+        print_line: Callable[[str], None],
+        on_alert: Callable[[StretchAlert], None],
+    ) -> None:
+        self._asked = query.parse({} if options.bbox is None else {"bbox": options.bbox})
+        self._as_json = options.as_json
+        self._print_line = print_line
+        self._on_alert = on_alert
+        self._stretches = Stretches()
+        self._arrived: SimpleQueue[wire.Alert] = SimpleQueue()
+        self._away = set[str]()
+
+    def _is_near(self, tile: int) -> bool:
+        box = self._asked.bbox
+        return box is None or bool(grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)))
+
+    def print_tile(self, sample: zenoh.Sample) -> None:
+        """Print a line about a changed tile of the map."""
+        tile = keys.parse(str(sample.key_expr)).quadint
+        if tile is not None and self._is_near(tile):
+            table = decode_tile(sample.payload.to_bytes())
+            self._print_line(_tile_line(tile, table, self._as_json))
+
+    def queue_alert(self, sample: zenoh.Sample) -> None:
+        """Queue a received alert for the next `print_alerts`."""
+        tile = keys.parse(str(sample.key_expr)).quadint
+        if tile is not None and self._is_near(tile):
+            self._arrived.put(wire.decode_alert(sample.payload.to_bytes()))
+
+    def query_alerts(self, session: zenoh.Session, services: presence.PresenceTracker) -> None:
+        """Query the active alerts. A known alert ends if the service of its place does not report
+        it; the message about its end was then missed.
+        """
+        before = services.active
+        found = standing_alerts(session)
+        heard = {token.region for token in before & services.active}
+
+        def is_heard(alert: wire.Alert) -> bool:
+            region = regions.region_of(int(grid.tile_of(alert.cell)))
+            return any(regions.covers(one, region) for one in heard)
+
+        near = (alert for alert in found if self._is_near(int(grid.tile_of(alert.cell))))
+        # The queued alerts are applied later, because some are newer than the answer.
+        self._stretches.replace_alerts(near, is_heard)
+
+    def print_alerts(self) -> None:
+        """Print the stretches of road whose alert has changed."""
+        while not self._arrived.empty():
+            self._stretches.apply_alert(self._arrived.get())
+        for alert in self._stretches.take_changes():
+            self._print_line(
+                json.dumps({"event": "alert", **alert.to_json_values()})
+                if self._as_json
+                else alert.to_line()
+            )
+            self._on_alert(alert)
+
+    def print_services(self, services: presence.PresenceTracker) -> None:
+        """Print the regions that have lost or regained their service."""
+        here = {token.region for token in services.active}
+        left = {token.region for token in services.lost_tokens} - here
+        now = set(regions.unserved_expressions(self._asked, here)) if self._asked.bbox else left
+        if now != self._away and (here or services.lost_tokens):
+            for event, found in (("away", now - self._away), ("back", self._away - now)):
+                if found:
+                    self._print_line(_regions_line(event, sorted(found), self._as_json))
+            self._away = now
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
@@ -124,19 +162,13 @@ def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 
-def _print_regions(
-    print_line: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool
-) -> None:
-    for event, found in (("away", away), ("back", back)):
-        if found and as_json:
-            print_line(json.dumps({"event": event, "regions": sorted(found)}))
-        elif found:
-            names = ", ".join(sorted(found))
-            print_line(
-                f"no service answers for {names}"
-                if event == "away"
-                else f"{names} has a service again"
-            )
+def _regions_line(event: str, found: list[str], as_json: bool) -> str:
+    if as_json:
+        return json.dumps({"event": event, "regions": found})
+    names = ", ".join(found)
+    if event == "away":
+        return f"no service answers for {names}"
+    return f"{names} has a service again"
 
 
 def _tile_line(tile: int, table: pa.Table, as_json: bool) -> str:

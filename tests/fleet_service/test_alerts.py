@@ -114,6 +114,14 @@ def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> N
     assert take_alerts(road) == []
 
 
+def test_end_of_a_stretch_states_its_own_time_and_reason() -> None:
+    road = Stretches()
+    take_alerts(road, alert(0, at=0), alert(100, at=1))
+    (ended,) = take_alerts(road, alert(0, raised=False, at=5), alert(100, at=1))
+    assert (ended.state, ended.time) == ("cleared", (1_800_000_000 + 5) * SECOND)
+    assert ended.reason == "later visits measured good grip"
+
+
 @contextmanager
 def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yield the address of a real HTTP server, and the list of webhooks (HTTP calls) that it
