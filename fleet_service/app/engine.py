@@ -160,9 +160,12 @@ class Engine:
         """
         checkpoints.mark_survived(self._root)
 
-    def close(self) -> None:
-        """Stop all parts of the service and release the archive."""
+    def close(self, *, has_failed: bool = False) -> None:
+        """Stop all parts of the service and release the archive. `has_failed` is True if an error
+        ended the service; the checkpoint (saved state) from which it started may be the cause.
+        """
         self.queries.close()
-        self.mark_survived()
+        if not has_failed:
+            self.mark_survived()
         self.settlement.close()
         self.holding.close()

@@ -132,7 +132,7 @@ class Service:
                 if session is not None:
                     self._serve(session, stop, f", {address}" if address else "")
         finally:
-            self.engine.close()
+            self.engine.close(has_failed=self.failure is not None)
 
     @property
     def exit_code(self) -> int:

@@ -18,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_service.app.engine import Engine
+from fleet_service.app.service import Service
 from fleet_service.archive.format import reading
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import drop_checkpoints
@@ -25,10 +26,11 @@ from fleet_service.fusion.store.records import CELL
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints, rebuild
 from schemas import grid, wire
-from schemas.config import ServiceConfig
+from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
+from tests.event_lines import logger_into
 from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
 
@@ -307,3 +309,22 @@ def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None
         checkpoints.load_checkpoint(path)
     checkpoints.mark_survived(tmp_path)
     checkpoints.load_checkpoint(path)
+
+
+def test_checkpoint_is_given_up_if_errors_end_the_service(
+    router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        path = keep(engine, tmp_path)
+
+    def fail(*_: object) -> None:
+        raise IndexError("row 7")
+
+    monkeypatch.setattr(Service, "_step", fail)
+    for _ in range(checkpoints.TRIES):
+        service = Service(ServiceConfig(zenoh=router), tmp_path, logger_into([]))
+        with pytest.raises(IndexError):
+            service.run(threading.Event())
+    with pytest.raises(InputError, match="made the service fail"):
+        checkpoints.load_checkpoint(path)
