@@ -253,14 +253,11 @@ class BatchIntake:
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
         self._tell_time(owners, time)
         for place in np.flatnonzero(broken >= 0).tolist():
-            if (
-                rules[broken[place]].rule == "time"
-                and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt
-            ):
-                # The batch is neither accepted nor refused, so the sender keeps and repeats it.
+            refusal = rules[broken[place]]
+            if validation.is_doubted(refusal, int(time[place]), clock):
                 self._counts.clock_doubted += 1
             else:
-                self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
+                self._refuse(str(owners[place].name), found.heads.at(place), refusal)
         good = broken < 0
         for place in np.flatnonzero(good & self._is_erased(owners, time)).tolist():
             good[place] = False
@@ -388,7 +385,10 @@ class BatchIntake:
             if good[place]:
                 good[place] = False
                 refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
-                self._refuse(batches[place][0].vehicle, heads.at(place), refusal)
+                if validation.is_doubted(refusal, int(rows[TIME[kind]][index]), clock):
+                    self._counts.clock_doubted += 1
+                else:
+                    self._refuse(batches[place][0].vehicle, heads.at(place), refusal)
         for place in np.flatnonzero(validation.too_long(rows[TIME[kind]], sizes) & good).tolist():
             good[place] = False
             self._refuse(batches[place][0].vehicle, heads.at(place), validation.TOO_LONG)

@@ -102,6 +102,14 @@ class Refusal(NamedTuple):
     reason: str
 
 
+def is_doubted(refusal: Refusal, time: int, clock: Clock) -> bool:
+    """Return True if a record at `time` [ns] is too far in the future only because the service's
+    clock may be wrong. Its batch (message with records) is then neither accepted nor refused, so
+    the sender keeps and repeats it.
+    """
+    return refusal.rule == "time" and 0 < time - clock.now - clock.ahead <= clock.doubt
+
+
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:

@@ -136,6 +136,21 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(
             assert engine.counts.refused["time"] == 0
 
 
+@pytest.mark.parametrize("doubt", [0, HOUR])
+def test_visit_that_ends_after_a_doubtful_clock_is_kept(tmp_path: Path, doubt: int) -> None:
+    now = time.time_ns()
+    sent = batch(
+        "sim-001", 1, now, [0.8], enter_time=[now - SECOND], leave_time=[now + 60 * SECOND]
+    )
+    visit = message(1, now)._replace(payload=wire.encode(sent))
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.intake.ingest([visit], TimeNow(now, doubt=doubt))
+        assert engine.counts.refused["time"] == (doubt == 0)
+        assert engine.counts.clock_doubted == (doubt > 0)
+        engine.intake.ingest([visit], now + 60 * SECOND)
+        assert engine.counts.observations == 1
+
+
 def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
