@@ -42,6 +42,10 @@ class ZenohSettings(Settings):
         default_factory=dict, description="any Zenoh setting; {name} in it is the session's name"
     )
 
+    def with_endpoint(self, connect: str | None) -> ZenohSettings:
+        """Return these settings with the router endpoint `connect`; unchanged if it is None."""
+        return self if connect is None else self.model_copy(update={"connect": [connect]})
+
 
 class MonitoringSettings(Settings):
     """Settings of metrics, health checks and log format."""

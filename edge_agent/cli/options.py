@@ -51,10 +51,7 @@ def config_of(args: argparse.Namespace) -> AgentConfig:
     from schemas.config import AgentConfig, load
 
     config = load(args.config, AgentConfig)
-    if args.connect is None:
-        return config
-    zenoh = config.zenoh.model_copy(update={"connect": [args.connect]})
-    return config.model_copy(update={"zenoh": zenoh})
+    return config.model_copy(update={"zenoh": config.zenoh.with_endpoint(args.connect)})
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:

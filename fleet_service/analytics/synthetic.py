@@ -89,21 +89,9 @@ def _make_chunk(
     seconds = begin[trip] + along * CELL_S + rng.normal(0.0, 0.05, rows)
     latitude, longitude, yaw = _draw_positions(road[trip], along, rng)
     truth = truth_of(world, road[trip], along, seconds)
-    excited = rng.random(rows) < _EXCITED
-    used = np.clip(
-        truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)),
-        0.02,
-        1.2,
-    )
-    reported = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
-    mu = np.clip(
-        np.where(excited, reported, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)),
-        0.06,
-        1.19,
-    )
+    mu, used, excited = _draw_friction(rng, truth, bias[who[trip]])
     half = np.where(excited, Z_95 * _STD, 0.35)
     cell = grid.cell_of(latitude, longitude)
-    zeros = np.zeros(rows, np.int64)
     names = np.array(
         [
             blake2b(f"{world.seed}/{v}".encode(), digest_size=8).hexdigest()
@@ -111,52 +99,76 @@ def _make_chunk(
         ]
     )
     leave = START_NS + (seconds * NS).astype(np.int64)
-    found: Rows = {
+    found = _equal_columns(rows) | {
         "enter_time": leave - int(CELL_S * NS) - rng.integers(0, 10**7, rows),
         "leave_time": leave,
         "cell": cell,
         "sector": grid.sector_of(yaw),
         "latitude": latitude,
         "longitude": longitude,
-        "position_std": np.full(rows, 1.5, np.float32),
         "yaw": yaw.astype(np.float32),
-        "yaw_std": np.full(rows, 0.02, np.float32),
         "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),
         "mu": mu.astype(np.float32),
         "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
         "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32),
         "mu_utilised": used.astype(np.float32),
         "log_likelihood": _make_likelihoods(rng, mu, used, excited),
-        "with_likelihood": np.ones(rows, bool),
         "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32),
-        "tyre_season": zeros.astype(np.int8),
         "air_temperature": (5.0 - 8.0 * night_factor(seconds) + rng.normal(0, 1, rows)).astype(
             np.float32
         ),
-        "abs_active": np.full(rows, -1, np.int8),
-        "used_longitudinal": np.full(rows, np.nan, np.float32),
-        "used_lateral": np.full(rows, np.nan, np.float32),
-        "esc_active": np.full(rows, -1, np.int8),
-        "tcs_active": np.full(rows, -1, np.int8),
-        "wiper": np.full(rows, np.nan, np.float32),
         "vehicle": names[who[trip]],
         "boot": (who[trip] + 1) * 7919 + since_s,
         "region": grid.region_of(cell),
         "seq": trip * 64 + along // 10 + 1,
         "row": (along % 10).astype(np.int32),
         "first_held": trip * 64 + np.maximum(along // 10 - 1, 0) + 1,
-        "estimator": np.full(rows, "aco-fckf"),
         "received_at": (leave // 50_000_000 + 20) * 50_000_000 + leave // 50_000_000 % 997 * 1000,
-        "late": zeros.astype(bool),
-        "weight": np.full(rows, 0.75, np.float32),
-        "late_by": zeros,
-        "bias": 0.0 * zeros.astype(np.float32),
-        "bias_std": np.full(rows, 0.05, np.float32),
-        "spread": np.ones(rows, np.float32),
-        "slope": np.full(rows, 0.4, np.float32),
     }
     order = np.argsort(leave, kind="stable")
     return {name: column[order] for name, column in round_to_steps(found).items()}
+
+
+def _equal_columns(rows: int) -> Rows:
+    """Return the columns that have the same value in all rows."""
+    values = {
+        "position_std": np.float32(1.5),
+        "yaw_std": np.float32(0.02),
+        "with_likelihood": np.True_,
+        "tyre_season": np.int8(0),
+        "abs_active": np.int8(-1),
+        "used_longitudinal": np.float32(np.nan),
+        "used_lateral": np.float32(np.nan),
+        "esc_active": np.int8(-1),
+        "tcs_active": np.int8(-1),
+        "wiper": np.float32(np.nan),
+        "estimator": np.str_("aco-fckf"),
+        "late": np.False_,
+        "weight": np.float32(0.75),
+        "late_by": np.int64(0),
+        "bias": np.float32(0.0),
+        "bias_std": np.float32(0.05),
+        "spread": np.float32(1.0),
+        "slope": np.float32(0.4),
+    }
+    return {name: np.full(rows, value) for name, value in values.items()}
+
+
+def _draw_friction(
+    rng: np.random.Generator, truth: FloatArray, bias: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the reported friction and the used grip of n visits (n,), and a mask (n,): True for a
+    visit that used enough grip to measure the friction. `truth` (n,) is the true friction, and
+    `bias` (n,) the relative error of the vehicle.
+    """
+    rows = len(truth)
+    excited = rng.random(rows) < _EXCITED
+    share = np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows))
+    used = np.clip(truth * share, 0.02, 1.2)
+    measured = truth * (1.0 + bias) + _STD * rng.normal(size=rows)
+    guessed = np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)
+    mu = np.clip(np.where(excited, measured, guessed), 0.06, 1.19)
+    return mu, used, excited
 
 
 def _draw_positions(

@@ -5,7 +5,7 @@ it, or from archived rows alone.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from fleet_service.serve.public_cells import PRESENT, WAITING, PublicCells
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
+from schemas.numeric import IntArray
 
 # [ns] Time after the last visit after which a cell may be dropped. It is 56 times the mean time
 # between changes (fusion.constants.CHANGE_S), so that the belief has become the prior.
@@ -132,6 +133,20 @@ def public_tables(public: PublicCells) -> dict[str, pa.Table]:
     }
 
 
+def _load_public(
+    least: int, fusion: Fusion, kept: Mapping[str, dict[str, IntArray]]
+) -> PublicCells | None:
+    """Return the public copy of the map (cells that readers may see) from the tables of a
+    checkpoint (saved state); None if readers may see all cells. If the checkpoint does not contain
+    it, a cell is shown only after new visits. `least` is the number of vehicles of a public cell.
+    """
+    if least <= 1:
+        return None
+    known = {VISITORS, WAITING, PRESENT} <= kept.keys() and len(kept[VISITORS]["bits"])
+    visitors = Visitors.of(fusion, kept[VISITORS]) if known else Visitors(fusion)
+    return PublicCells(fusion, visitors, least, kept if known else None)
+
+
 def load_state(
     root: Path,
     config: ServiceConfig,
@@ -148,13 +163,7 @@ def load_state(
     begin = load_restart(root, config.lateness_s, (VISITORS, WAITING, PRESENT), enrolled=enrolled)
     fusion = begin.fusion
     streams = begin.streams
-    public = None
-    # If the checkpoint contains no public cells, a cell is shown only after new visits.
-    if config.public_vehicles > 1:
-        kept = begin.extra_tables
-        known = {VISITORS, WAITING, PRESENT} <= kept.keys() and len(kept[VISITORS]["bits"])
-        visitors = Visitors.of(fusion, kept[VISITORS]) if known else Visitors(fusion)
-        public = PublicCells(fusion, visitors, config.public_vehicles, kept if known else None)
+    public = _load_public(config.public_vehicles, fusion, begin.extra_tables)
     shown = MapState(fusion)
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)

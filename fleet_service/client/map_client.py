@@ -79,8 +79,7 @@ def connection_settings(connect: str | None, config: Path | str | None) -> Zenoh
     """Return the Zenoh connection settings from a configuration file; if `connect` is given, it
     replaces the endpoints.
     """
-    found = load(config, ServiceConfig).zenoh
-    return found if connect is None else found.model_copy(update={"connect": [connect]})
+    return load(config, ServiceConfig).zenoh.with_endpoint(connect)
 
 
 def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
