@@ -241,7 +241,7 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
         )
     except OSError as error:
         raise InputError(
-            "at", f"the archive cannot be read ({error.strerror})", "ask again later"
+            "at", f"the archive cannot be read ({error.strerror or error})", "ask again later"
         ) from error
     cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
     yield from answer_query(cache, question.query, lambda _: True, question.at, question.only)

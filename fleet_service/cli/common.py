@@ -188,9 +188,9 @@ def on_archive(
             else done.line
         )
     except OSError as error:
-        raise InputError(
-            "archive", f"cannot use {error.filename} ({error.strerror})", "nothing is lost"
-        ) from error
+        place = error.filename or arguments.archive  # a full disk gives no file name
+        problem = f"cannot use {place} ({error.strerror or error})"
+        raise InputError("archive", problem, "nothing is lost") from error
     return 0
 
 

@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
             holding.close()
             raise
     except OSError as error:
-        problem = f"cannot use {error.filename} ({error.strerror})"
+        problem = f"cannot use {error.filename or root} ({error.strerror or error})"
         raise InputError("archive", problem, "give a folder that you may read and write") from error
     sys.setswitchinterval(SWITCH_S)
     gc.collect()

@@ -4,6 +4,7 @@ wherever it is interrupted and whichever program reads the archive.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import threading
@@ -25,6 +26,7 @@ from fleet_service.archive.format import load as loading
 from fleet_service.archive.format.segments import Writer
 from fleet_service.archive.maintenance import compaction
 from fleet_service.archive.maintenance.compaction import compact, hold_compaction_lock
+from fleet_service.cli import main
 from schemas import grid, tables
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -225,6 +227,20 @@ def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
         compact(tmp_path)
     with pytest.raises(InputError, match="^archive: .* is not a folder; "):
         compact(tmp_path / "nowhere")
+
+
+def test_full_disk_is_an_error_that_names_the_archive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(tmp_path, 1, ROWS)
+
+    def fail(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(compaction, "_place_files", fail)
+    assert main(["compact", "--archive", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"cannot use {tmp_path} (No space left on device); nothing is lost" in error
 
 
 def test_a_damaged_segment_is_set_aside_and_the_rest_compacted(tmp_path: Path) -> None:
