@@ -14,7 +14,7 @@ next such slot. Unmeasured time is unknown, and never counts as kept.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import ibis
 import numpy as np
@@ -187,11 +187,12 @@ class _Measured(NamedTuple):
     values: list[int]
 
 
+_PieceSlot = tuple[str, str, int, int]  # link, direction, piece, time slot
+
+
 def _link_rows(
     found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options
 ) -> pa.Table:
-    level = options.level or 0.0
-    within = options.within_s or 0.0
     about = {
         (row["link"], row["direction"]): row
         for row in roads.group_by(["link", "direction"], use_threads=False)
@@ -204,10 +205,30 @@ def _link_rows(
         (str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"]))
         for row in rows
     ]
-    number = {key: k for k, key in enumerate(sorted(set(names)))}
+    keys = sorted(set(names))
+    number = {key: k for k, key in enumerate(keys)}
     found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
     each = slot_intervals(found)
-    keys = sorted(number)
+    out = [
+        {
+            "link": key[0],
+            "direction": key[1],
+            "name": about[key]["name_first"],
+            "measured_share": share[key],
+            "length_m": about[key]["length_m_first"],
+            **_judge_link(own, keys, each, span, options, share[key]),
+        }
+        for key, own in _group_by_link(rows, names, keys).items()
+    ]
+    return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
+
+
+def _group_by_link(
+    rows: list[dict[str, Any]], names: list[_PieceSlot], keys: list[_PieceSlot]
+) -> dict[tuple[str, str], _Measured]:
+    """Return the measurements of each road link and direction. `names` are the pieces and slots of
+    the `rows`, and `keys` those of the result of `slot_intervals`.
+    """
     links: dict[tuple[str, str], _Measured] = {}
     for (link, direction, _, _), row in zip(names, rows, strict=True):
         own = links.setdefault((link, direction), _Measured({}, set(), []))
@@ -215,41 +236,46 @@ def _link_rows(
         own.values.append(int(row["values"]))
     for k, (link, direction, piece, _) in enumerate(keys):
         links[link, direction].pieces.setdefault(piece, []).append(k)
-    out = []
-    for key, own in links.items():
-        found_breaches = []
-        for of_piece in own.pieces.values():
-            slot = np.array([keys[k][3] for k in of_piece], np.int64)
-            lower, mu, upper = (each[name][of_piece] for name in ("lower", "mu", "upper"))
-            found_breaches.append(longest_breach(slot, lower, mu, upper, level, span))
-        by_mean, begin = max((one[0], one[3]) for one in found_breaches)
-        least, most = (max(one[k] for one in found_breaches) for k in (1, 2))
-        worst = min(
-            (k for of_piece in own.pieces.values() for k in of_piece),
-            key=lambda k: float(each["mu"][k]),
-        )
-        enough = share[key] >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
-        verdict = BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN
-        out.append(
-            {
-                "link": key[0],
-                "direction": key[1],
-                "name": about[key]["name_first"],
-                "verdict": verdict,
-                "breach_s": by_mean,
-                "least_s": least,
-                "most_s": most,
-                "begin": begin or None,
-                "mu_worst": each["mu"][worst],
-                "mu_worst_lower": each["lower"][worst],
-                "mu_worst_upper": each["upper"][worst],
-                "measured_share": share[key],
-                "length_m": about[key]["length_m_first"],
-                "vehicles": len(own.vehicles),
-                "values": sum(own.values),
-            }
-        )
-    return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
+    return links
+
+
+def _judge_link(
+    own: _Measured,
+    keys: list[_PieceSlot],
+    each: dict[str, FloatArray],
+    span: tuple[int, int],
+    options: Options,
+    share: float,
+) -> dict[str, Any]:
+    """Return the columns of one road link that follow from its measurements: verdict, breaches, and
+    the interval of its worst piece and slot. `share` is the measured share of the link's length.
+    """
+    level = options.level or 0.0
+    within = options.within_s or 0.0
+    breaches = []
+    for of_piece in own.pieces.values():
+        slot = np.array([keys[k][3] for k in of_piece], np.int64)
+        lower, mu, upper = (each[name][of_piece] for name in ("lower", "mu", "upper"))
+        breaches.append(longest_breach(slot, lower, mu, upper, level, span))
+    by_mean, begin = max((one[0], one[3]) for one in breaches)
+    least, most = (max(one[k] for one in breaches) for k in (1, 2))
+    worst = min(
+        (k for of_piece in own.pieces.values() for k in of_piece),
+        key=lambda k: float(each["mu"][k]),
+    )
+    enough = share >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
+    return {
+        "verdict": BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN,
+        "breach_s": by_mean,
+        "least_s": least,
+        "most_s": most,
+        "begin": begin or None,
+        "mu_worst": each["mu"][worst],
+        "mu_worst_lower": each["lower"][worst],
+        "mu_worst_upper": each["upper"][worst],
+        "vehicles": len(own.vehicles),
+        "values": sum(own.values),
+    }
 
 
 def _measured_share(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
