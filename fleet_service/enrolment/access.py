@@ -136,7 +136,28 @@ def access_control(fleet: Enrolment) -> Section:
     """Return the access list (who may publish and read what) for an enrolment; it is the same at
     all routers.
     """
-    rules = [
+    own = {name: _own_rules(name) for name in fleet.vehicles}
+    for name, owned in fleet.owners.items():
+        if owned:
+            expressions = [key for vehicle in owned for key in keys.private_keys(vehicle)]
+            own[name] = _subscriber_rules(name, expressions)
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [*_shared_rules(), *(rule for rules in own.values() for rule in rules)],
+        "subjects": _subjects(fleet),
+        "policies": [
+            *_role_policies(fleet),
+            *(
+                {"rules": [rule["id"] for rule in rules], "subjects": [name]}
+                for name, rules in own.items()
+            ),
+        ],
+    }
+
+
+def _shared_rules() -> list[Section]:
+    return [
         _allow_rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
         _allow_rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
         | {"permission": "deny"},
@@ -160,46 +181,41 @@ def access_control(fleet: Enrolment) -> Section:
         _allow_rule("there", ("egress",), ("liveliness_token",), [SERVED]),
         _allow_rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
     ]
+
+
+def _subjects(fleet: Enrolment) -> list[Section]:
     roles = {
         "routers": list(fleet.routers),
         "services": fleet.services,
         "readers": fleet.readers,
         "weather": fleet.weather,
     }
-    subjects = [
-        {"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names
+    return [
+        *(
+            {"id": f"role/{role}", "cert_common_names": names}
+            for role, names in roles.items()
+            if names
+        ),
+        *({"id": name, "cert_common_names": [name]} for name in (*fleet.vehicles, *fleet.owners)),
     ]
-    subjects += [
-        {"id": name, "cert_common_names": [name]} for name in (*fleet.vehicles, *fleet.owners)
+
+
+def _role_policies(fleet: Enrolment) -> list[Section]:
+    """Return the assignments of the shared rules to roles, and to all vehicles and owners."""
+    services = ["role/services"] if fleet.services else []
+    weather = ["role/weather"] if fleet.weather else []
+    readers = ["role/readers"] if fleet.readers else []
+    assigned = [
+        (["everything"], ["role/routers", *services]),
+        (["private"], services),
+        (
+            ["ask", "told", "answered", "who", "there"],
+            [*readers, *fleet.vehicles, *fleet.owners],
+        ),
+        (["weather", "weathered"], weather),
+        (["listened"], fleet.vehicles),
     ]
-    trusted = [f"role/{role}" for role in ("routers", "services") if roles[role]]
-    policies = [{"rules": ["everything"], "subjects": trusted}]
-    if fleet.services:
-        policies.append({"rules": ["private"], "subjects": ["role/services"]})
-    if public := [*(["role/readers"] if fleet.readers else []), *fleet.vehicles, *fleet.owners]:
-        policies.append({"rules": ["ask", "told", "answered", "who", "there"], "subjects": public})
-    if fleet.weather:
-        policies.append({"rules": ["weather", "weathered"], "subjects": ["role/weather"]})
-    if fleet.vehicles:
-        policies.append({"rules": ["listened"], "subjects": fleet.vehicles})
-    for name in fleet.vehicles:
-        own = _own_rules(name)
-        rules += own
-        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
-    for name, owned in fleet.owners.items():
-        if owned:
-            sees = _subscriber_rules(
-                name, [key for vehicle in owned for key in keys.private_keys(vehicle)]
-            )
-            rules += sees
-            policies.append({"rules": [rule["id"] for rule in sees], "subjects": [name]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    return [{"rules": rules, "subjects": subjects} for rules, subjects in assigned if subjects]
 
 
 def _own_rules(name: str) -> list[Section]:
