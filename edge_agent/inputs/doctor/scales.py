@@ -14,9 +14,9 @@ where the power is 1 for a quantity on the left side and -1 on the right side.
 
 An explanation is a set of faults. Its cost is the sum of the costs of its faults and of the squared
 normalised errors. Each fault costs FAULT_COST, twice its negative log probability, because faulty
-columns are rare. Every set of at most two faulty quantities is tried. The fault of a quantity is
-certain if each explanation with another fault of this quantity costs at least SETTLED more than the
-best explanation.
+columns are rare. Every set of faults is tried, because a table without units often has several
+wrong ones. The fault of a quantity is certain if each explanation with another fault of this
+quantity costs at least SETTLED more than the best explanation.
 
 Clocks are treated in the same way: the lag of an identity is the difference between the lags of two
 devices.
@@ -25,16 +25,15 @@ devices.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from edge_agent.inputs.doctor.identities import Fit
 from edge_agent.inputs.units import ANGLE, DEG, SPEED
-from schemas.numeric import FloatArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
@@ -194,21 +193,27 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
     This set has the lowest cost. Each fault adds a fixed cost, because faults are rare. Each
     identity adds the squared normalised error that remains in its gain (ratio of its two sides).
     """
-    choices = faults_of(vehicle, found["ground"])
+    choices: dict[str, list[Mistake | None]] = {
+        quantity: [None, *faults]
+        for quantity, faults in faults_of(vehicle, found["ground"]).items()
+    }
+    sets = dict(zip(choices, _index_sets(choices), strict=True))
+    factors = {
+        quantity: np.array([fault.factor if fault else 1.0 for fault in choices[quantity]])[chosen]
+        for quantity, chosen in sets.items()
+    }
     known = {name: fit for name, fit in found.items() if fit.is_known}
-    guesses, prices = zip(*_enumerate_guesses(choices), strict=True)
-    costs = np.array(prices) + sum(_misfits_of(name, fit, guesses) for name, fit in known.items())
-    best = guesses[int(np.argmin(costs))]
+    costs = _prices_of(choices, sets) + sum(
+        _misfits_of(name, fit, factors) for name, fit in known.items()
+    )
+    least = int(np.argmin(costs))
+    best = {quantity: choices[quantity][chosen[least]] for quantity, chosen in sets.items()}
     margins = dict.fromkeys(QUANTITIES, 0.0)
     for quantity in {member.quantity for name in known for member in LAWS[name].members}:
-        other = {
-            fault
-            for fault in (None, *choices[quantity])
-            if not _are_equivalent(fault, best.get(quantity))
-        }
-        rivals = costs[[guess.get(quantity) in other for guess in guesses]]
-        margins[quantity] = float(rivals.min() - costs.min())
-    return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
+        others = [not _are_equivalent(fault, best[quantity]) for fault in choices[quantity]]
+        rivals = costs[np.array(others)[sets[quantity]]]
+        margins[quantity] = float(rivals.min() - costs[least])
+    return Verdict(best, margins)
 
 
 def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
@@ -220,34 +225,46 @@ def _are_equivalent(one: Mistake | None, other: Mistake | None) -> bool:
     return abs(math.log(abs(one.factor / other.factor))) < ALIKE and one.factor * other.factor > 0.0
 
 
-def _enumerate_guesses(
-    choices: Mapping[str, list[Mistake]],
-) -> Iterator[tuple[dict[str, Mistake], float]]:
-    yield {}, 0.0
-    for count in (1, 2):
-        for quantities in combinations(QUANTITIES, count):
-            for faults in product(*(choices[quantity] for quantity in quantities)):
-                # If a unit and a wheel radius explain the drive equally well, prefer the unit.
-                odd = sum(fault.name == "radius" for fault in faults)
-                yield dict(zip(quantities, faults, strict=True)), FAULT_COST * count + odd
+def _index_sets(choices: Mapping[str, Sequence[Mistake | None]]) -> IntArray:
+    """Return every set of faults, as the index of each quantity's fault in its choices: an array
+    (quantities, sets). The first set has no fault.
+    """
+    sizes = [len(faults) for faults in choices.values()]
+    return np.indices(sizes).reshape(len(sizes), -1)
+
+
+def _prices_of(
+    choices: Mapping[str, Sequence[Mistake | None]], sets: Mapping[str, IntArray]
+) -> FloatArray:
+    """Return the summed cost (n,) of the faults in each set; see `JOINT` for groups of faults."""
+    # If a unit and a wheel radius explain the drive equally well, prefer the unit.
+    prices = sum(
+        np.array([0.0 if f is None else FAULT_COST + (f.name == "radius") for f in faults])[
+            sets[quantity]
+        ]
+        for quantity, faults in choices.items()
+    )
+    saved = np.zeros(np.shape(prices))
     for joint in JOINT:
-        chosen = {q: next(f for f in choices[q] if f.name == name) for q, name in joint}
-        yield chosen, 1.25 * FAULT_COST
+        together = np.ones(np.shape(prices), bool)
+        for quantity, name in joint:
+            named = [fault is not None and fault.name == name for fault in choices[quantity]]
+            together &= np.array(named)[sets[quantity]]
+        saved = np.maximum(saved, np.where(together, (len(joint) - 1.25) * FAULT_COST, 0.0))
+    return np.asarray(prices - saved)
 
 
-def _misfits_of(name: str, fit: Fit, guesses: Sequence[Mapping[str, Mistake]]) -> FloatArray:
+def _misfits_of(name: str, fit: Fit, factors: Mapping[str, FloatArray]) -> FloatArray:
     """Return the squared normalised error (n,) that remains in the gain of an identity for each of
-    the sets of faults `guesses`.
+    n sets of faults, which multiply each quantity by its `factors` (n,).
     """
     law = LAWS[name]
-    factors = np.full(len(guesses), law.centre)
-    for quantity, power in law.members:
-        factors *= [
-            guess[quantity].factor ** power if quantity in guess else 1.0 for guess in guesses
-        ]
-    away = np.log(abs(fit.gain) / np.abs(factors)) if fit.gain else np.full(len(guesses), 10.0)
+    gains = law.centre * np.prod(
+        [factors[quantity] ** float(power) for quantity, power in law.members], axis=0
+    )
+    away = np.log(abs(fit.gain) / np.abs(gains)) if fit.gain else np.full(len(gains), 10.0)
     costs = away**2 / (law.spread**2 + fit.error**2)
-    costs += np.where(fit.gain * factors < 0.0, WRONG_SIGN * fit.correlation**2, 0.0)
+    costs += np.where(fit.gain * gains < 0.0, WRONG_SIGN * fit.correlation**2, 0.0)
     return np.minimum(costs, 400.0)
 
 

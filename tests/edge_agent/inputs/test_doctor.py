@@ -78,6 +78,26 @@ def test_a_planted_mistake_is_named_and_does_not_pass(rough: Recorded, name: str
     assert not passed
 
 
+@pytest.mark.parametrize("wheels", ["wheels in km/h", "wheels in rpm"])
+def test_units_that_are_all_wrong_are_all_named(
+    rough: Recorded, wheels: str, tmp_path: Path
+) -> None:
+    """A table without units has g, degrees and km/h, all at once; one correction removes all."""
+    drive = rough
+    for name in ("both in g", "yaw rate in deg/s", "steering wheel in deg", wheels):
+        drive = PLANTED[name].spoil(drive)
+    said = diagnose(*drive)
+    kinds = {(finding.channel, finding.kind) for finding in said.findings}
+    named = {("ax", "g"), ("ay", "g"), ("yaw_rate", "deg/s"), ("delta", "steering wheel, deg")}
+    assert named | {("omega", PLANTED[wheels].kind)} <= kinds
+    log = write(tmp_path / "bad.parquet", drive)
+    profile = str(tmp_path / "fixed.json")
+    good = str(tmp_path / "good.parquet")
+    assert main(["check", *log, "--fix", profile]) == 1
+    assert main(["import", log[0], "--profile", profile, *log[1:], "--out", good]) == 0
+    assert main(["check", good, *log[1:]]) == 0
+
+
 def test_a_sound_drive_passes_with_its_tilts_offsets_and_lags(rough: Recorded) -> None:
     said = diagnose(*rough)
     assert said.is_passed
