@@ -55,7 +55,8 @@ CORRELATED_S: Final = 1.0  # [s] two moments count as independent if they are th
 @dataclass(frozen=True)
 class Fit:
     """Result of the fit left = gain · right + offset (+ further terms), where left and right are
-    equal by physics.
+    equal by physics. `left` and `right` are the fitted samples; the offset and the further terms
+    are subtracted from `left`.
 
     `error` is the standard deviation of ln |gain|. `lag_s` is the delay of `left` relative to
     `right` [s]. `excited_s` is the time [s] in which the signals change enough.
@@ -260,7 +261,7 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
         excited_s,
         lag,
         lag_error,
-        y,
+        rest,
         x,
         found,
         _gains_of_parts(x, rest, excited),

@@ -17,7 +17,7 @@ from schemas.numeric import FloatArray
 AXES: Final = {
     "lateral": ("v · yaw rate [m/s²]", "ay [m/s²]"),
     "longitudinal": ("dv/dt of the wheels [m/s²]", "ax [m/s²]"),
-    "steering": ("L · yaw rate / v [rad]", "delta [rad]"),
+    "steering": ("L · yaw rate [m/s]", "v · delta [m/s]"),
     "axle": ("yaw rate [rad/s]", "of the wheels [rad/s]"),
     "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
     "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
@@ -36,8 +36,8 @@ EDGE: Final = 36
 STYLE: Final = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 "
     "1em;color:#222}"
-    "table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid "
-    "#ddd;text-align:left}"
+    "table{border-collapse:collapse;margin-bottom:1.5em}td,th{padding:.2em .8em;border-bottom:1px "
+    "solid #ddd;text-align:left}"
     "figure{display:inline-block;margin:.5em}figcaption{font-size:13px;color:#555}"
     ".bad{color:#b00020}"
 )
@@ -122,7 +122,8 @@ def report_page(diagnosis: Diagnosis, title: str) -> str:
         f"<!doctype html><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
         f"<h1>{escape(title)}</h1><p>{escape(publishing_advice(diagnosis))}</p>"
         f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>"
-        f"{_identity_table(diagnosis.fits)}{plots}\n"
+        f"{_identity_table(diagnosis.fits)}<p>Each plot compares two quantities that are equal by "
+        f"physics, without offset. Grey line: equal; red line: as recorded.</p>{plots}\n"
     )
 
 
@@ -163,7 +164,7 @@ def _scatter_plot(name: str, fit: Fit) -> str:
         f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in points_at(x, y)
     )
     ends = np.array([low, high])
-    law, found = (" ".join(points_at(ends, gain * ends + fit.offset)) for gain in (1.0, fit.gain))
+    law, found = (" ".join(points_at(ends, gain * ends)) for gain in (1.0, fit.gain))
     across, up = AXES[name]
     return (
         f"<figure><svg width='{SIDE}' height='{SIDE}' viewBox='0 0 {SIDE} {SIDE}' role='img'>"
@@ -173,5 +174,5 @@ def _scatter_plot(name: str, fit: Fit) -> str:
         f"<text x='{SIDE / 2}' y='{SIDE - 8}' font-size='12' text-anchor='middle'>{across}</text>"
         f"<text x='12' y='{SIDE / 2}' font-size='12' text-anchor='middle' "
         f"transform='rotate(-90 12 {SIDE / 2})'>{up}</text>"
-        f"</svg><figcaption>{name}: gain {fit.gain:.3g} (1 is right)</figcaption></figure>"
+        f"</svg><figcaption>{name}: gain {fit.gain:.3g} (about 1 is right)</figcaption></figure>"
     )
