@@ -111,9 +111,9 @@ class Plausibility:
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "
             "from the wheels', "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
-            f"violations {self.violations / n:.1%}, resets {self.resets}"
+            f"upper bound below the grip in use {self.violations / n:.1%}, resets {self.resets}; "
         )
         bad = self.problems()
-        return (
-            f"{summary}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else summary
+        return summary + (
+            f"NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else "plausible"
         )
