@@ -365,5 +365,7 @@ def test_demo_extra_brings_what_its_processes_need(tmp_path: Path) -> None:
 
 def test_no_command_reports_the_threads_of_a_library() -> None:
     asked = "import logging, edge_agent.cli as c; c.main(['simulate', '--list']); "
-    asked += "assert not logging.getLogger('numexpr').isEnabledFor(logging.INFO)"
+    for library in ("numexpr", "matplotlib.font_manager"):
+        asked += f"assert not logging.getLogger('{library}').isEnabledFor(logging.INFO); "
+    asked += "assert logging.getLogger('schemas.runtime.link_watch').isEnabledFor(logging.INFO)"
     subprocess.run([sys.executable, "-c", asked], check=True, capture_output=True)

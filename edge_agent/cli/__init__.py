@@ -116,12 +116,13 @@ def _run_command(
     running and would keep the process from ending.
     """
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
-    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
+    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.WARNING
     logging.basicConfig(
         level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
-    # Many libraries load pandas, which imports numexpr. It reports its threads at the level INFO.
-    logging.getLogger("numexpr").setLevel(logging.WARNING)
+    if level == logging.WARNING:  # libraries report threads and caches at the level INFO
+        for package in ("edge_agent", "schemas"):
+            logging.getLogger(package).setLevel(logging.INFO)
     from edge_agent.app.publishing import left_behind
     from schemas.runtime.process import limit_memory
 
