@@ -253,7 +253,7 @@ def _check_log(table: pa.Table, signals: FloatArray) -> None:
     for name in NEEDED:
         if name not in table.column_names:
             raise InputError(
-                name, "the log has no such column", "add it in SI units (README, signal log)"
+                name, "the log has no such column", "add it in SI units, or use edge-agent import"
             )
         if np.isnan(signals[:, CHANNELS.index(name)]).all():
             raise InputError(

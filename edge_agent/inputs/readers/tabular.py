@@ -246,8 +246,8 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     for name in TIMES:
         if name in lower:
             return lower[name]
-    for name in named:  # take the first name with the word "time", such as "INS_time_sec"
-        if "time" in _WORD.findall(name.lower()):
+    for name in named:  # take the first name with such a word, such as "INS_time_sec"
+        if {"time", "timestamp", "datetime"} & set(_WORD.findall(name.lower())):
             return name
     seen = ", ".join(list(named)[:MOST_NAMES])
     raise InputError(

@@ -109,7 +109,7 @@ def test_racechrono_keeps_units_and_sources(tmp_path: Path) -> None:
     assert np.allclose(recording.signals["speed calc"].values, [10.1, 10.3])
 
 
-@pytest.mark.parametrize("title", ["# time(s)", "INS_time_sec", "Time [s]"])
+@pytest.mark.parametrize("title", ["# time(s)", "INS_time_sec", "Time [s]", "gps_timestamp"])
 def test_a_column_of_time_is_found_by_its_word(tmp_path: Path, title: str) -> None:
     recording = read_source(
         write(tmp_path / "a.csv", f"{title},ax\n0.0,1.0\n0.1,2.0\n"), None, None
