@@ -45,7 +45,7 @@ class StatusLine:
         rest = ", ".join(
             f"{name} {n}"
             for name, n in sorted(counts.as_dict().items())
-            if n and name not in set(Kind)
+            if n and name not in set(Kind) and not name.endswith("_runs")
         )
         text = (
             f"status: {counts.observations} observations ({rate:.0f}/s), {counts.states} "

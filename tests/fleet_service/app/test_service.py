@@ -483,5 +483,7 @@ def test_leaving_flushes_and_acknowledges_what_was_taken_in(
         sent = batch("sim-001", 1, now(), [0.8])
         fleet.publish(sent)
         until(lambda: len(run.service.inbox) or run.service.engine.counts.observations)
+        run.service.engine.counts.runs["checkpoint"] += 1
     until(lambda: 1 in fleet.durable["sim-001"])
     assert run.lines[-1].startswith("status: 1 observations")
+    assert "_runs" not in run.lines[-1]
