@@ -135,7 +135,7 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     ratio = vehicle.steering_ratio or 16.0
     radius = vehicle.wheel_radius
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
-    if ground.is_known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
+    if ground.is_known and 0.4 < ground.gain < 2.5 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
     angles = [
         Mistake("deg", 1.0 / ANGLE["deg"]),

@@ -143,6 +143,13 @@ def test_a_fault_of_a_channel_without_rule_is_not_corrected(rough: Recorded) -> 
     assert apply_findings(faults, profile, rough.vehicle) == (profile, rough.vehicle, faults)
 
 
+def test_a_diameter_given_as_the_radius_is_named(rough: Recorded) -> None:
+    radius = 2.0 * rough.vehicle.wheel_radius
+    vehicle = rough.vehicle.model_copy(update={"wheel_radius": radius})
+    said = diagnose(rough.t, rough.signals, vehicle)
+    assert [(finding.channel, finding.kind) for finding in said.findings] == [("omega", "radius")]
+
+
 def test_fit_removes_the_offset_from_the_samples_of_its_plot(rough: Recorded) -> None:
     fit = diagnose(*PLANTED["steering offset"].spoil(rough)).fits["steering"]
     away = fit.left - fit.gain * fit.right
