@@ -185,8 +185,9 @@ def load_vehicle(path: Path | str) -> Vehicle:
     "class:compact".
 
     Raises:
-        InputError: the file cannot be read, a field is missing or out of range, or mass and yaw
-            inertia do not fit together. The error names the field and the fix.
+        InputError: the file cannot be read, a field is missing or out of range, or fields do not
+            fit together: mass and yaw inertia, or a stiffness and the wheel's load. The error names
+            the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))
@@ -204,4 +205,12 @@ def load_vehicle(path: Path | str) -> Vehicle:
         problem = f"{of_both} has a radius of gyration of {gyration:.3g} m"
         fix = f"give kg and kg m^2: that of cars is half the wheelbase, here {wheelbase:.3g} m"
         raise InputError("mass", problem, fix)
+    # A tyre reaches the force of its load far below a slip of 1. In kN or per degree it does not.
+    load = 0.25 * vehicle.mass * GRAVITY
+    for name, value in vehicle:
+        if "stiffness" in name and value is not None and value < load:
+            problem = f"{value:g} is less than the load of a wheel, {load:.0f} N"
+            unit = "N per unit slip" if name == "longitudinal_stiffness" else "N/rad"
+            fix = f"give {unit} of one wheel; a car's is 10 to 30 times the load"
+            raise InputError(name, problem, fix)
     return vehicle
