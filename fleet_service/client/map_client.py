@@ -137,9 +137,10 @@ def query_replies(
     timeout = PAST_S if "at" in parameters else TIMEOUT_S
     for reply in session.get(f"{key}?{text}" if text else key, timeout=timeout):
         if reply.ok is None:
-            problem = reply.err.payload.to_string() if reply.err else "no reply"
-            field, _, rest = problem.partition(": ")
-            raise InputError(field if rest else "query", rest or problem, "see above")
+            reason = reply.err.payload.to_string() if reply.err else "no reply"
+            field, _, rest = reason.partition(": ")
+            problem, _, fix = rest.partition("; ")
+            raise InputError(field if rest else "query", problem or reason, fix or "ask again")
         yield str(reply.ok.key_expr), reply.ok.payload.to_bytes()
 
 

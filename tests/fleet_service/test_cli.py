@@ -108,6 +108,7 @@ def test_query_prints_a_table_or_json_and_writes_files(
         (["--route", "0,0|90,0"], "error: route: "),
         (["--config", "nowhere.json"], "error: config: "),
         (["--out", "/nowhere/at/all"], "error: out: "),
+        (["--at", "2999-01-01"], "error: at: lies in the future; give a time in the past\n"),
     ],
 )
 @pytest.mark.usefixtures("service")
