@@ -221,25 +221,65 @@ def _draw_vehicles(figure: Figure, table: pa.Table) -> None:
     order = np.argsort(-np.nan_to_num(z, nan=-1.0), kind="stable")[:MOST_ROWS]
     rows = [row for row in table.take(order).to_pylist() if row["bias"] is not None]
     axes = figure.subplots()
-    at = np.arange(len(rows))
-    spread = [Z_95 * (row["bias_std"] or 0.0) for row in rows]
-    axes.errorbar(
-        [row["bias"] for row in rows],
-        at,
-        xerr=spread,
-        fmt="o",
-        markersize=3,
-        capsize=2,
-        color=_DARK,
-        label="bias against others, 95 %",
-    )
+    bias = np.array([row["bias"] for row in rows])
+    spread = np.array([Z_95 * (row["bias_std"] or 0.0) for row in rows])
+    names = [str(row["vehicle"])[:8] for row in rows]
+    _draw_ranges(axes, names, bias, bias - spread, bias + spread, "bias against others, 95 %")
     axes.axvline(0.0, color=_MARK, linewidth=1)
-    axes.set_yticks(at, [str(row["vehicle"])[:8] for row in rows], fontsize=6)
-    axes.invert_yaxis()
     axes.set(
         xlabel="bias of μ [1]",
         ylabel="vehicle",
         title=f"the {len(rows)} most certain of {table.num_rows}",
+    )
+    axes.legend(fontsize=8)
+
+
+def _draw_ranges(
+    axes: Axes, names: list[str], middle: FloatArray, low: FloatArray, high: FloatArray, label: str
+) -> None:
+    """Draw one horizontal interval with its middle per name, the first name on top."""
+    at = np.arange(len(names))
+    axes.errorbar(
+        middle,
+        at,
+        xerr=np.maximum([middle - low, high - middle], 0.0),
+        fmt="o",
+        markersize=3,
+        capsize=2,
+        color=_DARK,
+        label=label,
+    )
+    axes.set_yticks(at, names, fontsize=6)
+    axes.invert_yaxis()
+
+
+def _draw_change_rates(figure: Figure, table: pa.Table) -> None:
+    axes = figure.subplots()
+    rate, low, high, assumed = (
+        _float_column(table, name)
+        for name in ("rate_per_hour", "rate_lower", "rate_upper", "assumed_per_hour")
+    )
+    names = [f"{row['by']}: {row['class']}" for row in table.to_pylist()]
+    _draw_ranges(axes, names, rate, low, high, "measured, 90 % interval over days")
+    axes.plot(assumed, np.arange(len(names)), "|", color=_MARK, label="assumed by the fusion")
+    axes.set(xlabel="rate at which roads become slippery or recover [1/h]", xlim=(0.0, None))
+    axes.legend(fontsize=8)
+
+
+def _draw_contract(figure: Figure, table: pa.Table) -> None:
+    shown = table.slice(0, MOST_ROWS)
+    axes = figure.subplots()
+    mean, least, most = (
+        24.0 * _float_column(shown, name) / DAY_S for name in ("breach_s", "least_s", "most_s")
+    )
+    names = [
+        f"{row['name'] or row['link']}, {row['direction']}: {row['verdict']}"
+        for row in shown.to_pylist()
+    ]
+    _draw_ranges(axes, names, mean, least, most, "by the mean; from certainly to possibly")
+    axes.set(
+        xlabel="longest time below the agreed friction [h]",
+        title=f"{shown.num_rows} of {table.num_rows} links",
     )
     axes.legend(fontsize=8)
 
@@ -294,7 +334,16 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
         np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_PANELS)).astype(int))
     ]
     panels = _make_panels(figure, len(times))
-    shapes = cell_shapes(table["cell"].to_numpy(), table["sector"].to_numpy().astype(np.int64))
+    cell = table["cell"].to_numpy()
+    west, south, *_ = grid.bounds(cell)
+    middle = np.argsort(west)[len(west) // 2]
+    # Another town would shrink this one to a dot, so show one degree around the middle cell.
+    near = np.hypot(west - west[middle], south - south[middle]) < 1.0
+    if not near.all():
+        figure.text(0.01, 0.01, f"{np.sum(~near)} rows far away left out; choose with --bbox")
+        table = table.filter(pa.array(near))
+        frame = frame[near]
+    shapes = cell_shapes(cell[near], table["sector"].to_numpy().astype(np.int64))
     for axes, time in zip(panels, times.tolist(), strict=False):
         patches = paint(axes, shapes[frame == time], _float_column(table, "mu")[frame == time])
         axes.set_title(f"{np.datetime64(time, 'us').astype('datetime64[s]')} UTC", fontsize=9)
@@ -331,6 +380,8 @@ _DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {
     "trend": _draw_trend,
     "vehicles": _draw_vehicles,
     "calibration": _draw_calibration,
+    "change-rates": _draw_change_rates,
+    "contract": _draw_contract,
     "weather": _draw_weather,
     "replay": _draw_replay,
 }

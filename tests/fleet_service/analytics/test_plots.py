@@ -85,6 +85,38 @@ def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
     assert [len(one.get_paths()) for one in hatched] == [1]
 
 
+def test_replay_leaves_out_another_town_and_says_so() -> None:
+    """A drive in another country must not shrink the town to a dot."""
+    cells = [CELL, CELL + 1, int(grid.cell_of(37.7, -122.4))]
+    frames = pa.array([NOON_US] * 3, pa.timestamp("us", tz="UTC"))
+    table = pa.table({"frame": frames, "cell": cells, "sector": [0] * 3, "mu": [0.3, 0.4, 0.9]})
+    figure = draw_figure("replay", table)
+    assert shapes(figure.axes[0]) == 2
+    assert [text.get_text() for text in figure.texts] == [
+        "1 rows far away left out; choose with --bbox"
+    ]
+
+
+def test_change_rates_show_each_class_with_its_interval() -> None:
+    one = {"by": "road temperature", "rate_per_hour": 0.2, "assumed_per_hour": 0.3}
+    rows = [
+        {**one, "class": "above 5", "rate_lower": 0.1, "rate_upper": 0.4},
+        {**one, "class": "below 0", "rate_lower": None, "rate_upper": None},
+    ]
+    (axes,) = draw_figure("change-rates", pa.Table.from_pylist(rows)).axes
+    names = ["road temperature: above 5", "road temperature: below 0"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == names
+    assert len(list_names(axes)) == 2
+
+
+def test_contract_shows_the_breach_and_the_verdict_of_each_link() -> None:
+    row: dict[str, object] = {"link": "7", "direction": "forward", "name": None}
+    row |= {"verdict": "broken", "breach_s": 7200, "least_s": 3600, "most_s": 10800}
+    (axes,) = draw_figure("contract", pa.Table.from_pylist([row])).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["7, forward: broken"]
+    assert np.asarray(axes.lines[0].get_xdata()).tolist() == [2.0]
+
+
 def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
     rows = [("measured", 0, 0.86, 0.97), ("measured", 1, 0.84, 0.96), ("bound", 0, 0.9, 0.98)]
     table = pa.Table.from_pylist(
