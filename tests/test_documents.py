@@ -11,6 +11,8 @@ import subprocess
 
 import pytest
 
+from fleet_service.cli import export
+from schemas.errors import InputError
 from schemas.runtime import commandline
 from tests import reference_pages
 from tests.results import list_pages
@@ -72,11 +74,13 @@ def test_every_command_of_every_page_is_understood() -> None:
     for page, line in found:
         name, *words = shlex.split(line)
         try:
-            commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(
+            arguments = commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(
                 commandline.join_negative_numbers(words)
             )
-        except SystemExit:
-            pytest.fail(f"{page}: {line}")
+            if words[0] == "export":
+                export.check_options(arguments)
+        except (SystemExit, InputError) as error:
+            pytest.fail(f"{page}: {line}: {error}")
 
 
 @pytest.mark.parametrize("half", HALVES)

@@ -110,12 +110,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Export from the archive, or from the live map of the running services.
-
-    Raises:
-        InputError: an option is missing, or belongs to another kind of export.
-    """
+def check_options(arguments: argparse.Namespace) -> None:
+    """Raise InputError if an option is missing, or belongs to another kind of export."""
     for name in _NOT[arguments.what]:
         if getattr(arguments, name):
             option = {"since": "from", "until": "to"}.get(name, name)
@@ -123,6 +119,11 @@ def run(arguments: argparse.Namespace) -> int:
     for name in _NEEDS[arguments.what]:
         if getattr(arguments, name) is None:
             raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Export from the archive, or from the live map of the running services."""
+    check_options(arguments)
     if arguments.what == DATEX:
         return _publish_datex(arguments)
     if arguments.what in ROUTERS:
