@@ -79,9 +79,8 @@ class StretchAlert:
             f"{self.direction}, "
             f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, "
             f"{self.mu_upper:.2f}], "
-            f"{self.vehicles} vehicles; since {format_time(self.since)}, {format_time(self.time)}; "
-            f"{self.reason}; "
-            f"id {self.id}"
+            f"{self.vehicles} vehicles; since {format_time(self.since)}, state of "
+            f"{format_time(self.time)}; {self.reason}; id {self.id}"
         )
 
 

@@ -78,7 +78,7 @@ def test_an_icy_road_in_both_directions_is_one_alert() -> None:
     assert found.state == "raised"
     assert (
         "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since "
-        "2027-01-15T08:00:00Z" in found.to_line()
+        "2027-01-15T08:00:00Z, state of 2027-01-15T08:" in found.to_line()
     )
     (north,) = take_alerts(Stretches(), *(alert(0, y) for y in range(10)))
     assert north.direction == "north-south"
