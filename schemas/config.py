@@ -139,8 +139,7 @@ class ArchiveSettings(Settings):
     store: dict[str, SecretStr] = Field(
         default_factory=dict,
         description="how obstore reaches the bucket: endpoint, region, access_key_id, "
-        "secret_access_key …; missing "
-        "options come from the environment (AWS_…)",
+        "secret_access_key …; missing options come from the environment (AWS_…)",
     )
 
     @property

@@ -62,14 +62,11 @@ STOP: Final = re.compile(r"\b(?:" + "|".join(STOP_WORDS) + r")\b", re.IGNORECASE
 NOT_PARTICIPLES: Final = {"embed", "feed", "need", "seed", "speed", "shed", "read", "spread"}
 IRREGULAR: Final = (
     "begun born bound bought brought built caught chosen come cut dealt done drawn driven eaten "
-    "fallen fed felt fit "
-    "flown forbidden forgotten found frozen given gone grown heard held hidden hit hung hurt kept "
-    "known laid led left "
-    "lent let lit lost made meant met mixed moved paid put quit read rid risen run said seen sent "
-    "set shown shut sold "
-    "spent split spoken spread stood stuck swept sworn taken taught thought thrown told torn "
-    "understood woken won worn "
-    "written"
+    "fallen fed felt fit flown forbidden forgotten found frozen given gone grown heard held "
+    "hidden hit hung hurt kept known laid led left lent let lit lost made meant met mixed moved "
+    "paid put quit read rid risen run said seen sent set shown shut sold spent split spoken "
+    "spread stood stuck swept sworn taken taught thought thrown told torn understood woken won "
+    "worn written"
 )
 PARTICIPLES: Final = set(IRREGULAR.split()) - {
     "bound",

@@ -373,8 +373,8 @@ def _campaign_section(name: str) -> Iterator[str]:
         return
     for commit, run in _read_runs(name).items():
         yield (
-            f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, "
-            f"seeds {format_seeds(run['seeds'])}"
+            f"- Commit {commit}, {run['date'][:10]}, {run['machine']}, seeds "
+            f"{format_seeds(run['seeds'])}"
         )
     tables = [table for table in TABLES if table.campaign == name]
     rows = [

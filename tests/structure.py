@@ -117,8 +117,8 @@ def light_import(root: Path) -> tuple[float, int, list[str]]:
     """
     words = (
         f"import sys, time; before = set(sys.modules); begun = time.perf_counter(); {LIGHT}; "
-        f"print(1e3 * (time.perf_counter() - begun), len(set(sys.modules) - before), "
-        f"*[name for name in {HEAVY!r} if name in sys.modules])"
+        "print(1e3 * (time.perf_counter() - begun), len(set(sys.modules) - before), *[name for "
+        f"name in {HEAVY!r} if name in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, "-c", words], cwd=root, capture_output=True, text=True, check=True

@@ -65,8 +65,7 @@ class Listener:
         standing = {(alert.cell, alert.sector): alert.raised for _, alert in alerts}
         return (
             f"{len(basis):5d} cells, {basis.count('measured'):4d} measured, {several:4d} by two or "
-            "more vehicles, "
-            f"{sum(standing.values()):3d} active alerts"
+            f"more vehicles, {sum(standing.values()):3d} active alerts"
         )
 
     def whole_map(self) -> pa.Table:

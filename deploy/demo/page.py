@@ -45,8 +45,8 @@ def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> 
     drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
     several = int(comparison.has_several_vehicles.sum())
     about = (
-        f"{cells.num_rows} cells and directions with a known true friction; {several} of "
-        "them were visited by two or more vehicles, and the figures below cover only these."
+        f"{cells.num_rows} cells and directions with a known true friction; {several} of them were "
+        "visited by two or more vehicles, and the figures below cover only these."
     )
     table = [["figure", "value", "bar", ""], *(row(figure) for figure in figures)]
     path.write_text(

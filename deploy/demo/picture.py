@@ -45,8 +45,8 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
     figure.colorbar(wide, ax=width, label="width [1]", shrink=0.8)
     figure.suptitle(
         f"{cells.num_rows} cells and directions; truth inside the interval in "
-        f"{comparison.is_covered.mean():.0%}, "
-        f"{comparison.has_several_vehicles.sum()} of them visited by two or more vehicles"
+        f"{comparison.is_covered.mean():.0%}, {comparison.has_several_vehicles.sum()} of them "
+        "visited by two or more vehicles"
     )
     figure.savefig(path, dpi=130)
 

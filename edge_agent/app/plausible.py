@@ -109,8 +109,7 @@ class Plausibility:
         n = max(self.samples, 1)
         summary = (
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} "
-            "from the wheels', "
-            f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
+            f"from the wheels', excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"upper bound below the grip in use {self.violations / n:.1%}, resets {self.resets}; "
         )
         bad = self.problems()

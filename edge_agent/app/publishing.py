@@ -104,8 +104,7 @@ def print_status(progress: Progress, publisher: Publisher, events: logging.Logge
     late = f", at most {progress.lag_s:.1f} s behind real time" if progress.behind else ""
     text = (
         f"{progress.signals_s:7.1f} s  {publisher.status.links} sessions, "
-        f"{sum(counts.published.values())} records published, "
-        f"{sum(counts.acknowledged.values())} acknowledged, "
-        f"{publisher.count_unsettled()} unsettled{late}"
+        f"{sum(counts.published.values())} records published, {sum(counts.acknowledged.values())} "
+        f"acknowledged, {publisher.count_unsettled()} unsettled{late}"
     )
     events.info(text, extra=values(event="status", **final_counts(progress, publisher)))

@@ -110,8 +110,7 @@ def report_lines(found: HeldOut) -> list[str]:
     after = found.after
     lines.append(
         f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} "
-        "-> "
-        f"{after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> "
+        f"-> {after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> "
         f"{after.contradicted:.3f}"
     )
     return lines

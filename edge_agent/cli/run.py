@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         action="append",
-        help="'simulated' (default), a signal log (Parquet), or live sources (repeat the "
-        "option for each): can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or "
+        help="'simulated' (default), a signal log (Parquet), or live sources (repeat the option "
+        "for each): can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or "
         "NAME:ADDRESS of your own plug-in",
     )
     parser.add_argument(

@@ -81,8 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--objective",
         choices=tuple(OBJECTIVES),
         help="interval score of friction (needs the truth: simulated drives' default), "
-        "log-likelihood of the"
-        " innovations, or that with a price on wrong calibration (default with logs: predictive)",
+        "log-likelihood of the innovations, or that with a price on wrong calibration (default "
+        "with logs: predictive)",
     )
     parser.add_argument(
         "--repeats",
@@ -98,8 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         help="run the study of paper 004's filter instead: figures.json, study.md, "
-        "convergence.png, "
-        "paper-aco-fckf.json",
+        "convergence.png, paper-aco-fckf.json",
     )
     parser.add_argument(
         "--quick", action="store_true", help="a few ants on short drives, as a smoke test"
@@ -167,8 +166,7 @@ def run(args: argparse.Namespace) -> int:
     evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats "
-        f"{args.repeats}"
-        " --objective "
+        f"{args.repeats} --objective "
         f"{chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
     )
     document = _make_document(
@@ -322,8 +320,8 @@ def progress_printer(
         left = elapsed / line.iteration * (iterations - line.iteration)
         write(
             f"{way:<7} {line.iteration:>3}/{iterations}   best {line.best:.4f}   mean "
-            f"{line.mean:.4f}   "
-            f"evaluations {line.evaluations:>4}   elapsed {elapsed:4.0f} s   left {left:4.0f} s"
+            f"{line.mean:.4f}   evaluations {line.evaluations:>4}   elapsed {elapsed:4.0f} s   "
+            f"left {left:4.0f} s"
         )
 
     return log_line
@@ -371,15 +369,14 @@ def comparison_table(scores: dict[str, SplitScores]) -> str:
     lines = [
         (
             f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} "
-            f"{'innovations [nat/s]':>20} "
-            f"{'NIS':>6}"
+            f"{'innovations [nat/s]':>20} {'NIS':>6}"
         )
     ]
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):
             lines.append(
                 f"{way:<8} {drives:<9} {_format_number(score.interval_score, 4):>15} "
-                f"{_format_number(score.coverage, 3):>9}"
-                f" {score.log_likelihood:>20.2f} {score.nis_ratio:>6.2f}"
+                f"{_format_number(score.coverage, 3):>9} {score.log_likelihood:>20.2f} "
+                f"{score.nis_ratio:>6.2f}"
             )
     return "\n".join(lines)

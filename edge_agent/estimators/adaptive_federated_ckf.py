@@ -223,8 +223,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "table 1",
         "35 fuzzy rules",
         "corrected",
-        "the left half grows R where alpha is negative: turned round; PMB "
-        "and PSM, which no set has, are taken as the steps beside PM",
+        "the left half grows R where alpha is negative: turned round; PMB and PSM, which no set "
+        "has, are taken as the steps beside PM",
         "adaptation.rules",
     ),
     Element(
@@ -246,8 +246,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "sub-filters and master",
         "corrected",
         "a_y and r, used by both sub-filters, have twice the variance in each; sub-filter 1 also "
-        "measures the "
-        "wheels' speed, off by wheel_speed=False",
+        "measures the wheels' speed, off by wheel_speed=False",
         "gaussian.federated_motion",
     ),
     Element(

@@ -366,10 +366,9 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(7) to (11)",
         "electric drive wheel: current, voltage, back-EMF K_a, damping b",
         "corrected",
-        "torque stands for current, because cars send no current and voltage; K_a = .06 and K_t = "
-        "11.43 are not of "
-        "one machine; K_a*omega and b*omega are losses inside the torque that is measured at the "
-        "wheel",
+        "torque stands for current, because cars send no current and voltage; K_a = .06 and K_t "
+        "= 11.43 are not of one machine; K_a*omega and b*omega are losses inside the torque that "
+        "is measured at the wheel",
         "dynamics.drive_wheel",
     ),
     Element("(12)", "Magic Formula", "as printed", where="dynamics.tyres.combined_magic"),

@@ -269,8 +269,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "Dugoff lateral force, proportional to mu",
         "option",
         "mu*F_z*C_y counts the load twice; 1/2 and mu*F_z are missing in (13). By default "
-        "stiffness does not depend "
-        "on mu, because that of a real tyre does not",
+        "stiffness does not depend on mu, because that of a real tyre does not",
         "common.tyre_option, literal.wheel_forces",
     ),
     Element(
@@ -298,8 +297,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "friction as a random walk",
         "option",
         "by default it returns to the prior over 190 m, so that it is not believed where nothing "
-        "shows it; as "
-        "printed in the literal filter",
+        "shows it; as printed in the literal filter",
         "gaussian.wheel_friction, literal.federated_friction",
     ),
     Element(
@@ -325,9 +323,8 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(54)",
         "shares beta_i by traces",
         "option",
-        "printed, the worse filter gets more, and beta = 0 divides by zero: turned round, from one "
-        "half; as "
-        "printed from one half in the literal filter",
+        "printed, the worse filter gets more, and beta = 0 divides by zero: turned round, from "
+        "one half; as printed from one half in the literal filter",
         "share_by_information, literal.federated_friction",
     ),
     Element(

@@ -261,8 +261,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "dual-motor torque output model",
         "option",
         "the mean of two wheel speeds is the axle's midpoint, the larger is the outer wheel; by "
-        "default F_x comes "
-        "from slip as in (7); i_t and eta_t are not given",
+        "default F_x comes from slip as in (7); i_t and eta_t are not given",
         "dynamics.dual_motor, Setting.dual_motor",
     ),
     Element(

@@ -33,8 +33,8 @@ from schemas.vehicle import Vehicle
 
 ESTIMATORS = {
     "aco-fckf": (
-        "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the "
-        "ant colony"
+        "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the ant "
+        "colony"
     ),
     "fckf": "the same with untuned memberships",
     "ckf": "the same without adaptation",

@@ -223,8 +223,8 @@ def _align_clocks(
         if meets[0]:
             hours = meets[0] * ZONE_S / 3600.0
             notes.append(
-                f"{recording.name}: its date is {-hours:g} h from the others', "
-                "probably because of another time zone"
+                f"{recording.name}: its date is {-hours:g} h from the others', probably because of "
+                "another time zone"
             )
             if dated is not None and recording.start_ns == dated:
                 # The date of a position receiver is correct, so the other date is shifted.

@@ -48,8 +48,7 @@ class StatusLine:
             if n and name not in set(Kind) and not name.endswith("_runs")
         )
         text = (
-            f"status: {counts.observations} observations ({rate:.0f}/s), {counts.states} "
-            "states, "
+            f"status: {counts.observations} observations ({rate:.0f}/s), {counts.states} states, "
             f"{self._engine.state.fusion.size} cells, {self._engine.alerts.count} alerts, queue "
             f"{len(self._inbox)}"
             + (f"; {rest}" if rest else "")

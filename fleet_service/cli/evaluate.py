@@ -53,8 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "exact: independence of arrival order and replay; ice: ice that appears and disappears; "
         "fleets: with and without misbehaving vehicles; attacks: malicious reports; "
         "models: fleets with other error models; fading: ageing of the belief on a dry road; "
-        "third-party: vehicles of another make; value: alerts and known roads, compared with "
-        "two simple rules; "
+        "third-party: vehicles of another make; value: alerts and known roads, compared with two "
+        "simple rules; "
         "situations: bounds, a backlog, gentle drivers, a wet curve; "
         "end-to-end: the same as --end-to-end",
     )

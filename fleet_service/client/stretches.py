@@ -76,11 +76,10 @@ class StretchAlert:
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
         return (
             f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m "
-            f"{self.direction}, "
-            f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, "
-            f"{self.mu_upper:.2f}], "
-            f"{self.vehicles} vehicles; since {format_time(self.since)}, state of "
-            f"{format_time(self.time)}; {self.reason}; id {self.id}"
+            f"{self.direction}, heading {' and '.join(self.headings)}; mu {self.mu:.2f} "
+            f"[{self.mu_lower:.2f}, {self.mu_upper:.2f}], {self.vehicles} vehicles; since "
+            f"{format_time(self.since)}, state of {format_time(self.time)}; {self.reason}; id "
+            f"{self.id}"
         )
 
 

@@ -32,10 +32,9 @@ ABOUT: Final = (
     "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % "
     "quantiles. basis: "
     "measured, or bound where only a lower bound is known; a bound has no mu. A place that no "
-    "vehicle "
-    "visited has no feature: its grip is unknown, which does not mean dry. datetime: an "
-    "instant is the map as it was then; an interval is the map as it was at its end, restricted to "
-    "cells observed since its begin."
+    "vehicle visited has no feature: its grip is unknown, which does not mean dry. datetime: an "
+    "instant is the map as it was then; an interval is the map as it was at its end, restricted "
+    "to cells observed since its begin."
 )
 # Columns that are left out, because they repeat the geometry.
 _PLACE: Final = ("latitude", "longitude", "west", "south", "east", "north")

@@ -206,8 +206,8 @@ def _acquire_under_lease(
     except CopyError as error:
         _release_and_close(lease, copy)
         fix = (
-            "check the network, endpoint, region and credentials, "
-            "then start again; no data are lost"
+            "check the network, endpoint, region and credentials, then start again; no data are "
+            "lost"
         )
         raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
     except BaseException:

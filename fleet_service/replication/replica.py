@@ -94,8 +94,8 @@ class BucketReplica:
             return self.sync_under_lease(service)
         except CopyError as error:
             fix = (
-                "check the network, endpoint, region and credentials, "
-                "then start again; no data are lost"
+                "check the network, endpoint, region and credentials, then start again; no data "
+                "are lost"
             )
             raise InputError(
                 "archive.copy", f"{self._url} cannot be used ({error})", fix

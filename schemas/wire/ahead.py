@@ -49,8 +49,8 @@ class GripWarning:
         where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
         return (
             f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least "
-            f"{self.mu_lower:.2f}), "
-            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; "
+            f"{self.mu_lower:.2f}), safe {3.6 * self.safe_speed:.0f} km/h, known for "
+            f"{self.age_s:.0f} s; {self.reason}; "
             f"id {self.id}"
         )
 

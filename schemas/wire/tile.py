@@ -71,8 +71,8 @@ def _refuse_compressed(payload: bytes) -> None:
                 raise WireError(
                     "tile",
                     "is compressed",
-                    "send it uncompressed; compressed tiles are refused because they can "
-                    "expand without limit",
+                    "send it uncompressed; compressed tiles are refused because they can expand "
+                    "without limit",
                 )
 
 

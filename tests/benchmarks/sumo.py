@@ -66,8 +66,8 @@ class Sumo:
         seconds. Most begin and end at the edge of the town.
         """
         words = (
-            f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed "
-            f"{seed} --validate"
+            f"-n net.xml -r routes.xml -e {seconds} -p {every_s} --fringe-factor 5 --seed {seed} "
+            "--validate"
         )
         self._run_program("python", f"{self._home}/tools/randomTrips.py", *words.split(), *more)
 

@@ -212,8 +212,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     assert (
         grip.line()
         == "On the new ice, after it was known: 1 of 2 warned drivers lost grip, and 1 of 1 "
-        "unwarned "
-        "drivers."
+        "unwarned drivers."
     )
     unheard = compare.lost_grip(driven, [], ice, 0.5)
     assert not len(unheard.lost), "nobody knew of it"

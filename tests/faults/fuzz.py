@@ -109,8 +109,8 @@ def run(site: Site) -> list[Figure]:
             pasts = pasts - past
         if not turn % 200:
             site.say(
-                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts.observations} "
-                "rows admitted"
+                f"{turn * TURN} malformed, {crashes} crashes, {engine.counts.observations} rows "
+                "admitted"
             )
     refused = engine.counts.refused.total()
     engine.close()

@@ -224,8 +224,8 @@ def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
         words = (
-            f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} "
-            "steps: status bits?"
+            f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: "
+            "status bits?"
         )
         diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
         signals[rows[off], S.OMEGA + i] = np.nan

@@ -120,8 +120,7 @@ def judge_towns(
             f"town {town.seed}{' in winter' if town.winter else ''}, {town.kind}, "
             f"{town.seconds:.0f} s: "
             f"ice visits with a value {tally.mean('ice.yield'):.2f}, passes found "
-            f"{tally.mean('passes.ice'):.2f}, "
-            f"false ice {tally.mean('false_ice'):.5f}"
+            f"{tally.mean('passes.ice'):.2f}, false ice {tally.mean('false_ice'):.5f}"
         )
     return results
 

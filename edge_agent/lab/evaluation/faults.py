@@ -113,8 +113,8 @@ CASES: Final = {
     "wrong-steering-zero": Case(
         (Fault("bias", "delta_fl", size=0.003), Fault("bias", "delta_fr", size=0.003)),
         Health.OK,
-        "3 degrees at the steering wheel: not reported; the steering offset is a state of "
-        "the filter",
+        "3 degrees at the steering wheel: not reported; the steering offset is a state of the "
+        "filter",
     ),
     "one-wheel-speed-lost": Case(
         (Fault("dropout", "omega_rl", BEGINS),),

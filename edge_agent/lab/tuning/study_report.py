@@ -179,8 +179,8 @@ def markdown(listed: Sequence[Figure]) -> str:
         rows.append(f"| {title} | log likelihood [nat/s] | {cells} |")
     gain = "tuning.colony_over_random.held_out"
     summary = (
-        f"Colony over random search of the same seed and budget, held out: {cell(gain)} nat/s,"
-        f" better in {100 * values[f'{gain}.wins']:.0f} % of the searches."
+        f"Colony over random search of the same seed and budget, held out: {cell(gain)} nat/s, "
+        f"better in {100 * values[f'{gain}.wins']:.0f} % of the searches."
     )
     return "\n".join(rows) + f"\n\n{summary}\n"
 

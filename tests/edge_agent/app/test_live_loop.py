@@ -174,8 +174,7 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     assert told == [
         (
             "vehicle 1: abs_active has been on since the start: it is treated as unknown; "
-            "correct the "
-            "profile"
+            "correct the profile"
         )
     ]
     for name in plain.taken[0].columns.keys() - {"abs_active", "air_temperature"}:

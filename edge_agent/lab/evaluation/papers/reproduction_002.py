@@ -194,9 +194,8 @@ NOTES: Final = (
         "read as per cent."
     ),
     (
-        "Wheel torque replaces motor current, because cars do not send the current. K_a, K_t and J "
-        "of table 1 are not of one machine; J is used as printed, which leaves the wheels "
-        "slow."
+        "Wheel torque replaces motor current, because cars do not send the current. K_a, K_t and "
+        "J of table 1 are not of one machine; J is used as printed, which leaves the wheels slow."
     ),
     (
         "With ordinary sensors the default estimator's error of v_x in the sine is the error of "
@@ -206,8 +205,8 @@ NOTES: Final = (
         "(`lab.evaluation.oracle`)."
     ),
     (
-        "Friction is set by hand in the paper and here. Tables 6 and 7 (road test) repeat "
-        "tables 2 and 3 digit for digit."
+        "Friction is set by hand in the paper and here. Tables 6 and 7 (road test) repeat tables "
+        "2 and 3 digit for digit."
     ),
 )
 

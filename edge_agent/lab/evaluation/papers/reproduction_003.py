@@ -187,8 +187,8 @@ NOTES: Final = (
     ),
     (
         "The figures of sensors without error hold for a wheel radius that is known exactly. "
-        "At constant speed an error of 1e-4 of the radius, or .003 rad/s of noise on the "
-        "wheel speeds, is enough to spoil the result: see the last table."
+        "At constant speed an error of 1e-4 of the radius, or .003 rad/s of noise on the wheel "
+        "speeds, is enough to spoil the result: see the last table."
     ),
     (
         "At a constant .6 g the default estimator finds a lower limit of μ and no more: slip and "
