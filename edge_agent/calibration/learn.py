@@ -73,9 +73,9 @@ BIAS: Final = {
     "radius": 0.0001,
     "ax": 0.02,
     "ay": 0.25,
-    "yaw_rate": 0.0005,
+    "yaw_rate": 0.0007,
     "steer_offset": 0.0004,
-    "steer_gain": 0.015,
+    "steer_gain": 0.02,
     "force_gain": 0.008,
     "understeer": 0.0002,
     "wheel_lag": 0.006,
@@ -104,8 +104,8 @@ STEERED_M_S: Final = 5.0  # [m/s] minimum speed at which the path shows the stee
 LINEAR: Final = 4.0  # [m/s^2] largest v·r at which understeer is proportional to it
 # [rad] minimum standard deviation of the steering angle from the regression. A steering ratio that
 # varies with the angle, and tyres on slippery road, make errors of this size for seconds. With .001
-# the errors of the gain were 1.7 of their standard deviations instead of 1.1, and larger by 40 %.
-LEAST_ANGLE: Final = 0.004
+# the errors of the gain were 1.7 of their standard deviations instead of 1.3, and larger by 30 %.
+LEAST_ANGLE: Final = 0.003
 TRACED: Final = ("steer_offset", "steer_gain", "understeer")
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 ROBUST: Final = 1.4826
