@@ -91,10 +91,11 @@ class TripEnds:
         """
         vehicle = records.vehicle
         t = self._t[-1, vehicle] - (self._now[vehicle] - records.columns[_TIME[records.kind]]) / NS
-        begin, end = self._t[:, vehicle]
-        before, after = self._driven[:, vehicle]
-        share = np.clip((t - begin) / np.maximum(end - begin, np.finfo(np.float64).tiny), 0.0, 1.0)
-        return _PlacedRecords(records, t, before + (after - before) * share)
+        begin = self._t[0, vehicle]
+        duration = np.maximum(self._t[1, vehicle] - begin, np.finfo(np.float64).tiny)
+        share = np.clip((t - begin) / duration, 0.0, 1.0)
+        before = self._driven[0, vehicle]
+        return _PlacedRecords(records, t, before + (self._driven[1, vehicle] - before) * share)
 
 
 class _PlacedRecords(NamedTuple):

@@ -81,6 +81,7 @@ from typing import Any, Final, NamedTuple
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import Term
 from schemas.errors import InputError
+from schemas.runtime.steady_clock import elapsed_seconds
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
@@ -91,7 +92,6 @@ HINT: Final = 0.6
 # [s] Period in which a standby downloads new objects, so that little is left to download at a
 # take-over.
 AHEAD_S: Final = 10.0
-_BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 UNKNOWN: Final = "unknown"  # holder's name if the lease object is damaged
 LOOK_S: Final = 0.25  # [s] period of the checks while waiting
 
@@ -433,13 +433,6 @@ class _HolderWatch:
         has_lost_token = self._had_token and not self._has_token
         stale_s = self._lease_s * (HINT if has_lost_token else 1.0)
         return time.monotonic() - self._since >= stale_s
-
-
-def elapsed_seconds() -> float:
-    """Return elapsed time [s] of a monotonic clock. On Linux it includes time in which the machine
-    was suspended.
-    """
-    return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:

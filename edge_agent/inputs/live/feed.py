@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
 from edge_agent.inputs.recording import Series
+from schemas.runtime.steady_clock import elapsed_seconds
 from schemas.thresholds import NS
 
 BELIEVED_S: Final = 1.0  # [s] maximum delay at which the stamps of a source are used unchanged
@@ -39,15 +40,6 @@ Heard: TypeAlias = tuple[float, Any]
 log = logging.getLogger(__name__)
 
 
-def _steady_seconds() -> float:
-    """Return the time [s] of a clock that never jumps. It includes the time for which the host was
-    suspended, where the system counts it; `monotonic` of Linux does not.
-    """
-    if hasattr(time, "CLOCK_BOOTTIME"):
-        return time.clock_gettime(time.CLOCK_BOOTTIME)
-    return time.monotonic()
-
-
 @dataclass(frozen=True)
 class HostClock:
     """Clock of the host (this computer). It stores the UTC time [ns] at which it was started, and
@@ -55,11 +47,11 @@ class HostClock:
     """
 
     start_ns: int = field(default_factory=time.time_ns)
-    steady_s: float = field(default_factory=_steady_seconds)
+    steady_s: float = field(default_factory=elapsed_seconds)
 
     def now(self) -> float:
         """Return the time [s] since the start of the host's clock."""
-        return _steady_seconds() - self.steady_s
+        return elapsed_seconds() - self.steady_s
 
     def seconds_of(self, stamp_ns: int) -> float:
         """Return the time [s] from the start of the host's clock to the instant `stamp_ns` [ns

@@ -187,8 +187,8 @@ def test_records_are_stored_if_the_source_of_samples_fails(
 ) -> None:
     fleet, parts = fleet_blocks(10)
     spool = tmp_path / "spool.sqlite"
-    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
-    config = AgentConfig(zenoh=nobody, spool=spool, flush_s=60.0)
+    unreachable = ZenohSettings(connect=["tcp/127.0.0.1:9"])
+    config = AgentConfig(zenoh=unreachable, spool=spool, flush_s=60.0)
 
     def blocks() -> Iterator[Block]:
         yield from parts

@@ -153,9 +153,13 @@ def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
     router.stop()
 
 
+def config_without_router(folder: Path) -> AgentConfig:
+    unreachable = ZenohSettings(connect=["tcp/127.0.0.1:9"])
+    return AgentConfig(zenoh=unreachable, spool=folder / "spool.sqlite", flush_s=0.05)
+
+
 def test_without_a_router_it_exits_in_time_and_keeps_everything(tmp_path: Path) -> None:
-    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
-    config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
+    config = config_without_router(tmp_path)
     publisher = publisher_of(config)
     observations, _ = drive()
     publisher.offer(observations)
@@ -277,8 +281,7 @@ def test_a_full_disk_is_waited_for(
 def test_records_that_the_disk_never_accepted_count_as_dropped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
-    config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
+    config = config_without_router(tmp_path)
     outbox = Outbox(config.spool)
     outbox._file.begin_transaction().execute("PRAGMA query_only = ON")
     publisher = Publisher(NAMES, outbox, config, "test")

@@ -114,9 +114,12 @@ def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> 
     outbox.close()
 
 
-def damage_page(path: Path) -> None:
+def damaged_file(folder: Path) -> Path:
+    path = folder / "spool.sqlite"
+    store_batches(path)
     image = path.read_bytes()
     path.write_bytes(image[: 5 * PAGE] + bytes(PAGE) + image[6 * PAGE :])
+    return path
 
 
 def raise_full_disk(_: Path) -> NoReturn:
@@ -126,9 +129,7 @@ def raise_full_disk(_: Path) -> NoReturn:
 def test_a_start_after_a_failed_recovery_finds_the_batches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "spool.sqlite"
-    store_batches(path)
-    damage_page(path)
+    path = damaged_file(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(spool_file, "_readable_batches", raise_full_disk)
         with pytest.raises(InputError, match="No space left"):
@@ -142,9 +143,7 @@ def test_a_start_after_a_failed_recovery_finds_the_batches(
 def test_a_recovery_interrupted_between_its_renames_is_completed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "spool.sqlite"
-    store_batches(path)
-    damage_page(path)
+    path = damaged_file(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", stop_after_one_rename(Path.rename))
         with pytest.raises(InputError, match="crash"):

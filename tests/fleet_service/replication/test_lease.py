@@ -425,7 +425,8 @@ def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     now = [100.0]
     # `monotonic` stops while a machine is suspended, so the lease must not use it.
     clock = SimpleNamespace(monotonic=lambda: 0.0, clock_gettime=lambda _: now[0], time=time.time)
-    monkeypatch.setattr("fleet_service.replication.lease.time", clock)
+    for module in ("fleet_service.replication.lease", "schemas.runtime.steady_clock"):
+        monkeypatch.setattr(f"{module}.time", clock)
     lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)
     fresh = [lease.may_acknowledge]
     assert lease.wait(threading.Event(), print, lambda: 0, None)

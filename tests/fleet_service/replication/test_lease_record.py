@@ -155,7 +155,8 @@ class VirtualStop(threading.Event):
         clock = SimpleNamespace(
             monotonic=lambda: self._now_s, clock_gettime=lambda _: self._now_s, time=time.time
         )
-        monkeypatch.setattr("fleet_service.replication.lease.time", clock)
+        for module in ("fleet_service.replication.lease", "schemas.runtime.steady_clock"):
+            monkeypatch.setattr(f"{module}.time", clock)
 
     def wait(self, timeout: float | None = None) -> bool:
         assert timeout is not None
