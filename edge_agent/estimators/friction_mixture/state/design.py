@@ -105,14 +105,13 @@ def design_of(
     sets. Studies pass other `constants`; other tyres need another `curve`.
     """
     constants = constants or Constants()
-    mu, width = node_table(NODES)
-    prior = friction_prior(mu, width, constants.physical.common_mu)
+    nodes = _node_tables(constants.physical.common_mu, constants.physical.split_prior)
     return MixtureDesign(
         constants=constants,
-        mu=mu,
-        width=width,
-        prior=prior,
-        sides=side_table(mu, prior, constants.physical.split_prior),
+        mu=nodes.mu,
+        width=nodes.width,
+        prior=nodes.prior,
+        sides=nodes.sides,
         curve=curve_tables(curve) if curve else _usual_curve(constants.physical.curve_c),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
@@ -121,6 +120,29 @@ def design_of(
         scales=np.exp(np.array(memberships.ln_scales)),
         adaptive=adaptive,
     )
+
+
+class NodeTables(NamedTuple):
+    """Tables of the nodes (friction hypotheses); see `MixtureDesign`."""
+
+    mu: FloatArray
+    width: FloatArray
+    prior: FloatArray
+    sides: Sides
+
+
+@cache
+def _node_tables(common_mu: float, split_prior: float) -> NodeTables:
+    """Return the tables of the nodes (friction hypotheses). They are kept, because computing them
+    takes as long as estimating several seconds of a drive.
+
+    Args:
+        common_mu: friction up to which all values are equally probable a priori [1].
+        split_prior: prior probability of different friction left and right [1].
+    """
+    mu, width = node_table(NODES)
+    prior = friction_prior(mu, width, common_mu)
+    return NodeTables(mu, width, prior, side_table(mu, prior, split_prior))
 
 
 @cache
