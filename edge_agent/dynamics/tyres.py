@@ -100,8 +100,8 @@ def combined_magic(
 def combined_dugoff(
     slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
-    """Return the forces (Fx, Fy) [N] of one wheel in its own frame at combined slip (longitudinal
-    and lateral) with the Dugoff curve f.
+    """Return the forces (Fx, Fy) [N] of one wheel in its own frame at combined slip with the Dugoff
+    curve f.
 
     Similarity method: the normalised slips of both directions form a vector of length theta. The
     force has the direction of this vector and the size mu*load*f(theta). Up to theta = 1/2,

@@ -27,9 +27,9 @@ def carlson_update(
     """Update the filter in place with a `reading`: a direct measurement of state i whose noise has
     the `variance` > 0.
 
-    Return (squared innovation divided by a, a), where a is the variance of the innovation
-    (measurement minus prediction). L stays triangular (Carlson 1973): its rows are rotated by 2 x 2
-    rotations whose cosines come from sums of squares only. gain (n,) is scratch memory.
+    Return (squared innovation divided by a, a), where a is the variance of the innovation. L stays
+    triangular (Carlson 1973): its rows are rotated by 2 x 2 rotations whose cosines come from sums
+    of squares only. gain (n,) is scratch memory.
     """
     n = mean.shape[0]
     for k in range(n):

@@ -100,7 +100,7 @@ def unscented_rule(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule
 
 def cubature_rule(n: int) -> SigmaRule:
     """Return points and weights of the third-degree spherical-radial rule for n dimensions
-    (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i (unit vectors) with weights 1/(2n).
+    (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i with weights 1/(2n).
     """
     if n < 1:
         raise InputError("cubature", "n must be at least 1", "give the dimension of the state")

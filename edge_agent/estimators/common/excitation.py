@@ -30,9 +30,7 @@ class Excitation:
 
 @compiled
 def begin_excitation(ring: Excitation) -> None:
-    """Reset the ring of time slots (short intervals) that records the grip used. Afterwards it
-    contains no grip.
-    """
+    """Reset the ring of time slots that records the grip used. Afterwards it contains no grip."""
     ring.largest_time = -math.inf
     for k in range(SLOTS):
         ring.time[k] = -math.inf
@@ -40,8 +38,8 @@ def begin_excitation(ring: Excitation) -> None:
 
 @compiled
 def note_excitation(ring: Excitation, time: float, used: float) -> None:
-    """Store `used`, the grip used (force over load) at `time` [s], in the ring of time slots (short
-    intervals). Update `ring.largest`, the largest value of the last second.
+    """Store `used`, the grip used at `time` [s], in the ring of time slots. Update `ring.largest`,
+    the largest value of the last second.
     """
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:
@@ -58,8 +56,8 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
 
 @compiled
 def _find_largest(ring: Excitation, time: float) -> None:
-    """Search all time slots (short intervals) of the last second for the largest grip used, and
-    store it in `ring.largest`. This is needed when the slot of the previous maximum has expired.
+    """Search all time slots of the last second for the largest grip used, and store it in
+    `ring.largest`. This is needed when the slot of the previous maximum has expired.
     """
     ring.largest = 0.0
     for k in range(SLOTS):

@@ -88,9 +88,9 @@ def step(
 
 @compiled
 def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Process the block (the samples within 0.05 s) that ends: run one step of the friction mixture
-    (the filters of all friction hypotheses) with the sums over the block's samples. The next block
-    begins at the time of the last sample.
+    """Process the block that ends: run one step of the friction mixture (the filters of all
+    friction hypotheses) with the sums over the block's samples. The next block begins at the time
+    of the last sample.
     """
     features = scratch.features
     features.duration = memory.last.time - memory.block.time
@@ -121,8 +121,8 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 
 @compiled
 def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Prepare the prediction over the block (0.05 s): compute the process variances of the states,
-    and the factors by which vehicle and sensor states return to their prior.
+    """Prepare the prediction over the block: compute the process variances of the states, and the
+    factors by which vehicle and sensor states return to their prior.
     """
     block = memory.block
     constants = design.constants
@@ -217,8 +217,8 @@ def turned_velocity(
     """Return the mean velocity (v_x, v_y) [m/s] of the mixture of filters at the current time, in
     the current vehicle axes.
 
-    Since the block (0.05 s) began, the vehicle has turned by the angle with cosine `cos` and sine
-    `sin`, and has gained the velocity `gain`.
+    Since the block began, the vehicle has turned by the angle with cosine `cos` and sine `sin`, and
+    has gained the velocity `gain`.
     """
     x = memory.overall_mean
     gained_x, gained_y = gained_velocity(

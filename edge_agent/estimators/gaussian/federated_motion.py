@@ -257,7 +257,7 @@ def mean_wheel_velocity(row: FloatArray, track: InputTrack, x: FloatArray, yaw_r
 @compiled
 def widened_speed_std(std: float, innovation: float) -> float:
     """Return the standard deviation `std` [m/s] of the measured wheel speed, increased if the
-    innovation (measurement minus prediction) is large.
+    innovation is large.
 
     The increase limits the innovation to FARTHEST standard deviations, so that spinning or locked
     wheels have little effect.

@@ -60,9 +60,9 @@ def strained_noise(trust: Trust, constants: Constants) -> float:
 
 @compiled
 def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Compute the inputs of the measurement equations from the sums of the block (the samples
-    within 0.05 s), and write them to `features`; return the health flags. The caller has already
-    set `duration` and `speed` of `features`.
+    """Compute the inputs of the measurement equations from the sums of the block, and write them to
+    `features`; return the health flags. The caller has already set `duration` and `speed` of
+    `features`.
     """
     row = memory.row
     last = memory.last
@@ -113,8 +113,8 @@ def _turn_wheel(row: FloatArray, features: BlockFeatures, wheel: int) -> None:
 
 @compiled
 def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
-    """Return the mean of the valid samples of a channel in the block (the samples within 0.05 s),
-    or `otherwise` if the channel has no valid sample.
+    """Return the mean of the valid samples of a channel in the block, or `otherwise` if the channel
+    has no valid sample.
     """
     return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
 
@@ -133,8 +133,7 @@ def _average_kinematics(block: BlockSums, features: BlockFeatures) -> None:
 
 @compiled
 def _steer_rate(memory: MixtureMemory, duration: float) -> float:
-    """Return the rate of change of the mean front steering angle within the block (the samples
-    within 0.05 s) [rad/s]."""
+    """Return the rate of change of the mean front steering angle within the block [rad/s]."""
     now = memory.last.delta
     before = memory.last.delta_before
     return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)

@@ -70,7 +70,7 @@ def lower_while_sliding(slides: float, used: float, lower: float, error: float) 
 
     Args:
         slides: fuzzy degree to which a wheel slides, 0 to 1.
-        used: grip (force over load) used within the last second, of the axle that uses more [1].
+        used: grip used within the last second, of the axle that uses more [1].
         lower: lower end according to the probabilities of the assumed friction values [1].
         error: relative error of the grip in use, from mass, torque and load [1].
     """

@@ -52,8 +52,8 @@ REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and
 def take_sample(
     memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample (18,) at `time` [s] to the current block (the samples within 0.05 s). Return the
-    health flags of the sample, and True if the block is complete.
+    """Add a sample (18,) at `time` [s] to the current block. Return the health flags of the sample,
+    and True if the block is complete.
     """
     last = memory.last
     dt = time - last.time
@@ -149,7 +149,7 @@ def _integrate_motion(
     memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
 ) -> None:
     """Integrate, over a further step of `dt` [s], the velocity that the vehicle has gained since
-    the beginning of the block (0.05 s). It is expressed in the current vehicle axes.
+    the beginning of the block. It is expressed in the current vehicle axes.
 
     The solution is exact for inputs that are constant over dt. `ax` and `ay` [m/s^2] are NaN where
     missing; `turning` is True if the yaw rate is known.

@@ -49,7 +49,7 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 
 @compiled
 def sliding_degree(memory: MixtureMemory) -> float:
-    """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the current block (0.05 s)."""
+    """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the current block."""
     return float(memory.slip.held - memory.slip.ended)
 
 
@@ -75,8 +75,8 @@ def slow_noise(fastest: float) -> float:
 
 @compiled
 def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
-    """Compute the fuzzy truth value, 0 to 1, of "a wheel slides" from the wheel speeds of the block
-    (0.05 s).
+    """Compute the fuzzy truth value, 0 to 1, of "a wheel slides" from the wheel speeds of the
+    block.
     """
     slowest = math.inf
     fastest = -math.inf

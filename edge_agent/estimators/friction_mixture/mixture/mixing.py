@@ -54,8 +54,8 @@ LARGEST_DRIFT = 0.5
 
 @compiled
 def active_nodes(memory: MixtureMemory) -> int:
-    """Return the number of active nodes (friction hypotheses). It is NODES, or ALL_NODES while the
-    nodes of split roads (different friction left and right) are active too.
+    """Return the number of active nodes. It is NODES, or ALL_NODES while the nodes of split roads
+    (different friction left and right) are active too.
     """
     return ALL_NODES if memory.split else NODES
 
@@ -88,9 +88,7 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
 
 @compiled
 def _put_moments(memory: MixtureMemory, node: int) -> None:
-    """Set mean and covariance of the node (filter of one friction hypothesis) with index `node` to
-    those of the whole mixture.
-    """
+    """Set mean and covariance of the node with index `node` to those of the whole mixture."""
     group = node // LANES
     lane = node % LANES
     for i in range(STATES):
@@ -103,8 +101,8 @@ def _put_moments(memory: MixtureMemory, node: int) -> None:
 def apply_road_change(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float
 ) -> None:
-    """Move probability between the nodes (friction hypotheses), because the road may have changed
-    within the last `metres`.
+    """Move probability between the nodes, because the road may have changed within the last
+    `metres`.
 
     Also compute scratch.mixing: for each node, the share of its probability that came from all
     nodes by a sudden change. `mix_nodes` then replaces this share of the node's state by that of
@@ -175,9 +173,8 @@ def share_weights(memory: MixtureMemory, scratch: Scratch) -> None:
 
 @compiled
 def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
-    """Mix the states of a group of nodes (friction hypotheses) after a road change has moved
-    probability to them. In each node, the share scratch.mixing of the state is replaced by the
-    state of the whole mixture.
+    """Mix the states of a group of nodes after a road change has moved probability to them. In each
+    node, the share scratch.mixing of the state is replaced by the state of the whole mixture.
     """
     zeta = lanes_at(scratch.mixing, group)
     zeta = select(zeta < LEAST_MIXING, 0.0, zeta)
@@ -193,8 +190,8 @@ def mix_nodes(memory: MixtureMemory, scratch: Scratch, group: int) -> None:
 
 @compiled
 def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
-    """Compute mean (n,) and covariance (n, n) of the mixture of all active nodes (filters of one
-    friction hypothesis each), weighted by scratch.share, and store them in `memory`.
+    """Compute mean (n,) and covariance (n, n) of the mixture of all active nodes, weighted by
+    scratch.share, and store them in `memory`.
     """
     groups = (active_nodes(memory) + LANES - 1) // LANES
     apart = scratch.apart
@@ -224,9 +221,9 @@ def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
 def reset_diverged(
     memory: MixtureMemory, scratch: Scratch, weight: FloatArray, constants: Constants
 ) -> None:
-    """Reset diverged nodes (filters of one friction hypothesis): each gets the state of the most
-    probable node, and a probability of almost zero. A node has diverged if its velocity after the
-    measurements, scratch.updated, is far from that of the most probable node.
+    """Reset diverged nodes: each gets the state of the most probable node, and a probability of
+    almost zero. A node has diverged if its velocity after the measurements, scratch.updated, is far
+    from that of the most probable node.
     """
     best = int(np.argmax(weight))
     velocity = scratch.updated
@@ -245,7 +242,7 @@ def reset_diverged(
 
 @compiled
 def _copy_node(memory: MixtureMemory, target: int, source: int) -> None:
-    """Set mean and covariance of the node (friction hypothesis) `target` to those of `source`."""
+    """Set mean and covariance of the node `target` to those of `source`."""
     mean = memory.mean
     covariance = memory.covariance
     group = target // LANES

@@ -117,8 +117,8 @@ def update_consistency(
 
 @compiled
 def unexplained_share(memory: MixtureMemory, design: MixtureDesign) -> float:
-    """Return the share of the axles' squared innovations (measurement minus prediction) that counts
-    as a contradiction of the model, because neither a slide nor slippery road explains it.
+    """Return the share of the axles' squared innovations that counts as a contradiction of the
+    model, because neither a slide nor slippery road explains it.
 
     While a wheel slides, or the road is estimated to be slippery, the axles' forces differ from the
     model for a while. Wrong signals also look like a slippery road, so the belief in it explains at
@@ -199,7 +199,7 @@ def used_evidence_share(trust: Trust, constants: Constants) -> float:
 @compiled
 def axles_ratio(ratio: float) -> float:
     """Return the log-likelihood ratio [nat] of two hypotheses about the variance of the axles'
-    innovations (measurement minus prediction): FACTOR times the stated variance, or the stated
-    variance. `ratio` is the sum of the squared innovations over the stated variance.
+    innovations: FACTOR times the stated variance, or the stated variance. `ratio` is the sum of the
+    squared innovations over the stated variance.
     """
     return (1.0 - 1.0 / FACTOR) * ratio - math.log(FACTOR)

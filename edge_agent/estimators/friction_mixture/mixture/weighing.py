@@ -74,11 +74,10 @@ def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) 
 
 @compiled
 def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Advance all groups of active nodes (filters of one friction hypothesis each) by one block
-    (0.05 s). Mix their states after a road change, apply the measurements, and predict to the
-    block's end. Store the predictive log-likelihood of the mixture, and its NIS. The NIS is the
-    squared innovation (measurement minus prediction) over its variance, averaged over the
-    measurements.
+    """Advance all groups of active nodes by one block. Mix their states after a road change, apply
+    the measurements, and predict to the block's end. Store the predictive log-likelihood of the
+    mixture, and its NIS. The NIS is the squared innovation (measurement minus prediction) over its
+    variance, averaged over the measurements.
     """
     features = scratch.features
     inflation = max(design.constants.physical.correlation_time / features.duration, 1.0)
@@ -117,8 +116,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 
 @compiled
 def mixture_likelihood(scratch: Scratch, groups: int) -> float:
-    """Return the log-likelihood [nat] of the measurements of the block (0.05 s) under the whole
-    mixture of friction hypotheses.
+    """Return the log-likelihood [nat] of the measurements of the block under the whole mixture of
+    friction hypotheses.
     """
     top = -math.inf
     for group in range(groups):
@@ -134,8 +133,8 @@ def mixture_likelihood(scratch: Scratch, groups: int) -> float:
 
 @compiled
 def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Weaken (temper) the log-likelihoods [nat] of all nodes (friction hypotheses) in a block (0.05
-    s), and store them in scratch.log_likelihood.
+    """Weaken (temper) the log-likelihoods [nat] of all nodes in a block, and store them in
+    scratch.log_likelihood.
 
     Each node's log-likelihood relative to that of the best node is multiplied by a factor from 0 to
     1. Fuzzy rules determine this factor, or a formula if the filter is not adaptive. A loss beyond
@@ -176,8 +175,8 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
 
 @compiled
 def charge_penalty(memory: MixtureMemory, node: int, price: float) -> float:
-    """Return the amount [nat] by which the log-likelihood of a node (friction hypothesis) must be
-    reduced in this block (0.05 s). Add this amount to the node's total, memory.penalty[node].
+    """Return the amount [nat] by which the log-likelihood of a node must be reduced in this block.
+    Add this amount to the node's total, memory.penalty[node].
 
     `price` [nat] grows with the distance by which the block has moved the node's vehicle states
     away from their prior. It is negative if the states have moved back. The result is then a
@@ -202,7 +201,7 @@ def update_novelty(
 
     features.new is large if forces or slips differ from their usual values, which are moving
     averages over the last seconds. The function also updates these averages. (vx, vy) [m/s] is the
-    mean velocity in the block (0.05 s).
+    mean velocity in the block.
     """
     constants = design.constants
     keep = math.exp(-features.duration / constants.chosen.window)
@@ -296,9 +295,8 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the actual and expected variance of the innovations (measurement minus prediction),
-    averaged over the latest blocks (of 0.05 s each). Compute from them the factors on the
-    measurement noise R for the next block.
+    """Update the actual and expected variance of the innovations, averaged over the latest blocks
+    (of 0.05 s each). Compute from them the factors on the measurement noise R for the next block.
     """
     keep = math.exp(-scratch.features.duration / design.constants.chosen.window)
     for group in range(2):

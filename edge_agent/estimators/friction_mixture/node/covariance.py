@@ -37,11 +37,10 @@ def symmetric_at(covariance: FloatArray, i: int, j: int) -> float:
 @compiled
 def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
     """Compute the first CURVED columns of the lower-triangular (Cholesky) factors of the state
-    covariances, one factor per node (friction hypothesis). Write them to `root` (n, CURVED, LANES),
-    with n states and LANES nodes.
+    covariances, one factor per node. Write them to `root` (n, CURVED, LANES), with n states and
+    LANES nodes.
 
-    The measurements are nonlinear only in the first CURVED states. A pivot (squared diagonal
-    element) is at least TINY.
+    The measurements are nonlinear only in the first CURVED states. A pivot is at least TINY.
     """
     for j in range(CURVED):
         total = lanes_at(covariance, (j, j))
@@ -63,10 +62,9 @@ def factorize_first(covariance: FloatArray, root: FloatArray) -> None:
 def subtract_row(
     mean: FloatArray, covariance: FloatArray, h: FloatArray, per: float, step: float
 ) -> None:
-    """Apply one scalar measurement to the filters of a group of nodes (friction hypotheses): m +=
-    h*step and P -= h*h'*per, with the means m and the covariances P. Here `h` (n, LANES) is the
-    covariance of the states with the measurement, `step` is nu/a (innovation over its variance) and
-    `per` is 1/a.
+    """Apply one scalar measurement to the filters of a group of nodes: m += h*step and P -=
+    h*h'*per, with the means m and the covariances P. Here `h` (n, LANES) is the covariance of the
+    states with the measurement, `step` is nu/a (innovation over its variance) and `per` is 1/a.
     """
     for i in range(mean.shape[0]):
         own = lanes_at(h, i)
@@ -85,8 +83,8 @@ def mix_states(
     overall_mean: FloatArray,
     overall_covariance: FloatArray,
 ) -> None:
-    """Replace the share z of the state of each node (friction hypothesis) by the state of the whole
-    mixture (moment matching). `mean` (n, LANES) and `covariance` are changed in place.
+    """Replace the share z of the state of each node by the state of the whole mixture (moment
+    matching). `mean` (n, LANES) and `covariance` are changed in place.
     """
     for i in range(mean.shape[0]):
         apart = z * (1.0 - z) * (overall_mean[i] - lanes_at(mean, i))
@@ -110,7 +108,7 @@ def predict_covariance(
     noise: FloatArray,
 ) -> None:
     """Replace the covariances by F*P*F' + diag(noise), where F is the matrix of the prediction over
-    a block (0.05 s).
+    a block.
 
     F rotates the velocity by the yaw angle (cosine and sine `turn`), and adds the effect of the
     accelerometer offsets on the velocity (`gain`). The other states decay by the factors `keep`

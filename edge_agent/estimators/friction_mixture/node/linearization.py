@@ -45,10 +45,9 @@ def linearize_nodes(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> float:
-    """Linearise the measurement equations (rows) of a group of nodes (friction hypotheses) at their
-    `mean` (n, LANES). Compute tyre forces over load, residuals, noise, and node.derivative, the
-    derivatives of the rows by the linear states. Return the penalty [nat] that each node gets for
-    sliding wheels.
+    """Linearise the measurement equations (rows) of a group of nodes at their `mean` (n, LANES).
+    Compute tyre forces over load, residuals, noise, and node.derivative, the derivatives of the
+    rows by the linear states. Return the penalty [nat] that each node gets for sliding wheels.
 
     The leak (gravity in a_y when the body rolls) and the offset of a_y change the same forces.
     Therefore the derivative by the leak is a multiple of the derivative by the offset.
@@ -122,8 +121,8 @@ def _differentiate_steering(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the measurement rows (residuals of wheels and axles) by the states
-    that change the steering angle.
+    """Compute the derivatives of the measurement rows by the states that change the
+    steering angle.
     """
     step = 0.5 * design.nominal.std[NodeState.STEER]
     derivative = node.derivative
@@ -151,8 +150,8 @@ def _differentiate_speeds(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Compute the derivatives of the measurement rows (residuals of wheels and axles) by the four
-    wheel radii, and by the time lag of the wheel speed signals.
+    """Compute the derivatives of the measurement rows by the four wheel radii, and by the time lag
+    of the wheel speed signals.
 
     The row of a wheel depends on the speed of this wheel only, and the rows of the axles hardly
     depend on the radii. Therefore one evaluation with all four radii changed gives all derivatives.
@@ -187,7 +186,7 @@ def weigh_slopes(
     curve: TyreCurve, features: BlockFeatures, flat: float, node: NodeWorkspace
 ) -> float:
     """Compute node.noise, the noise variances of the six residuals (four wheels, two axles) at the
-    slips node.slip. Return a penalty [nat] for sliding wheels per node (friction hypothesis).
+    slips node.slip. Return a penalty [nat] for sliding wheels per node.
 
     The penalty is for wheels on the flat part of the tyre curve. There a wheel may have any slip,
     so the probability density of the measured slip is low.
@@ -247,6 +246,6 @@ def slip_noise_correction(slope: float) -> float:
     `features.noise_std` assumes k = 1, where the share is 1/2. The result is 1/2 - k^2/(1 + k^2).
 
     Without the correction, the noise would be too large on the flat part of the curve. The filter
-    would then prefer nodes (friction hypotheses) in which the wheels slide.
+    would then prefer nodes in which the wheels slide.
     """
     return 0.5 - slope * slope * inverse_of(1.0 + slope * slope)

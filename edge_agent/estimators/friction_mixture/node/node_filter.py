@@ -70,8 +70,8 @@ DOUBTED = 0.05
 
 
 class NodeUpdate(NamedTuple):
-    """Result of the measurement update of a group of nodes (friction hypotheses): for each node its
-    log-likelihood, and the terms from which node weights and penalties are computed.
+    """Result of the measurement update of a group of nodes: for each node its log-likelihood, and
+    the terms from which node weights and penalties are computed.
     """
 
     log_likelihood: float  # [nat] with the inflated R, minus the penalty for sliding
@@ -83,8 +83,8 @@ class NodeUpdate(NamedTuple):
 def update_nodes(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, group: int, inflation: float
 ) -> NodeUpdate:
-    """Run the cubature update of a group of nodes (friction hypotheses) with the measurement noise
-    R times `inflation`. The update changes mean and covariance of the nodes.
+    """Run the cubature update of a group of nodes with the measurement noise R times `inflation`.
+    The update changes mean and covariance of the nodes.
 
     The function also adds the innovations (measurement minus prediction), weighted by the nodes'
     probabilities, to the sums from which R is adapted.
@@ -136,9 +136,8 @@ def weigh_rows(
     share: float,
     inflation: float,
 ) -> float:
-    """Compute the innovation (measurement minus prediction) of the six measurements (four wheels,
-    two axles) and its variance with increased noise. Return the log-likelihood [nat] of the
-    measurements without any increase of their noise R.
+    """Compute the innovation of the six measurements and its variance with increased noise. Return
+    the log-likelihood [nat] of the measurements without any increase of their noise R.
 
     The function increases R for these reasons:
 
@@ -204,7 +203,7 @@ def spread_points(
     slides: float,
 ) -> None:
     """Evaluate the residuals of the six measurements at the cubature points (sample states around
-    the mean) of a group of nodes (friction hypotheses).
+    the mean) of a group of nodes.
 
     The results for each residual are:
 
@@ -249,8 +248,8 @@ def spread_points(
 
 @compiled
 def find_covariances(covariance: FloatArray, node: NodeWorkspace) -> None:
-    """Compute node.cross, the covariance of the states with each of the six measurements (four
-    wheels, two axles), and node.spread, the covariance of the measurements with each other.
+    """Compute node.cross, the covariance of the states with each of the six measurements, and
+    node.spread, the covariance of the measurements with each other.
     """
     derivative = node.derivative
     for i in range(STATES):
@@ -303,9 +302,9 @@ def rear_noise(memory: MixtureMemory, constants: Constants) -> float:
 
 @compiled
 def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
-    """Return the penalty [nat] of each node (filter of one friction hypothesis) for deviations of
-    its vehicle and sensor states from their prior. It is half the sum of the squared deviations, in
-    standard deviations. `mean` has shape (n, LANES).
+    """Return the penalty [nat] of each node for deviations of its vehicle and sensor states from
+    their prior. It is half the sum of the squared deviations, in standard deviations. `mean` has
+    shape (n, LANES).
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
@@ -322,9 +321,8 @@ def take_rows(
     node: NodeWorkspace,
     penalty: float,
 ) -> float:
-    """Update the filters of a group of nodes (friction hypotheses) with the innovations
-    node.residual, one scalar measurement at a time. node.spread is the covariance of the
-    innovations.
+    """Update the filters of a group of nodes with the innovations node.residual, one scalar
+    measurement at a time. node.spread is the covariance of the innovations.
 
     Return the negative log-likelihood [nat] without constants: half of the normalised squared
     innovations, plus half of `penalty`·ln(innovation variance) for each measurement of an
@@ -415,9 +413,9 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 def predict_nodes(
     memory: MixtureMemory, scratch: Scratch, group: int, turn: tuple[float, float]
 ) -> None:
-    """Predict the states of a group of nodes (friction hypotheses) to the end of the block (0.05
-    s). The velocity is rotated by the yaw angle (cosine and sine `turn`), the velocity gained by
-    acceleration is added, and the variances grow by scratch.process.
+    """Predict the states of a group of nodes to the end of the block (0.05 s). The velocity is
+    rotated by the yaw angle (cosine and sine `turn`), the velocity gained by acceleration is added,
+    and the variances grow by scratch.process.
 
     The prediction is affine, so cubature is exact. Vehicle and sensor states return to their prior
     by the factors scratch.keep.

@@ -105,9 +105,9 @@ def gained_velocity(
 
 @inlined
 def gained_by(gain: VelocityGain, mean: FloatArray) -> tuple[float, float]:
-    """Return the velocity (forward, left) [m/s] that the vehicle gains in the block (0.05 s), as
-    each node (friction hypothesis) of a group estimates it. `gain` is the integral of the
-    accelerometers, and `mean` (n, LANES) contains the sensor offsets that the nodes assume.
+    """Return the velocity (forward, left) [m/s] that the vehicle gains in the block, as each node
+    of a group estimates it. `gain` is the integral of the accelerometers, and `mean` (n, LANES)
+    contains the sensor offsets that the nodes assume.
     """
     return gained_velocity(
         gain,
@@ -148,7 +148,7 @@ def find_slips(
     slip: NodeSlip,
 ) -> None:
     """Compute the slips of the wheels from the velocity and stiffness in node.point, the states of
-    each node (friction hypothesis) at the beginning of the block (0.05 s).
+    each node at the beginning of the block.
 
     `mean` (n, LANES) are the nodes' means. Where the force is too small to distinguish stiffness
     from slip noise, the logarithm of stiffness in node.point is moved towards that of `mean`.
@@ -195,8 +195,8 @@ def find_ratios(
     """Compute the tyre forces at the slips in `slip` from the tyre curve, and write the results to
     `slip`.
 
-    - slip.ratio, for each wheel: force divided by the force of a linear tyre (constant stiffness)
-      at the same slip. The slip of a locked axle in a turn counts too.
+    - slip.ratio, for each wheel: force divided by the force of a linear tyre at the same slip. The
+      slip of a locked axle in a turn counts too.
     - slip.size and slip.place, for each wheel: total slip, and its position in the tables of the
       tyre curve.
     - slip.axle_force, for each axle: lateral force over load.

@@ -196,8 +196,8 @@ def _take_velocity(
     innovation: float,
     reading: tuple[float, float],
 ) -> float:
-    """Apply a measured velocity along `direction` (x, y) to the filters of a group of nodes
-    (friction hypotheses). Return half of the squared innovation over its variance [nat].
+    """Apply a measured velocity along `direction` (x, y) to the filters of a group of nodes. Return
+    half of the squared innovation over its variance [nat].
 
     Args:
         mean, covariance: means and covariances of the nodes' states, updated in place.

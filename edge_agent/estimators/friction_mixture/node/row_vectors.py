@@ -22,7 +22,7 @@ Row: TypeAlias = tuple[float, float, float, float, float, float]
 
 @inlined
 def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
-    """Return `factor` times the vector rows[i], for each of LANES nodes (friction hypotheses).
+    """Return `factor` times the vector rows[i], for each of LANES nodes.
 
     `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
     wheels, two axles).
@@ -39,8 +39,7 @@ def scale_row(rows: FloatArray, i: int, factor: float) -> Row:
 
 @inlined
 def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
-    """Return the vector `total` plus `factor` times the vector rows[i], for each of LANES nodes
-    (friction hypotheses).
+    """Return the vector `total` plus `factor` times the vector rows[i], for each of LANES nodes.
 
     `rows` has the shape (n, ROWS, LANES). A vector, such as `total` and the result, has one number
     per measurement (ROWS = 6: four wheels, two axles).
@@ -58,7 +57,7 @@ def add_row(total: Row, rows: FloatArray, i: int, factor: float) -> Row:
 @inlined
 def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
     """Return the scalar product of the vectors `row` and rows[i], one number for each of LANES
-    nodes (friction hypotheses).
+    nodes.
 
     `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
     wheels, two axles).
@@ -71,7 +70,7 @@ def multiply_row(row: Row, rows: FloatArray, i: int) -> float:
 
 @inlined
 def put_row(rows: FloatArray, i: int, row: Row) -> None:
-    """Write the vector `row` to rows[i], for each of LANES nodes (friction hypotheses).
+    """Write the vector `row` to rows[i], for each of LANES nodes.
 
     `rows` has the shape (n, ROWS, LANES). A vector has one number per measurement (ROWS = 6: four
     wheels, two axles).

@@ -48,9 +48,8 @@ def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
 
 @compiled
 def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
-    """Test at the end of a block (0.05 s) for a friction jump inside the visit (passage of one map
-    cell). A jump ends the current part (stretch on one surface) of the visit and begins the next
-    part.
+    """Test at the end of a block (0.05 s) for a friction jump inside the visit. A jump ends the
+    current part of the visit and begins the next part.
 
     If friction has jumped, write the log-likelihood of the part that ends to `evidence` (32,), at
     the friction values CENTRES. This log-likelihood comes from the belief (probabilities of the

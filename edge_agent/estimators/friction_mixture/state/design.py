@@ -101,8 +101,8 @@ def design_of(
     constants: Constants | None = None,
     curve: Curve | None = None,
 ) -> MixtureDesign:
-    """Return the tables of a friction mixture (grid of friction hypotheses) for the given fuzzy
-    sets. Studies pass other `constants`; other tyres need another `curve`.
+    """Return the tables of a friction mixture for the given fuzzy sets. Studies pass other
+    `constants`; other tyres need another `curve`.
     """
     constants = constants or Constants()
     nodes = _node_tables(constants.physical.common_mu, constants.physical.split_prior)
@@ -123,7 +123,7 @@ def design_of(
 
 
 class NodeTables(NamedTuple):
-    """Tables of the nodes (friction hypotheses); see `MixtureDesign`."""
+    """Tables of the nodes; see `MixtureDesign`."""
 
     mu: FloatArray
     width: FloatArray
@@ -133,8 +133,8 @@ class NodeTables(NamedTuple):
 
 @cache
 def _node_tables(common_mu: float, split_prior: float) -> NodeTables:
-    """Return the tables of the nodes (friction hypotheses). They are kept, because computing them
-    takes as long as estimating several seconds of a drive.
+    """Return the tables of the nodes. They are kept, because computing them takes as long as
+    estimating several seconds of a drive.
 
     Args:
         common_mu: friction up to which all values are equally probable a priori [1].

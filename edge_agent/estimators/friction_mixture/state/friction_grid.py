@@ -35,8 +35,8 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def friction_prior(mu: FloatArray, width: FloatArray, common: float) -> FloatArray:
-    """Return the probability (K,) of each node (assumed friction value) without measurements, for
-    the `mu` and `width` of `node_table`.
+    """Return the probability (K,) of each node without measurements, for the `mu` and `width` of
+    `node_table`.
 
     Up to the friction `common` all values are equally likely. Above it, the density falls linearly
     to 0 at the end of the friction range, because few tyres have so much grip. If `common` lies
@@ -51,7 +51,7 @@ class RoadChange(NamedTuple):
     """Probabilities that the friction changes within a step.
 
     Attributes:
-        hazard: change from any node (friction hypothesis) to a friction drawn from the prior.
+        hazard: change from any node to a friction drawn from the prior.
         drift: approximate probability of a change to the node with the next lower or higher
             friction. Only nodes with one friction for both sides have such neighbours.
     """
@@ -68,8 +68,8 @@ def change_road(
     change: RoadChange,
     out: FloatArray,
 ) -> None:
-    """Compute the probabilities `out` (K,) of K nodes (friction hypotheses) after a possible road
-    change; before it they were `w`.
+    """Compute the probabilities `out` (K,) of K nodes after a possible road change; before it they
+    were `w`.
 
     Every node loses the share `change.hazard`, which goes to all nodes in proportion to `prior`.
     The nodes are of two kinds:

@@ -61,8 +61,7 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 
 @compiled
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
-    """Restart the velocity of all nodes (filters of one friction hypothesis each): v_x is `speed`
-    [m/s] and v_y zero.
+    """Restart the velocity of all nodes: v_x is `speed` [m/s] and v_y zero.
 
     If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
     """

@@ -75,9 +75,8 @@ def triangular_cells(edges: tuple[float, ...]) -> list[Triangle]:
 
 
 def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
-    """Return the table of all nodes (friction hypotheses): friction under both sides of the car,
-    and prior probability. The K nodes with one friction for both sides come first, then SPLIT_NODES
-    split nodes.
+    """Return the table of all nodes: friction under both sides of the car, and prior probability.
+    The K nodes with one friction for both sides come first, then SPLIT_NODES split nodes.
 
     A split node assumes a low friction under the wheels of one side and a high friction under those
     of the other side. `mu` and `prior` (K,) are friction and prior probability of the K nodes. In
@@ -107,8 +106,8 @@ def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
 
 
 def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
-    """Return the probability of each cell (range of friction) under a triangular density, (cells,);
-    `edges` (cells + 1,) are the borders of the cells.
+    """Return the probability of each cell under a triangular density, (cells,); `edges` (cells +
+    1,) are the borders of the cells.
     """
     left, middle, right, *_ = triangle
     rising = np.clip(edges - left, 0.0, middle - left)
@@ -122,7 +121,7 @@ def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
 @compiled
 def project_weights(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
     """Compute `out` (K,), the probabilities of K friction values of the road, from the
-    probabilities `w` of all nodes (friction hypotheses).
+    probabilities `w` of all nodes.
 
     The first K nodes assume one friction for the whole car, and `out` starts with their
     probabilities. The other nodes are split nodes, which assume different friction left and right.

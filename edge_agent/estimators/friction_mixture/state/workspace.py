@@ -23,7 +23,7 @@ from schemas.runtime.records import LaneArray
 
 
 class BlockFeatures:
-    """Inputs of the measurement equations for one block (the samples within 0.05 s).
+    """Inputs of the measurement equations for one block.
 
     The mean velocity of the block is rotation(cos, sin)*v + gains, where v is the velocity at the
     block's beginning. The order of wheels is fl, fr, rl, rr, and of axles front, rear. The order of
@@ -88,18 +88,14 @@ class NodeSlip:
 
 
 class NodeForces:
-    """Measured forces over load [1] of wheels and axles, corrected by the states of each node
-    (filter of one friction hypothesis).
-    """
+    """Measured forces over load [1] of wheels and axles, corrected by the states of each node."""
 
     force: Annotated[LaneArray, ROWS]
     slip_at_force: Annotated[LaneArray, ROWS]  # slip at which the tyre curve gives `force`
 
 
 class NodeWorkspace:
-    """Scratch arrays (working memory) for the update of one group of nodes (friction
-    hypotheses).
-    """
+    """Scratch arrays for the update of one group of nodes."""
 
     gained_x: Annotated[LaneArray, 1]  # [m/s] mean velocity gained in the block, per node
     gained_y: Annotated[LaneArray, 1]
@@ -139,9 +135,7 @@ class NodeWorkspace:
 
 
 class Scratch:
-    """Scratch arrays (working memory) for intermediate results of one block (the samples within
-    0.05 s) of one vehicle.
-    """
+    """Scratch arrays for intermediate results of one block of one vehicle."""
 
     features: BlockFeatures
     node: NodeWorkspace
