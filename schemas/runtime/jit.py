@@ -20,6 +20,7 @@ from typing import Final, ParamSpec, TypeVar, cast
 
 from schemas.runtime.native_kernels import Library, NativeIntrinsic, NativeKernel
 
+HALVES: Final = ("edge_agent", "fleet_service")  # packages that do not use each other
 LINE: Final = 64  # [bytes] size of a cache line
 # Fields of /proc/cpuinfo that decide which instructions LLVM uses.
 PROCESSOR: Final = ("vendor_id", "cpu family", "model", "flags", "CPU", "Features")
@@ -206,12 +207,14 @@ def describe_sources(package: str) -> str:
 
     The digest is needed because Numba's own cache checks only the source file of a function. After
     a change in another file whose functions or constants it uses, Numba would take outdated code
-    from its cache.
+    from its cache. A package that is not one of HALVES (tests, an installed estimator) may use
+    both.
     """
     root = Path(__file__).parents[2]
     digest = hashlib.blake2b(digest_size=8)
-    for folder in (root / "schemas", root / package):
-        for path in sorted(folder.rglob("*.py")):
+    used = ("schemas", package) if package in HALVES else ("schemas", *HALVES, package)
+    for name in used:
+        for path in sorted((root / name).rglob("*.py")):
             digest.update(path.read_bytes())
     return f"{package}-{digest.hexdigest()}"
 

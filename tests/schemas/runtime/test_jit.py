@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-CALLER = """from kernels.inner import inner
+CALLER = """from {package}.inner import inner
 from schemas.runtime.jit import compiled
 
 @compiled
@@ -27,12 +27,15 @@ def inner(x: float) -> float:
 FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
 
 
-def run_outer(folder: Path, factor: str, before: str = "") -> str:
-    """Write two compiled functions: `inner` multiplies by `factor`, and `outer` calls `inner`.
-    Return the result of outer(1.0) in a new process.
+def run_outer(folder: Path, factor: str, before: str = "", package: str = "kernels") -> str:
+    """Write two compiled functions: `inner` in `package` multiplies by `factor`, and `outer` in the
+    package "kernels" calls `inner`. Return the result of outer(1.0) in a new process.
     """
-    package = folder / "kernels"
-    (package / "inner.py").write_text(INNER.format(factor=factor))
+    for name in ("kernels", package):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / "__init__.py").touch()
+    (folder / "kernels" / "outer.py").write_text(CALLER.format(package=package))
+    (folder / package / "inner.py").write_text(INNER.format(factor=factor))
     source = Path(__file__).parents[3] / "schemas"
     if not (folder / "schemas").exists():
         (folder / "schemas").symlink_to(source, target_is_directory=True)
@@ -48,19 +51,14 @@ def run_outer(folder: Path, factor: str, before: str = "") -> str:
 
 
 @pytest.mark.campaign
-def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> None:
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "__init__.py").touch()
-    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
-    assert run_outer(tmp_path, "2.0") == "3.0"
-    assert run_outer(tmp_path, "5.0") == "6.0"
+@pytest.mark.parametrize("package", ["kernels", "edge_agent"])
+def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path, package: str) -> None:
+    assert run_outer(tmp_path, "2.0", package=package) == "3.0"
+    assert run_outer(tmp_path, "5.0", package=package) == "6.0"
     assert len(list((tmp_path / "cache" / "gripmap").glob("kernels-*"))) == 2
 
 
 def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> None:
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "__init__.py").touch()
-    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
     assert run_outer(tmp_path, "2.0", FULL_DISK) == "3.0"
     assert not list((tmp_path / "cache").rglob("*.nbc"))
 
@@ -72,9 +70,6 @@ def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, 
     folder. Kernels (compiled functions) must then be compiled at each start, without a traceback
     and without files elsewhere.
     """
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "__init__.py").touch()
-    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
     homeless = (
         "import os, tempfile; from pathlib import Path; tempfile.tempdir = '/proc/nowhere'; "
         f"os.environ.update(HOME='/proc/nowhere', XDG_CACHE_HOME={place!r}); "
@@ -91,9 +86,6 @@ def test_without_a_writable_cache_kernels_compile_at_each_start(tmp_path: Path, 
 
 @pytest.mark.campaign
 def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
-    (tmp_path / "kernels").mkdir()
-    (tmp_path / "kernels" / "__init__.py").touch()
-    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
     shared = tmp_path / "cache" / "gripmap"
     shared.mkdir(parents=True)
     shared.chmod(0o777)
