@@ -91,6 +91,21 @@ def test_every_room_is_in_the_readme_of_its_half(half: str) -> None:
     assert not [room for room in rooms if f"`{room}/" not in page]
 
 
+def test_modules_in_the_tables_of_a_readme_exist() -> None:
+    missing = []
+    for page in list_pages():
+        if page.name != "README.md":
+            continue
+        for cell in re.findall(r"^\|([^|]*)\|", page.read_text(), re.MULTILINE):
+            modules = re.findall(r"`([\w/]+\.py)`", cell)
+            missing += [
+                f"{page.relative_to(ROOT)}: {module}"
+                for module in modules
+                if not list(page.parent.rglob(module))
+            ]
+    assert not missing
+
+
 def test_every_command_of_the_tutorials_is_understood_and_writes_to_try() -> None:
     found = readme.list_commands(readme.read_pages())
     assert len(found) > 15
