@@ -66,10 +66,13 @@ class System:
         """Simulate and record a drive on a road with friction `mu`, and publish it under the
         vehicle name `vehicle`.
         """
-        log, file, out = (
-            self.folder / f"{vehicle}-{n}"
-            for n in ("log.parquet", "vehicle.json", "estimates.parquet")
-        )
+        self.record_drive(vehicle, manoeuvre, mu, seed)
+        assert edge_agent(self.replay_words(vehicle)) == 0
+
+    def record_drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
+        """Simulate and record a drive on a road with friction `mu`."""
+        log = self.folder / f"{vehicle}-log.parquet"
+        file = self.folder / f"{vehicle}-vehicle.json"
         words = [
             "simulate",
             manoeuvre,
@@ -83,18 +86,23 @@ class System:
             str(file),
         ]
         assert edge_agent(words) == 0
-        words = [
+
+    def replay_words(self, vehicle: str) -> list[str]:
+        """Return the command that publishes the recorded drive under the vehicle's name."""
+        return [
             "replay",
-            str(log),
+            str(self.folder / f"{vehicle}-log.parquet"),
             "--vehicle",
-            str(file),
+            str(self.folder / f"{vehicle}-vehicle.json"),
             "--out",
-            str(out),
+            str(self.folder / f"{vehicle}-estimates.parquet"),
             "--publish",
             "--name",
             vehicle,
+            "--trust",
+            "--config",
+            str(self.agent),
         ]
-        assert edge_agent([*words, "--trust", "--config", str(self.agent)]) == 0
 
     def query_cells(self, parameters: str = "format=json") -> list[dict[str, object]]:
         """Return the map's cells as a client that has no GripMap code receives them."""

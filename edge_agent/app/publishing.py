@@ -6,18 +6,23 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from schemas.config import AgentConfig
+from schemas.errors import InputError
 from schemas.runtime.logs import print_line, values
 
 if TYPE_CHECKING:
     import zenoh
 
     from edge_agent.app.live_loop import Progress
+    from edge_agent.publish.ack_settlement import Counts
+    from edge_agent.publish.batching import DriveBatches
+    from edge_agent.publish.outbox import Outbox
     from edge_agent.publish.publisher import Publisher
 
 FLEET = "fleet"  # value of {name} in the path of an outbox that serves many vehicles
@@ -33,9 +38,11 @@ def open_publisher(
     config: AgentConfig,
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
+    drive: DriveBatches | None = None,
 ) -> Publisher:
-    """Return a started publisher with the configured outbox (file of unsent records).
-    `on_open(name, session)` is called with each vehicle's name and its opened Zenoh session.
+    """Return a started publisher with the configured outbox (file of unsent records). It sends the
+    batches that the outbox contains, and those of a recorded `drive`. `on_open(name, session)` is
+    called with each vehicle's name and its opened Zenoh session.
 
     Raises:
         InputError: Zenoh rejects its settings, or the outbox is in use by another process or
@@ -55,8 +62,27 @@ def open_publisher(
         spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s
     )
     publisher = Publisher(names, outbox, config, estimator, on_open=on_open)
+    if drive is not None:
+        _store_drive(drive, outbox, publisher.counts)
     publisher.start()
     return publisher
+
+
+def _store_drive(drive: DriveBatches, outbox: Outbox, counts: Counts) -> None:
+    """Store the batches of a recorded drive in the outbox, and count their records as published.
+
+    Raises:
+        InputError: the disk does not accept the write.
+    """
+    try:
+        outbox.store_drive(drive)
+    except sqlite3.Error as error:
+        outbox.close()
+        problem = f"{outbox.path} does not accept the records ({error})"
+        raise InputError("spool", problem, "make room on its disk, then repeat") from error
+    for draft in drive.drafts:
+        counts.offered[draft.kind] += draft.records
+        counts.published[draft.kind] += draft.records
 
 
 def close_publisher(

@@ -8,6 +8,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,12 @@ from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
+    from edge_agent.app.live_loop import Progress
     from edge_agent.app.plausible import Plausibility
     from edge_agent.estimators import Estimates
     from edge_agent.inputs.block import Block
     from edge_agent.inputs.signal_log import SignalLog
+    from edge_agent.observe.observation_builder import RecordBlock
     from edge_agent.observe.pipeline import Pipeline
     from edge_agent.publish.publisher import Publisher
     from schemas.vehicle import Vehicle
@@ -33,8 +36,11 @@ SPARK = "spark"
 # [ns] age from which a record may be rejected: by default, a service rejects records that are more
 # than thirty days old.
 OLD_NS = 29 * 86_400 * NS
-# [s] time to wait for a busy service. Batches without an answer then stay in the outbox.
+# [s] time to wait for the next answer of a busy service. Batches without an answer then stay in the
+# outbox.
 DRAIN_S = 30.0
+CHECK_S = 0.05  # [s] time between two checks for answers
+CLOSE_S = 1.0  # [s] time for the sender to end its present round
 PROGRESS_S = 1.0
 
 
@@ -69,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--publish",
         action="store_true",
-        help="send observations and states, wait for acknowledgement",
+        help="send observations and states, wait for acknowledgement; a repeat counts once",
     )
     parser.add_argument(
         "--trust",
@@ -98,10 +104,14 @@ def run(args: argparse.Namespace) -> int:
     )
     from edge_agent.app.estimates_file import ENDINGS, EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.app.live_loop import Progress
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.cli.common import require_valid_signals, warn_about_faults
+    from edge_agent.app.publishing import open_publisher
+    from edge_agent.cli.common import checked_name, require_valid_signals, warn_about_faults
     from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log, require_log
+    from edge_agent.observe.pipeline import Pipeline
+    from edge_agent.publish.batching import batch_drive
     from schemas.vehicle import load_vehicle
 
     config = config_of(args)
@@ -153,25 +163,29 @@ def run(args: argparse.Namespace) -> int:
         notes += _write_report(args, log, vehicle, names, plausibility)
         print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
         return IMPLAUSIBLE if plausibility.problems() else 0
+    name = checked_name(args.name or vehicle.name) if args.publish else ""
+    records: list[RecordBlock] = []
+    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
     with EstimatesFile(args.out) as file:
-        code = 0
 
         def keep_estimates(block: Block, estimates: Estimates) -> None:
             plausibility.add(block.t, block.signals, estimates)
+            progress.blocks += 1
             file.write(block.t, estimates)
 
         if args.publish:
-            from edge_agent.app.publishing import open_publisher
-            from edge_agent.cli.common import checked_name
-            from edge_agent.observe.pipeline import Pipeline
-
-            name = checked_name(args.name or vehicle.name)
-            pipeline = Pipeline(bank, 1, config)
-            publisher = open_publisher([name], config, estimator)
-            code = _publish_log(log, start_ns, pipeline, publisher, keep_estimates)
+            records = _make_records(log, start_ns, Pipeline(bank, 1, config), keep_estimates)
         else:
             for block in log.blocks(start_ns):
                 keep_estimates(block, bank.advance(block.t, block.signals))
+    code = 0
+    if args.publish:
+        drive = batch_drive(records, name, estimator, config.batch_rows)
+        publisher = open_publisher([name], config, estimator, drive=drive)
+        same = f" with --start {_start_text(start_ns)}" if _is_start_now(args.start, log) else ""
+        code = _publish_drive(publisher, progress, start_ns, f"repeat the command{same}")
+        if same:
+            notes.append(f"note: repeated{same}, this drive counts once; otherwise it is another")
     print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
     return code or (IMPLAUSIBLE if plausibility.problems() else 0)
 
@@ -256,31 +270,35 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     return 2 if bad else 0
 
 
-def _publish_log(
+def _make_records(
     log: SignalLog,
     start_ns: int,
     pipeline: Pipeline,
-    publisher: Publisher,
     keep: Callable[[Block, Estimates], None],
-) -> int:
-    """Estimate a log that begins at `start_ns` [ns UTC], and publish the resulting records. `keep`
-    is called with each block of samples and its estimates. Return 1 if a record was refused, lost
-    or not acknowledged, else 0.
+) -> list[RecordBlock]:
+    """Estimate a log that begins at `start_ns` [ns UTC], and return the resulting records. `keep`
+    is called with each block of samples and its estimates.
     """
-    from edge_agent.app.live_loop import Progress
+    out: list[RecordBlock] = []
+    for block in log.blocks(start_ns):
+        estimates, *records = pipeline.step(block)
+        keep(block, estimates)
+        out += records
+    last = pipeline.finish()
+    return out if last is None else [*out, last]
+
+
+def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, again: str) -> int:
+    """Send the outbox of `publisher`, which contains the records of a log that begins at `start_ns`
+    [ns UTC] and was estimated with `progress`. Return 1 if a record was refused, lost or not
+    acknowledged, else 0. For the last two cases, print the instruction `again`.
+    """
     from edge_agent.app.publishing import close_publisher
 
-    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
     try:
-        for block in log.blocks(start_ns):
-            estimates, *records = pipeline.step(block)
-            keep(block, estimates)
-            publisher.offer(*records)
-            progress.blocks += 1
-        if (last := pipeline.finish()) is not None:
-            publisher.offer(last)
+        _wait_for_answers(publisher)
     finally:
-        close_publisher(publisher, progress, DRAIN_S)
+        close_publisher(publisher, progress, CLOSE_S)
     if refused := sum(publisher.counts.rejected.values()):
         old = time.time_ns() - start_ns > OLD_NS
         fix = (
@@ -289,7 +307,26 @@ def _publish_log(
             else "the reasons are above"
         )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
-    return 1 if refused or publisher.count_unsettled() or publisher.status.dropped_records else 0
+    left = publisher.count_unsettled() or publisher.status.dropped_records
+    if left:
+        print(
+            f"error: publish: {left} records were not acknowledged; {again}, no record counts "
+            "twice",
+            file=sys.stderr,
+        )
+    return 1 if refused or left else 0
+
+
+def _wait_for_answers(publisher: Publisher) -> None:
+    """Wait until the service has settled all records, or has not answered for DRAIN_S."""
+    left = publisher.count_unsettled()
+    answered = time.monotonic()
+    while left and time.monotonic() - answered < DRAIN_S:
+        progress_messages.set_status(f"sending {left} records")
+        time.sleep(CHECK_S)
+        if (unsettled := publisher.count_unsettled()) < left:
+            left = unsettled
+            answered = time.monotonic()
 
 
 def _start_time(given: str | None, log: SignalLog) -> int:
@@ -302,4 +339,14 @@ def _start_time(given: str | None, log: SignalLog) -> int:
         return moment(given, "start")
     if given is None and log.start_ns is not None:
         return log.start_ns
-    return time.time_ns() - round(float(log.t[-1]) * NS)
+    # A whole second, so that `_start_text` is exact.
+    return (time.time_ns() - round(float(log.t[-1]) * NS)) // NS * NS
+
+
+def _is_start_now(given: str | None, log: SignalLog) -> bool:
+    """Return True if neither `--start` nor the log states the time of t = 0."""
+    return given == NOW or (given is None and log.start_ns is None)
+
+
+def _start_text(start_ns: int) -> str:
+    return f"{datetime.fromtimestamp(start_ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"

@@ -2,17 +2,20 @@
 The module is pure: no I/O, and time is an argument.
 
 A batch is due when it is full, when its oldest record has waited long enough, or immediately when a
-record is urgent.
+record is urgent. The batches of a recorded drive do not depend on time (`batch_drive`).
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_agent.observe.observation_builder import RecordBlock
 from schemas import grid
@@ -22,6 +25,9 @@ from schemas.wire import Batch, Columns, Kind, encode
 
 SPAN_NS: Final = 600 * NS  # [ns] largest time span of a batch; a service rejects an hour
 _TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
+# Step to which the digest of a recorded drive rounds values. Their last bits differ between
+# processors. No constant of the estimator lies halfway between two multiples of this step.
+DIGEST_STEP: Final = math.pi / 100
 UNNUMBERED: Final = 0  # placeholder until the outbox stores and numbers the batch
 
 
@@ -37,6 +43,13 @@ class Draft:
     region: int
     records: int
     encode: Callable[[int, int], bytes]
+
+
+class DriveBatches(NamedTuple):
+    """All batches of a recorded drive, in the order of sending, and their `boot`."""
+
+    boot: int
+    drafts: list[Draft]
 
 
 class _Place(NamedTuple):
@@ -133,6 +146,45 @@ class Batcher:
             self._estimator,
         )
         return Draft(name, place.kind, place.region, batch.rows, partial(_encode_batch, batch))
+
+
+def batch_drive(
+    records: Sequence[RecordBlock], name: str, estimator: str, rows: int
+) -> DriveBatches:
+    """Return the batches of a recorded drive of the vehicle `name`, with at most `rows` records
+    each.
+
+    `boot` (63 bits) is a digest of the records and of their division into batches. Therefore the
+    same records always have the same identity, so that the service counts them once, and other
+    records have another identity.
+    """
+    whole = partial(Batcher, [name], estimator=estimator, flush_s=0.0, rows=rows)
+    parts = [
+        (one.kind, one.region, one.records) for one in _make_drafts(records, whole(UNNUMBERED))
+    ]
+    digest = hashlib.sha256(repr((name, estimator, parts)).encode())
+    for block in records:
+        for column, values in sorted(block.columns.items()):
+            digest.update(column.encode() + _rounded_bytes(values))
+    boot = int.from_bytes(digest.digest()[:8]) >> 1
+    return DriveBatches(boot, _make_drafts(records, whole(boot)))
+
+
+def _rounded_bytes(values: NDArray[Any]) -> bytes:
+    """Return the values of a column as bytes that are the same on each machine: rounded, and with
+    one form of zero and of NaN.
+    """
+    if values.dtype.kind == "f":
+        values = np.nan_to_num(np.rint(values / DIGEST_STEP), nan=np.inf) + 0.0
+    return values.tobytes()
+
+
+def _make_drafts(records: Sequence[RecordBlock], batcher: Batcher) -> list[Draft]:
+    drafts: list[Draft] = []
+    for block in records:
+        batcher.add(block, 0.0)
+        drafts += batcher.take_due(0.0, everything=True)
+    return drafts
 
 
 def _batch_ranges(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:

@@ -35,7 +35,7 @@ class Stream(NamedTuple):
 class HeldBatch:
     """Data of a batch in the outbox (store on disk), without its payload. `due` is the time [s] at
     which the batch is sent again if no answer came. It is None while the batch is not in flight
-    (sent and not answered).
+    (sent and not answered). `is_sent` is True once this run of the agent has sent the batch.
     """
 
     stream: Stream
@@ -44,6 +44,7 @@ class HeldBatch:
     size: int
     attempts: int = 0
     due: float | None = None
+    is_sent: bool = False
 
 
 @dataclass

@@ -5,7 +5,8 @@ A batch is committed here before it is sent. It is removed only after the servic
 (stored or refused it for good). A batch is identified by its stream (vehicle, boot, kind, region)
 and its sequence number `seq`, which counts from 1 without gaps in each stream. `boot` is a random
 number per run of the agent. Therefore a restarted agent opens new streams and never reuses an
-identifier. Batches of an earlier run are sent again under their old identifier.
+identifier. Batches of an earlier run are sent again under their old identifier. For a recorded
+drive, `boot` is a digest of its batches, so that a repeated publication has the same identifiers.
 
 The size is limited: when the payloads exceed the capacity, the oldest states (regular reports of
 motion) are dropped first, then the oldest observations, and both are counted. SQLite runs in WAL
@@ -16,17 +17,21 @@ open, so that two agents never use the same file. Time is an argument, in monoto
 from __future__ import annotations
 
 import secrets
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from edge_agent.publish.batching import Draft
+from edge_agent.publish.batching import Draft, DriveBatches
 from edge_agent.publish.held_batches import HeldBatch, HeldBatches, Stream
 from edge_agent.publish.resend_schedule import FIRST_RESEND_S, ResendSchedule
 from edge_agent.publish.spool_file import SpoolFile
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # `boot` is below this limit, so that it fits into a signed 64-bit column
+# `first_held` in the batches of a recorded drive. A repeat sends all of them again, so the service
+# must never conclude that a missing batch will not arrive.
+ALL_HELD = 1
 # Several days of one vehicle that stores a batch per second and kind.
 DEFAULT_CAPACITY_BYTES = 256 * 2**20
 # Old states are evicted first because they are worth least, observations last.
@@ -35,9 +40,9 @@ EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """Batch on disk that no service has settled (acknowledged or refused by the service). If
-    `fresh`, the batch is new and is sent immediately. Any other batch is sent when `due_batches`
-    returns it.
+    """Batch on disk that no service has settled (acknowledged or refused by the service). A batch
+    that `store` returns is sent at once if it is `fresh`, and otherwise when `due_batches` returns
+    it. A batch that `due_batches` returns is `fresh` if this run of the agent has not sent it yet.
     """
 
     key: int
@@ -156,6 +161,7 @@ class Outbox:
             self.held.add_batch(key, HeldBatch(stream, seq, draft.records, len(payload)))
             self.counts.stored += draft.records
             fresh = self.schedule.send_or_queue(key, now)
+            self.held[key].is_sent = fresh
             stored.append(StoredBatch(key, stream, seq, draft.records, payload, fresh))
         self._evict_oldest()
         return [batch for batch in stored if batch.key in self.held]
@@ -173,10 +179,43 @@ class Outbox:
         following, first_held = self.held.next_numbers(stream)
         seq = ahead.get(stream, following)
         payload = draft.encode(seq, first_held)
-        name = (stream.vehicle, stream.boot, str(stream.kind), stream.region, seq, draft.records)
-        key = self._file.insert_row(name, payload)
+        key = self._insert_payload(stream, seq, draft.records, payload)
         ahead[stream] = seq + 1
         return key, stream, seq, draft, payload
+
+    def _insert_payload(self, stream: Stream, seq: int, records: int, payload: bytes) -> int:
+        name = (stream.vehicle, stream.boot, str(stream.kind), stream.region, seq, records)
+        return self._file.insert_row(name, payload)
+
+    def store_drive(self, drive: DriveBatches) -> None:
+        """Commit the batches of a recorded drive to disk in one transaction, and queue them. They
+        replace those that an earlier attempt left in the outbox. If the commit fails, nothing
+        changes.
+
+        Raises:
+            sqlite3.Error: the disk does not accept the write.
+        """
+        last: Counter[Stream] = Counter()
+        replaced: set[int] = set()
+        inserted: list[tuple[int, HeldBatch]] = []
+        with self._file.begin_transaction():
+            for draft in drive.drafts:
+                stream = Stream(draft.vehicle, drive.boot, draft.kind, draft.region)
+                last[stream] += 1
+                seq = last[stream]
+                earlier = self.held.keys_within(stream, [(seq, seq)])
+                self._file.delete_rows(list(earlier))
+                replaced |= earlier
+                payload = draft.encode(seq, ALL_HELD)
+                key = self._insert_payload(stream, seq, draft.records, payload)
+                inserted.append((key, HeldBatch(stream, seq, draft.records, len(payload))))
+        for key in replaced:
+            self._drop_batch(key)
+        for key, batch in inserted:
+            self.held.add_batch(key, batch)
+            self.counts.stored += batch.records
+            self.schedule.queue_batch(key)
+        self._evict_oldest()
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
         """Treat all batches of a vehicle that are in flight (sent and not answered) as lost,
@@ -235,7 +274,10 @@ class Outbox:
         for key in self.schedule.expire_batches(now):
             self.counts.unanswered += self._drop_batch(key)
         keys = self.schedule.take_due(now, limit, vehicles)
-        return [batch for key in keys if (batch := self.read_batch(key)) is not None]
+        due = [batch for key in keys if (batch := self.read_batch(key)) is not None]
+        for batch in due:
+            self.held[batch.key].is_sent = True
+        return due
 
     def read_batch(self, key: int) -> StoredBatch | None:
         """Return the batch with the row number `key`, with its payload. If the row is missing or
@@ -250,7 +292,9 @@ class Outbox:
             # The stored number of records may be damaged as well, so count at least one.
             self.counts.damaged += max(self._drop_batch(key), 1)
             return None
-        return StoredBatch(key, batch.stream, batch.seq, batch.records, payload)
+        return StoredBatch(
+            key, batch.stream, batch.seq, batch.records, payload, fresh=not batch.is_sent
+        )
 
     def close(self) -> None:
         """Delete the settled batches (those that the service has answered) and release the file.

@@ -254,7 +254,7 @@ class Publisher:
         there = self._links.connected_names
         limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(there))
         for batch in self._outbox.due_batches(self._clock(), limit, there) if there else ():
-            self.counts.resent_batches += self._links.put_batch(batch)
+            self.counts.resent_batches += self._links.put_batch(batch) and not batch.fresh
 
 
 def _log_if_changed(text: str, error: sqlite3.Error, last: str) -> str:

@@ -170,10 +170,7 @@ IMPATIENT = (
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("well", [True, False])
-def test_replay_with_a_hanging_session_keeps_its_estimates(
-    drive: Path, tmp_path: Path, well: bool
-) -> None:
+def test_replay_with_a_hanging_session_keeps_its_estimates(drive: Path, tmp_path: Path) -> None:
     """A replay must end and write its estimates although a frozen router never answers."""
     router = Part(
         "router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path
@@ -193,13 +190,8 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
             "--config",
             str(tmp_path / "agent.json"),
         )
-        code = (
-            IMPATIENT
-            if well
-            else f"from edge_agent.observe.pipeline import Pipeline as P; P.finish = 0; {IMPATIENT}"
-        )
         done = subprocess.run(
-            [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=150
+            [sys.executable, "-c", IMPATIENT, *words], capture_output=True, text=True, timeout=150
         )
     finally:
         router.send_signal(signal.SIGCONT)
@@ -209,16 +201,7 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(
     assert any(words in done.stderr for words in late)
     assert json.loads(done.stdout)["unsettled"] > 20
     assert done.returncode == 1
-    if well:
-        assert (
-            pq.read_table(tmp_path / "out").num_rows
-            == pq.read_table(drive / "log.parquet").num_rows
-        )
-    else:
-        assert "TypeError: 'int' object is not callable" in done.stderr, (
-            "what went wrong is not swallowed"
-        )
-        assert not (tmp_path / "out").exists()
+    assert pq.read_table(tmp_path / "out").num_rows == pq.read_table(drive / "log.parquet").num_rows
 
 
 def test_run_drives_a_log_in_real_time_and_publishes_it(

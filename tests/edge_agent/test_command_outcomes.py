@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import sqlite3
 from pathlib import Path
 
 import pyarrow as pa
@@ -14,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.cli import main
+from edge_agent.publish.spool_file import SpoolFile
 from schemas import tables
 from tests.ports import free_ports
 
@@ -130,6 +132,52 @@ def test_records_lost_by_a_full_outbox_are_reported(
     counts = json.loads(seen.out.splitlines()[-1])
     assert counts["unsettled"] == 0
     assert f"{counts['dropped']} records are lost, because" in seen.err
+
+
+def test_replay_tells_what_it_leaves_in_the_outbox_and_how_to_go_on(
+    tmp_path: Path, capsys: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing listens at the router. A log states a time, or begins such that it ends now."""
+    monkeypatch.setattr("edge_agent.cli.replay.DRAIN_S", 0.2)
+    spool = tmp_path / "spool.sqlite"
+    config = tmp_path / "agent.json"
+    config.write_text(json.dumps({"spool": str(spool)}))
+    words = [*write_drive(tmp_path / "d.parquet"), "--out", str(tmp_path / "e.parquet")]
+    words += ["--config", str(config), "--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}"]
+    words += ["--publish", "--trust"]
+    capsys.readouterr()
+    assert main([*words, "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]) == 1
+    seen = capsys.readouterr()
+    left = json.loads(seen.out.splitlines()[-1])["unsettled"]
+    assert f"{left} records without acknowledgement stay in {spool};" in seen.err
+    assert (
+        f"error: publish: {left} records were not acknowledged; repeat the command, no record "
+        "counts twice\n"
+    ) in seen.err
+    assert main([*words, "--name", "car-two"]) == 1
+    said = capsys.readouterr().err
+    again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", said)
+    assert again is not None
+    assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in said
+
+
+def test_a_disk_that_refuses_the_records_of_a_replay_is_named(
+    tmp_path: Path, capsys: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(SpoolFile, "insert_row", refuse)
+    config = tmp_path / "agent.json"
+    spool = tmp_path / "spool.sqlite"
+    config.write_text(json.dumps({"spool": str(spool)}))
+    words = [*write_drive(tmp_path / "d.parquet"), "--out", str(tmp_path / "e.parquet")]
+    capsys.readouterr()
+    assert main([*words, "--publish", "--trust", "--name", "car-one", "--config", str(config)]) == 2
+    assert capsys.readouterr().err == (
+        f"error: spool: {spool} does not accept the records (database or disk is full); make room "
+        "on its disk, then repeat\n"
+    )
 
 
 def test_simulate_does_not_write_the_vehicle_over_its_log(tmp_path: Path, capsys: Output) -> None:

@@ -9,20 +9,23 @@ limited, and only one agent may use it.
 from __future__ import annotations
 
 import os
+import sqlite3
 import subprocess
 import sys
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from edge_agent.publish.batching import Draft
+from edge_agent.publish.batching import Draft, DriveBatches
 from edge_agent.publish.held_batches import Stream
 from edge_agent.publish.outbox import Outbox, StoredBatch
 from edge_agent.publish.pacing import FIRST_WINDOW, LONGEST_PROBE_S, SILENT_S
 from edge_agent.publish.resend_schedule import JITTER
 from schemas.errors import InputError
 from schemas.wire import Kind
+from tests.outboxes import read_batches
 
 REGION = 77
 BOOT = 5
@@ -99,6 +102,67 @@ def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
     outbox.close()
 
 
+DRIVE = DriveBatches(BOOT, [draft(), draft(kind=Kind.STATE), draft(records=2), draft(region=9)])
+
+
+def test_a_repeated_drive_is_stored_under_the_same_names(path: Path) -> None:
+    stored = []
+    for turn in range(2):
+        outbox = Outbox(path.with_name(str(turn)))
+        outbox.store_drive(DRIVE)
+        stored.append({(b.stream, b.seq, b.payload) for b in read_batches(outbox)})
+        outbox.close()
+    assert stored[0] == stored[1]
+    assert {(one.kind, one.region, seq, payload) for one, seq, payload in stored[0]} == {
+        (Kind.OBSERVATION, REGION, 1, b"1/1"),
+        (Kind.STATE, REGION, 1, b"1/1"),
+        (Kind.OBSERVATION, REGION, 2, b"2/1"),
+        (Kind.OBSERVATION, 9, 1, b"1/1"),
+    }
+
+
+def test_a_repeated_drive_replaces_what_the_first_try_left(path: Path) -> None:
+    """The first try left some batches, one of them damaged. After the repeat, the outbox must have
+    each batch of the drive once, and count the agent's own streams from 1.
+    """
+    outbox = Outbox(path, boot=BOOT + 1)
+    outbox.store_drive(DRIVE)
+    expected = {(b.stream, b.seq, b.payload) for b in read_batches(outbox)}
+    outbox.settle_ranges(stream(), [(1, 1)])
+    outbox.close()
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE batch SET payload = X'00' WHERE kind = 'state'")
+    again = Outbox(path, boot=BOOT + 2)
+    again.store_drive(DRIVE)
+    again.delete_settled()
+    again.close()
+    last = Outbox(path, boot=BOOT + 3)
+    found = [(b.stream, b.seq, b.payload) for b in read_batches(last)]
+    assert len(found) == len(DRIVE.drafts)
+    assert set(found) == expected
+    assert seqs(last.store([draft()], now=0.0)) == [1]
+    last.close()
+
+
+def test_a_batch_of_a_drive_is_fresh_when_it_is_sent_first(path: Path) -> None:
+    outbox = Outbox(path, first_resend_s=1.0)
+    outbox.store_drive(DRIVE)
+    assert [batch.fresh for batch in outbox.due_batches(0.0, 9)] == [True] * 4
+    assert [batch.fresh for batch in outbox.due_batches(2.0, 9)] == [False] * 4
+    outbox.close()
+
+
+def test_a_drive_larger_than_the_outbox_can_be_completed_later(path: Path) -> None:
+    """A batch that was dropped for lack of space must be accepted when a repeat sends it. Therefore
+    no payload may claim that it will not arrive.
+    """
+    outbox = Outbox(path, capacity_bytes=5)
+    outbox.store_drive(DRIVE)
+    assert outbox.counts.evicted[Kind.OBSERVATION] > 0
+    assert {b.payload.partition(b"/")[2] for b in read_batches(outbox)} == {b"1"}
+    outbox.close()
+
+
 def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft()], now=0.0)
@@ -114,7 +178,7 @@ def test_stored_batches_survive_a_kill_and_are_due_under_their_name(path: Path) 
     """
     script = f"""
 import os, pathlib, signal
-from edge_agent.publish.batching import Draft
+from edge_agent.publish.batching import Draft, DriveBatches
 from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
 outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
@@ -296,7 +360,7 @@ def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -
     """
     script = f"""
 import os, pathlib, signal
-from edge_agent.publish.batching import Draft
+from edge_agent.publish.batching import Draft, DriveBatches
 from edge_agent.publish.held_batches import Stream
 from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
