@@ -93,8 +93,8 @@ def close_publisher(
     on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
-    next start. Their number, the number of lost records and the outbox's path are printed on
-    stderr.
+    next start under the same vehicle name. Their number, the number of lost records and the
+    outbox's path are printed on stderr.
     """
     from edge_agent.app.live_loop import final_counts
 
@@ -109,7 +109,13 @@ def close_publisher(
     if waiting := publisher.count_unsettled():
         print_line(
             f"{waiting} records without acknowledgement stay in {path}; the next start with this "
-            "outbox sends them",
+            "outbox and vehicle name sends them",
+            sys.stderr,
+        )
+    if stranded := publisher.status.stranded_records:
+        print_line(
+            f"{stranded} records of other vehicle names stay in {path}; the next start with this "
+            "outbox and their name sends them",
             sys.stderr,
         )
     if not clean:

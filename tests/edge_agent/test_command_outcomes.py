@@ -156,6 +156,7 @@ def test_replay_tells_what_it_leaves_in_the_outbox_and_how_to_go_on(
     ) in seen.err
     assert main([*words, "--name", "car-two"]) == 1
     said = capsys.readouterr().err
+    assert f"{left} records of other vehicle names stay in {spool};" in said
     again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", said)
     assert again is not None
     assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in said
