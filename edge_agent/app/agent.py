@@ -160,7 +160,7 @@ class Agent:
             finally:  # an error must not lose the records that are not in the outbox yet
                 drain_s = STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S
                 close_publisher(publisher, self._progress, drain_s, **counts)
-        left = publisher.count_unsettled() or publisher.status.dropped_records
+        left = publisher.count_unsettled() or publisher.status.lost_records
         return 1 if left and not stop.is_set() else 0
 
     def _drive_until(self, stop: threading.Event, publisher: Publisher) -> None:

@@ -100,10 +100,17 @@ def close_publisher(
 
     clean = publisher.close(drain_s)
     path = publisher.status.outbox_path
-    if lost := publisher.status.dropped_records:
+    dropped = publisher.status.dropped_records
+    if dropped:
         print_line(
-            f"{lost} records are lost, because {path} was full or its disk refused them; see "
+            f"{dropped} records are lost, because {path} was full or its disk refused them; see "
             "spool_mb",
+            sys.stderr,
+        )
+    if lost := publisher.status.lost_records - dropped:
+        print_line(
+            f"{lost} records are lost, because {path} was damaged or the service answered only "
+            "later ones",
             sys.stderr,
         )
     if waiting := publisher.count_unsettled():

@@ -307,7 +307,7 @@ def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, agai
             else "the reasons are above"
         )
         print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
-    left = publisher.count_unsettled() or publisher.status.dropped_records
+    left = publisher.count_unsettled() or publisher.status.lost_records
     if left:
         print(
             f"error: publish: {left} records were not acknowledged; {again}, no record counts "

@@ -101,6 +101,13 @@ class PublisherStatus:
         """
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
+    @property
+    def lost_records(self) -> int:
+        """Return the number of records that were lost: dropped for lack of space, given up without
+        an answer, or damaged.
+        """
+        return self.dropped_records + self.unanswered_records + self.damage_counts[1]
+
     def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of records of one kind, or of all kinds, that no service has settled
         (acknowledged or refused). They are in the outbox (store on disk), where some may come from

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,8 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.cli import main
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.spool_file import SpoolFile
 from schemas import tables
+from schemas.wire import Kind
+from tests.edge_agent.service import Router, Service
 from tests.ports import free_ports
 
 Output = pytest.CaptureFixture[str]
@@ -160,6 +165,31 @@ def test_replay_tells_what_it_leaves_in_the_outbox_and_how_to_go_on(
     again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", said)
     assert again is not None
     assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in said
+
+
+def test_records_lost_by_a_damaged_outbox_are_reported(
+    tmp_path: Path, router: Router, service: Service, capsys: Output
+) -> None:
+    """An earlier run left a batch that is damaged on the disk. The replayed drive is sent, but the
+    loss must not pass as a success.
+    """
+    spool = tmp_path / "spool.sqlite"
+    outbox = Outbox(spool)
+    outbox.store([Draft("car-one", Kind.STATE, 77, 3, lambda seq, first: b"three records")], 0.0)
+    outbox.close()
+    with closing(sqlite3.connect(spool)) as database, database:
+        database.execute("UPDATE batch SET payload = X'00'")
+    config = tmp_path / "agent.json"
+    config.write_text(
+        json.dumps({"spool": str(spool), "zenoh": router.settings.model_dump(mode="json")})
+    )
+    words = [*write_drive(tmp_path / "d.parquet"), "--out", str(tmp_path / "e.parquet")]
+    capsys.readouterr()
+    assert main([*words, "--publish", "--trust", "--name", "car-one", "--config", str(config)]) == 1
+    seen = capsys.readouterr()
+    counts = json.loads(seen.out.splitlines()[-1])
+    assert counts["published"] == counts["acknowledged"] > 0
+    assert f"3 records are lost, because {spool} was damaged" in seen.err
 
 
 def test_a_disk_that_refuses_the_records_of_a_replay_is_named(
