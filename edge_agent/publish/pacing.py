@@ -14,6 +14,7 @@ state. Time is monotonic [s].
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Container
 from typing import Final
 
@@ -86,6 +87,11 @@ class Pacer:
         for an answer.
         """
         return self._unanswered_since
+
+    @property
+    def oldest(self) -> float:
+        """Return the key of the oldest batch that waits to be sent; infinite if none waits."""
+        return self._waiting[0] if self._waiting else math.inf
 
     def queue_batch(self, key: int) -> None:
         """Queue a stored batch for sending. `key` is its row number in the outbox (store on disk),

@@ -132,14 +132,32 @@ class ResendSchedule:
         """Mark at most `limit` batches as in flight (sent and not answered), and return their keys,
         oldest first, so that the caller sends them at `now` [s]. They belong to `vehicles`, or to
         any vehicle if that is None.
+
+        The oldest batches of all regions come first. A vehicle's records then arrive in the order
+        of its drive, as the service's check of impossible paths expects.
         """
+        pacers = [
+            pacer
+            for (vehicle, _), pacer in self._pacers.items()
+            if vehicles is None or vehicle in vehicles
+        ]
         keys: list[int] = []
-        for (vehicle, _), pacer in self._pacers.items():
-            if vehicles is None or vehicle in vehicles:
-                taken = pacer.take_due(now, self._random_jitter(), limit - len(keys), self._held)
-                for key in taken:
-                    self.mark_in_flight(key, now)
-                keys += taken
+
+        def take_from(pacer: Pacer, most: int) -> bool:
+            taken = pacer.take_due(now, self._random_jitter(), most, self._held)
+            for key in taken:
+                self.mark_in_flight(key, now)
+            keys.extend(taken)
+            return bool(taken)
+
+        for pacer in pacers:
+            take_from(pacer, 0)  # only probes of silent regions
+        by_age = [(pacer.oldest, n) for n, pacer in enumerate(pacers) if not pacer.silent]
+        heapq.heapify(by_age)
+        while by_age and len(keys) < limit:
+            _, n = heapq.heappop(by_age)
+            if take_from(pacers[n], 1):
+                heapq.heappush(by_age, (pacers[n].oldest, n))
         self._pacers = {
             name: pacer for name, pacer in self._pacers.items() if not pacer.is_idle or pacer.silent
         }

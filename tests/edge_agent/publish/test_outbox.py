@@ -295,6 +295,18 @@ def test_reconnect_sends_everything_again_oldest_first_and_once(path: Path) -> N
     outbox.close()
 
 
+def test_a_backlog_of_two_regions_is_sent_in_the_order_of_the_drive(path: Path) -> None:
+    drive = [77] * 6 + [9] * 6 + [77] * 6
+    outbox = Outbox(path, boot=BOOT, first_resend_s=4.0)
+    stored = outbox.store([draft(region=region) for region in drive], now=0.0)
+    outbox.reset_in_flight("car-a", now=1.0)
+    sent: list[StoredBatch] = []
+    while batches := outbox.due_batches(now=1.0, limit=4):
+        sent += batches
+    assert [(b.stream, b.seq) for b in sent] == [(b.stream, b.seq) for b in stored]
+    outbox.close()
+
+
 def test_reconnect_probes_a_silent_route_at_once_with_one_batch(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     now = silence_route(outbox)
