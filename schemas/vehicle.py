@@ -79,9 +79,11 @@ class Calibration(BaseModel):
 
 
 class Vehicle(BaseModel):
-    """Nominal parameters of one vehicle, as in its vehicle file, in SI units."""
+    """Nominal parameters of one vehicle, as in its vehicle file, in SI units. Unknown names are
+    refused, so that a misspelt optional name is reported.
+    """
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=64, description="name of the vehicle")]
     mass: Annotated[float, Field(gt=0.0, lt=100_000.0, allow_inf_nan=False, description="[kg]")]
@@ -185,9 +187,9 @@ def load_vehicle(path: Path | str) -> Vehicle:
     "class:compact".
 
     Raises:
-        InputError: the file cannot be read, a field is missing or out of range, or fields do not
-            fit together: mass and yaw inertia, or a stiffness and the wheel's load. The error names
-            the field and the fix.
+        InputError: the file cannot be read, a field is unknown, missing or out of range, or fields
+            do not fit together: mass and yaw inertia, or a stiffness and the wheel's load. The
+            error names the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))

@@ -121,7 +121,7 @@ def test_every_column_has_a_unit_and_a_meaning() -> None:
 
 def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.json"
-    path.write_text(json.dumps({**VEHICLE, "colour": "red"}))
+    path.write_text(json.dumps(VEHICLE))
     assert load_vehicle(path) == Vehicle.model_validate(VEHICLE)
 
 
@@ -132,6 +132,9 @@ def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
         ({"mass": None}, "^mass: "),
         ({"track_front": "wide"}, "^track_front: "),
         ({"wheel_radius": float("nan")}, "^wheel_radius: "),
+        ({"weel_radius_front": 0.3}, "^weel_radius_front: .*; write 'wheel_radius_front' in the"),
+        ({"colour": "red"}, "^colour: is not a known name; remove it, or use one of name, mass"),
+        ({"calibration": {"drives": 1, "axe": None}}, "^calibration.axe: .*; write 'ax' in the"),
     ],
 )
 def test_a_wrong_vehicle_field_is_named(
