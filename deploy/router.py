@@ -18,6 +18,7 @@ from pathlib import Path
 import zenoh
 
 from schemas.errors import InputError
+from schemas.runtime import commandline
 from schemas.runtime.link_watch import router_metrics
 from schemas.runtime.metrics import serve_metrics
 from schemas.runtime.process import force_exit
@@ -92,7 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="listen endpoints; override the file's; e.g. tcp/127.0.0.1:0 for a free port",
     )
     parser.add_argument(
-        "--metrics-port", type=int, help="serve /metrics: sessions and links; 0 for a free port"
+        "--metrics-port",
+        type=commandline.parse_port,
+        help="serve /metrics: sessions and links; 0 for a free port",
     )
     parser.add_argument(
         "--metrics-host", default="127.0.0.1", help="listen address of /metrics (default 127.0.0.1)"

@@ -48,6 +48,41 @@ def test_the_version_is_that_of_the_distribution(name: str, capsys: Capture) -> 
     assert commandline.version()[0].isdigit()
 
 
+@pytest.mark.parametrize("value", ["nan", "-inf", "-1", "0", "ten"])
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("run", "--duration"),
+        ("run", "--rate"),
+        ("fleet", "--duration"),
+        ("fleet", "--rate"),
+        ("simulate", "--speed"),
+        ("simulate", "--duration"),
+        ("simulate", "--rate"),
+    ],
+)
+def test_an_option_above_zero_refuses_any_other_value(
+    command: str, option: str, value: str, capsys: Capture
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        edge_agent.cli.main([command, f"{option}={value}"])
+    message = f"error: argument {option}: '{value}' is not a positive number; see "
+    assert capsys.readouterr().err == f"{message}edge-agent {command} --help\n"
+
+
+@pytest.mark.parametrize("value", ["-1", "65536", "8080.5", "http"])
+@pytest.mark.parametrize(
+    "words", [("page", "--port"), ("watch", "--health-port"), ("router", "--metrics-port")]
+)
+def test_an_option_for_a_port_refuses_any_other_value(
+    words: tuple[str, str], value: str, capsys: Capture
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        fleet_service.cli.main([words[0], f"{words[1]}={value}"])
+    error = f"error: argument {words[1]}: '{value}' is not a port (0 to 65535); see "
+    assert capsys.readouterr().err.startswith(error)
+
+
 @pytest.mark.parametrize(("name", "command", "example"), EXAMPLES)
 def test_the_example_of_each_help_is_a_command_that_is_understood(
     name: str, command: str, example: str

@@ -10,9 +10,8 @@ import argparse
 from pathlib import Path
 
 from schemas.errors import InputError
+from schemas.runtime import commandline
 from schemas.runtime.installing import install_command
-
-LAST_PORT = 65_535
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument(
         "--duration",
-        type=float,
+        type=commandline.parse_positive,
         default=150.0,
         help="duration of the drive in seconds (default 150)",
     )
@@ -43,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--page-port",
-        type=int,
+        type=commandline.parse_port,
         default=8080,
         help="port of the live page; 0 selects a free one (default 8080)",
     )
@@ -59,11 +58,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo with the parsed options; return the exit code.
 
     Raises:
-        InputError: the port is out of range, an optional package is missing, or a process of the
-            demo did not start.
+        InputError: an optional package is missing, or a process of the demo did not start.
     """
-    if not 0 <= args.page_port <= LAST_PORT:
-        raise InputError("page-port", f"{args.page_port} is not a port", f"give 0 to {LAST_PORT}")
     try:
         from deploy.demo import processes, story
         from fleet_service.page import server  # noqa: F401 the page's process needs this package

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
+from schemas.runtime import commandline
 
 if TYPE_CHECKING:
     from schemas.wire.ahead import GripWarning
@@ -47,11 +48,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)"
     )
     parser.add_argument(
-        "--rate", type=float, default=100.0, help="samples per second (default 100)"
+        "--rate",
+        type=commandline.parse_positive,
+        default=100.0,
+        help="samples per second (default 100)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulation (default 0)")
     parser.add_argument(
-        "--duration", type=float, default=float("inf"), help="duration [s] (default: until stopped)"
+        "--duration",
+        type=commandline.parse_positive,
+        default=float("inf"),
+        help="duration [s] (default: until stopped)",
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
-from schemas.runtime import progress_messages
+from schemas.runtime import commandline, progress_messages
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
@@ -80,12 +80,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scenario", default="demo", help="scenario of the simulated vehicle (default demo)"
     )
     parser.add_argument(
-        "--rate", type=float, default=100.0, help="samples per second of the simulation"
+        "--rate",
+        type=commandline.parse_positive,
+        default=100.0,
+        help="samples per second of the simulation",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulation")
     parser.add_argument(
         "--duration",
-        type=float,
+        type=commandline.parse_positive,
         default=float("inf"),
         help="duration [s] (default: until stopped or the end of the log)",
     )

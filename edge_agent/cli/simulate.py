@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
+from schemas.runtime import commandline
 
 SENSORS = ("ideal", "mems", "mems-leak", "mems-patchy", "rough", "rough-coarse", "rough-late")
 ROADS = ("level", "rolling", "stepped", "banked", "hilly", "cobbled")
@@ -21,11 +22,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mu", type=float, help="peak friction of the road (default: the manoeuvre's)"
     )
     parser.add_argument(
-        "--speed", type=float, help="speed at the start [m/s] (default: the manoeuvre's)"
+        "--speed",
+        type=commandline.parse_positive,
+        help="speed at the start [m/s] (default: the manoeuvre's)",
     )
-    parser.add_argument("--duration", type=float, help="duration [s] (default: the manoeuvre's)")
     parser.add_argument(
-        "--rate", type=float, default=100.0, help="samples per second (default 100)"
+        "--duration",
+        type=commandline.parse_positive,
+        help="duration [s] (default: the manoeuvre's)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=commandline.parse_positive,
+        default=100.0,
+        help="samples per second (default 100)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the sensor errors (default 0)")
     parser.add_argument(

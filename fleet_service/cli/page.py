@@ -27,7 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host", default="127.0.0.1", help="listen address (default 127.0.0.1: this machine only)"
     )
     parser.add_argument(
-        "--port", type=int, default=8080, help="port; 0 selects a free one (default 8080)"
+        "--port",
+        type=commandline.parse_port,
+        default=8080,
+        help="port; 0 selects a free one (default 8080)",
     )
     parser.add_argument(
         "--name",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from fleet_service.cli.common import add_connection, stop_on_signals
 from schemas.errors import InputError
+from schemas.runtime import commandline
 
 if TYPE_CHECKING:
     from fleet_service.client.stretches import StretchAlert
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--health-port",
         metavar="PORT",
-        type=int,
+        type=commandline.parse_port,
         help="serve /healthz and /metrics of the webhook on loopback",
     )
     add_connection(parser)

@@ -200,7 +200,7 @@ def open_socket(host: str, port: int) -> socket.socket:
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((host, port))
-    except (OSError, OverflowError) as error:  # OverflowError: the port number is too large
+    except OSError as error:
         found.close()
         fix = "give another with --port, or 0 for a free one"
         raise InputError(

@@ -1,4 +1,4 @@
-"""Common parts of both command lines: error handling, negative numbers, version, completion, quiet
+"""Common parts of both command lines: error handling, types of numbers, version, completion, quiet
 mode.
 
 Exit codes: 0 success, 1 finished but something failed or is left to do, 2 misuse or bad input, 3
@@ -8,6 +8,7 @@ implausible signals (edge-agent), 130 ended by Ctrl-C.
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,6 +26,7 @@ INTERRUPTED: Final = 130  # exit code 128 + SIGINT, as shells use it
 SHELLS: Final = ("bash", "zsh", "tcsh")
 # Optional extra of this project that installs a package.
 EXTRA_OF: Final = {"scipy": "analytics", "matplotlib": "analytics"}
+LAST_PORT: Final = 65_535
 _NEGATIVE: Final = re.compile(r"^-[\d.]")
 
 
@@ -104,6 +106,39 @@ def add_command(
     )
     louder.add_argument("-q", "--quiet", action="store_true", help="show errors only")
     return parser
+
+
+def parse_positive(text: str) -> float:
+    """Return the value of an option that is a number above 0, such as a duration [s]. Infinity is
+    allowed. The function is a `type` for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: `text` is not such a number.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f"{text[:60]!r} is not a positive number")
+    return value
+
+
+def parse_port(text: str) -> int:
+    """Return the value of an option that is a port; 0 stands for a free port. The function is a
+    `type` for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: `text` is not a port number.
+    """
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= LAST_PORT:
+        problem = f"{text[:60]!r} is not a port (0 to {LAST_PORT})"
+        raise argparse.ArgumentTypeError(problem)
+    return value
 
 
 def wants_quiet(arguments: Sequence[str]) -> bool:

@@ -7,9 +7,12 @@ import pytest
 from deploy import cli
 
 
-@pytest.mark.parametrize("port", ["99999999", "-1"])
-def test_a_port_out_of_range_is_refused_before_anything_starts(
-    port: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("option", "value"), [("--page-port", "99999999"), ("--page-port", "-1"), ("--duration", "nan")]
+)
+def test_a_number_out_of_range_is_refused_before_anything_starts(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["demo", "--page-port", port]) == 2
-    assert capsys.readouterr().err == f"error: page-port: {port} is not a port; give 0 to 65535\n"
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["demo", option, value])
+    assert capsys.readouterr().err.startswith(f"error: argument {option}: '{value}' is not a p")

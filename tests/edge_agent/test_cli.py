@@ -418,7 +418,6 @@ BAD_COMMANDS = {
     "unknown manoeuvre": (["simulate", "moonwalk", "--out", "x"], "^error: manoeuvre: "),
     "no output": (["simulate", next(iter(MANOEUVRES))], "^error: out: is not given; "),
     "no vehicles": (["fleet", "--vehicles", "0"], "^error: vehicles: "),
-    "no rate": (["fleet", "--rate", "nan"], "^error: rate"),
     "unknown scenario": (["fleet", "--scenario", "moon"], "^error: scenario: "),
     "truth into nowhere": (
         ["fleet", "--truth", "/dev/null/truth"],
