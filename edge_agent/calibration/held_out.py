@@ -148,15 +148,17 @@ def restrict_groups(calibration: Calibration, groups: Sequence[str]) -> Calibrat
 
 def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     """Return True if the predictions `tried` are worse than the predictions `best` on the same
-    drives.
+    drives, or if they cannot be compared because a score is NaN.
 
     Either of two reasons suffices. The mean log-likelihood is lower by more than WORSE. Or, on at
     least one drive, the share of time with the flag CONTRADICTION (measurements contradict the
     model) is larger by more than LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
-    longer = max(new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True))
-    return lost > WORSE or longer > LONGER
+    longer = np.max(
+        [new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True)]
+    )
+    return not (lost <= WORSE and bool(longer <= LONGER))
 
 
 def _mean_prediction(predictions: Sequence[Prediction]) -> Prediction:

@@ -75,6 +75,13 @@ def test_longer_contradiction_is_worse_whatever_the_likelihood() -> None:
     assert not is_worse([Prediction(0.0, 0.0)], [Prediction(0.0, 0.1)])
 
 
+def test_prediction_that_was_not_measured_counts_as_worse() -> None:
+    good = Prediction(0.0, 0.0)
+    for unmeasured in (Prediction(np.nan, 0.0), Prediction(5.0, np.nan)):
+        assert is_worse([good, unmeasured], [good, good])
+        assert is_worse([unmeasured, good], [good, good])
+
+
 def test_restriction_keeps_the_groups_that_are_named() -> None:
     known = Calibration(drives=2, ax=(0.1, 0.1), radius_fl=(0.01, 0.001), steer_gain=(1.0, 0.1))
     assert restrict_groups(known, ["radii"]) == Calibration(drives=2, radius_fl=(0.01, 0.001))
