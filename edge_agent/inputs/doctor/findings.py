@@ -28,7 +28,15 @@ from edge_agent.inputs.doctor.drive import (
 from edge_agent.inputs.doctor.identities import PARTS, Fit, fit_identities, fit_robustly
 from edge_agent.inputs.doctor.lift import is_on_lift
 from edge_agent.inputs.doctor.places import has_exchanged_position, yaw_findings
-from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, Verdict, explain_fits, late_clocks
+from edge_agent.inputs.doctor.scales import (
+    CLOCK_SETTLED,
+    LAWS,
+    REVERSING,
+    UNSIGNED,
+    Verdict,
+    explain_fits,
+    late_clocks,
+)
 from edge_agent.inputs.doctor.slip import (
     RADIUS_PARTS,
     STEADY,
@@ -126,7 +134,7 @@ def diagnose(
     if diagnosis.locked == ["rear"]:
         drive = replace(drive, r_wheels=drive.yaw_front)
     found = fit_identities(drive)
-    verdict = explain_fits(found, vehicle)
+    verdict = explain_fits(found, vehicle, drive.fast)
     diagnosis.fits = found
     diagnosis.drive = drive
     _find_scales(verdict, found, diagnosis)
@@ -281,7 +289,8 @@ def _find_scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) 
                 channel,
                 fault.name,
                 f"{words}: {fault.name}?",
-                1.0 / fault.factor,
+                # No factor corrects both directions of travel.
+                1.0 if fault is REVERSING else 1.0 / fault.factor,
                 confidence=verdict.margins[quantity],
             )
         )
@@ -293,7 +302,7 @@ def _find_receiver_scale(channel: str, verdict: Verdict, ground: Fit) -> list[Fi
     `verdict` is taken into account. `ground` is the fit of both speeds.
     """
     fault = verdict.faults["v"]
-    share = abs(ground.gain) * (1.0 if fault is None else fault.factor)
+    share = abs(ground.gain) * (1.0 if fault is None else abs(fault.factor))
     if not ground.is_known or not is_steady(ground) or abs(np.log(share)) < STEADY:
         return []
     words = f"the receiver is {share:.3g} times as fast as the wheels: its unit?"
@@ -320,7 +329,7 @@ def _holds_throughout(
         return False
     ground = found["ground"]
     if quantity == "v" and fault is not None and drive is not None and ground.is_known:
-        like_slip = abs(np.log(fault.factor)) < NEAR_ONE
+        like_slip = fault is not REVERSING and abs(np.log(fault.factor)) < NEAR_ONE
         if (
             like_slip
             and abs(np.log(abs(ground.gain * fault.factor))) < 0.1
@@ -336,6 +345,8 @@ def _holds_throughout(
             other = verdict.faults[member.quantity]
             if other is not None:
                 gain *= other.factor**member.power
+        if name in UNSIGNED:
+            gain = abs(gain)
         off = abs(np.log(abs(gain / law.centre)))
         # Noise of ln gain in one part of the drive.
         noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)

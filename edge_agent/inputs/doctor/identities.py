@@ -5,7 +5,7 @@
     longitudinal   a_x         dv/dt    unit and sign of a_x, v
     steering       δ · v       L · r    unit and sign of δ, v, r (plus a term understeer · v² r)
     axle           r_w         r        which wheel is left, v, r
-    ground         v_g         v        unit of v: the wheels' radius
+    ground         v_g         |v|      unit of v: the wheels' radius
     turning        d course    r        sign and unit of r
 
 Symbols: v speed and r_w yaw rate from the wheels, r yaw rate of the gyroscope, δ steering angle, L
@@ -141,7 +141,7 @@ def _axle_relation(d: EvenDrive) -> Relation:
 
 
 def _ground_relation(d: EvenDrive) -> Relation:
-    return Relation(d.v_ground, smooth_twice(d.v))
+    return Relation(d.v_ground, smooth_twice(np.abs(d.v)))
 
 
 def _turning_relation(d: EvenDrive) -> Relation:

@@ -93,7 +93,13 @@ LAWS: Final = {
     "ground": Law(1.0, 0.015, (Member("v", -1),)),
     "turning": Law(1.0, 0.08, (Member("r", -1), Member("place", 1))),
 }
+# Identities of sizes without sign.
+UNSIGNED: Final = ("ground",)
 FLIPPED: Final = Mistake("sign", -1.0)
+# Most wheel-speed sensors do not report the direction. In a car that drives backwards, such a speed
+# has the wrong sign in all identities, as if several other signals had one.
+REVERSING: Final = Mistake("unsigned in reverse", -1.0)
+FASTEST_REVERSE: Final = 10.0  # [m/s] reverse gears of cars end at about 30 km/h
 QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
 # Clocks that an identity compares: identity -> (device on the left, device on the right).
 CLOCKS: Final = {
@@ -126,9 +132,10 @@ CLOCK_LIKE: Final = 0.8
 CLOCK_COST: Final = 4.0
 
 
-def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
+def faults_of(vehicle: Vehicle, ground: Fit, fast: float) -> dict[str, list[Mistake]]:
     """Return, for each measured quantity, its possible faults (wrong units and signs) for this
-    vehicle. `ground` is the fit of the speed over ground to the wheels' speed.
+    vehicle. `ground` is the fit of the speed over ground to the wheels' speed, `fast` the drive's
+    high speed [m/s].
     """
     g = 1.0 / GRAVITY
     deg = 1.0 / DEG
@@ -137,6 +144,8 @@ def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
     if ground.is_known and 0.4 < ground.gain < 2.5 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
+    if fast < FASTEST_REVERSE:
+        rims.append(REVERSING)
     angles = [
         Mistake("deg", 1.0 / ANGLE["deg"]),
         Mistake("steering wheel", ratio),
@@ -186,16 +195,17 @@ class Verdict:
         return self.margins[quantity] >= SETTLED
 
 
-def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
+def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle, fast: float) -> Verdict:
     """Return the most plausible set of faults (wrong units and signs) that explains the fitted
-    identities `found` (pairs of expressions that are equal by physics).
+    identities `found` (pairs of expressions that are equal by physics). `fast` is the drive's high
+    speed [m/s].
 
     This set has the lowest cost. Each fault adds a fixed cost, because faults are rare. Each
     identity adds the squared normalised error that remains in its gain (ratio of its two sides).
     """
     choices: dict[str, list[Mistake | None]] = {
         quantity: [None, *faults]
-        for quantity, faults in faults_of(vehicle, found["ground"]).items()
+        for quantity, faults in faults_of(vehicle, found["ground"], fast).items()
     }
     sets = dict(zip(choices, _index_sets(choices), strict=True))
     factors = {
@@ -262,6 +272,8 @@ def _misfits_of(name: str, fit: Fit, factors: Mapping[str, FloatArray]) -> Float
     gains = law.centre * np.prod(
         [factors[quantity] ** float(power) for quantity, power in law.members], axis=0
     )
+    if name in UNSIGNED:
+        gains = np.abs(gains)
     away = np.log(abs(fit.gain) / np.abs(gains)) if fit.gain else np.full(len(gains), 10.0)
     costs = away**2 / (law.spread**2 + fit.error**2)
     costs += np.where(fit.gain * gains < 0.0, WRONG_SIGN * fit.correlation**2, 0.0)

@@ -26,7 +26,9 @@ from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas.signals import CHANNELS, S
 from tests.benchmarks.inputs.__main__ import main as evaluate_inputs
 from tests.benchmarks.inputs.planted import (
+    DELTA,
     DRIVE_S,
+    PLACE,
     PLANTED,
     RATE_HZ,
     Recorded,
@@ -69,6 +71,68 @@ def write(path: Path, drive: Recorded) -> list[str]:
     pq.write_table(pa.table(columns), path)
     path.with_suffix(".json").write_text(drive.vehicle.model_dump_json(exclude_none=True))
     return [str(path), "--vehicle", str(path.with_suffix(".json"))]
+
+
+def slow_down(drive: Recorded) -> Recorded:
+    """Return the drive at half its speed, which cars also reach in reverse."""
+    signals = drive.signals.copy()
+    signals[:, [*range(S.OMEGA, S.OMEGA + 4), S.YAW_RATE]] *= 0.5
+    signals[:, [S.AX, S.AY]] *= 0.25
+    return drive._replace(t=2.0 * drive.t, signals=signals)
+
+
+def play_backwards(drive: Recorded) -> Recorded:
+    """Return the drive played backwards: a car in reverse whose wheel speeds have no sign. Time
+    reversal changes the signs of speed and yaw rate, but not of accelerations.
+    """
+    signals = drive.signals[::-1].copy()
+    signals[:, S.YAW_RATE] *= -1.0
+    return drive._replace(signals=signals)
+
+
+def without(drive: Recorded, channels: list[int]) -> Recorded:
+    """Return the drive without the readings of `channels`."""
+    signals = drive.signals.copy()
+    signals[:, channels] = np.nan
+    return drive._replace(signals=signals)
+
+
+def flip_ax(drive: Recorded) -> Recorded:
+    """Return the drive with the wrong sign of a_x."""
+    signals = drive.signals.copy()
+    signals[:, S.AX] *= -1.0
+    return drive._replace(signals=signals)
+
+
+def list_faults(drive: Recorded) -> list[tuple[str, str]]:
+    """Return channel and kind of the faults that the doctor finds, without clocks."""
+    found = diagnose(drive.t, drive.signals, drive.vehicle).findings
+    return [(finding.channel, finding.kind) for finding in found if finding.kind != "clock"]
+
+
+@pytest.mark.parametrize("missing", [[], PLACE, [*PLACE, *DELTA]])
+def test_reversing_with_unsigned_wheels_is_no_wrong_sign(
+    rough: Recorded, missing: list[int]
+) -> None:
+    forward = slow_down(without(rough, missing))
+    assert list_faults(forward) == []
+    assert list_faults(play_backwards(forward)) == [("omega", "unsigned in reverse")]
+    assert list_faults(flip_ax(forward)) == [("ax", "sign")]
+
+
+def test_reversing_with_signed_wheel_speeds_is_no_fault(rough: Recorded) -> None:
+    backwards = play_backwards(slow_down(rough))
+    backwards.signals[:, S.OMEGA : S.OMEGA + 4] *= -1.0
+    assert list_faults(backwards) == []
+
+
+def test_straight_slow_drive_leaves_the_sign_of_a_x_open(rough: Recorded) -> None:
+    """Only turns distinguish a wrong sign from a car that reverses; a fast car does not reverse."""
+    straight = without(rough, [S.AY, S.YAW_RATE, *DELTA])
+    assert list_faults(flip_ax(straight)) == [("ax", "sign")]
+    slow = flip_ax(slow_down(straight))
+    assert list_faults(slow) == []
+    assert "ax" in diagnose(slow.t, slow.signals, slow.vehicle).unknown
 
 
 @pytest.mark.parametrize("name", PLANTED)
