@@ -109,7 +109,7 @@ class Engine:
         before()
         state = load_state(self._root, self._config, set_aside)
         with self._shared.guard:
-            self._shared.adopt(state)
+            self._shared.replace(state)
             self.intake.reset()
             self.alerts.end_erased(standing)
 

@@ -40,12 +40,16 @@ class Queries:
 
     def first_tiles(self, tiles: list[int], now: int) -> dict[int, bytes]:
         """Return the first of the given tiles that are made in one step, at least one. For each
-        tile, those cells that readers may see are given as an Arrow stream (bytes), or empty bytes
-        if there are none.
+        tile, those cells that readers may see are given as an Arrow stream (bytes). If there are
+        none, it is a stream without rows if readers saw cells there before, else empty bytes.
         """
         group = self._shared.tiles.first_group(tiles)
         made = zip(group, self._shared.tiles.make(group, now), strict=True)
-        return {tile: shown.payload if shown.cells.num_rows else b"" for tile, shown in made}
+        emptied = self._shared.state.map.emptied
+        return {
+            tile: shown.payload if shown.cells.num_rows or tile in emptied else b""
+            for tile, shown in made
+        }
 
     def take_changed(self, now: int) -> list[int]:
         """Return the numbers of the tiles that changed since the last call. If cells are hidden for

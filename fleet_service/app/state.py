@@ -17,6 +17,7 @@ import pyarrow as pa
 from fleet_service.archive.format.layout import DAY_NS, Cut
 from fleet_service.archive.format.load import skip_damaged
 from fleet_service.fusion import Fusion
+from fleet_service.fusion.store.store import distinct_values
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
@@ -30,7 +31,7 @@ from fleet_service.replay.restart import image_of, load_restart
 from fleet_service.replay.streams import Begin, read_streams, restore_streams
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.idle_roads import IdleRoads
-from fleet_service.serve.map_state import MapState
+from fleet_service.serve.map_state import MapState, tile_of
 from fleet_service.serve.public_cells import PRESENT, WAITING, PublicCells
 from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
@@ -103,21 +104,34 @@ class SharedState:
 
     Attributes:
         guard: lock that is held while the map is changed or read.
-        state: current state; replaced as a whole by `adopt`.
+        state: current state; replaced as a whole by `replace`.
         tiles: cached tiles of the current map.
     """
 
     def __init__(self, state: ServiceState, public_vehicles: int) -> None:
         self.guard = threading.Lock()
         self._public_vehicles = public_vehicles
-        self.adopt(state)
 
-    def adopt(self, state: ServiceState) -> None:
-        """Replace the service's state by a newly loaded one, and start with an empty cache of map
-        tiles.
-        """
+        self._adopt(state)
+
+    def _adopt(self, state: ServiceState) -> None:
+        """Use `state` from now on, and start with an empty cache of map tiles."""
         self.state = state
         self.tiles = TileCache(state.map, self.guard, self._public_vehicles, state.public)
+
+    def replace(self, state: ServiceState) -> None:
+        """Replace the service's state by a newly loaded one. Tiles that have lost all their cells
+        are published once more, because subscribers still have these cells.
+        """
+        before = self._readable_tiles() | self.state.map.emptied
+        self._adopt(state)
+        state.map.mark_emptied(before - self._readable_tiles())
+
+    def _readable_tiles(self) -> set[int]:
+        """Return the numbers of the tiles that have cells for readers."""
+        fusion = self.state.fusion
+        slots = self.tiles.public(np.arange(fusion.size), self.state.streams.newest)
+        return set(distinct_values(tile_of(fusion, slots)).tolist())
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:

@@ -24,6 +24,11 @@ class MapState:
 
     Args:
         fusion: owner of the cells.
+
+    Attributes:
+        change: number of changes so far.
+        emptied: numbers of the tiles that had cells for readers and lost all of them, so that they
+            are published without cells.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -33,7 +38,8 @@ class MapState:
         self._indexed = 0
         self._dirty: set[int] = set()
         self._changed: dict[int, int] = {}
-        self.change = 0  # number of changes so far
+        self.change = 0
+        self.emptied: set[int] = set()
 
     def mark_changed(self, slots: IntArray) -> None:
         """Record that slots (one per cell and heading sector) were updated, so that their tiles
@@ -51,6 +57,11 @@ class MapState:
         self.change += 1
         self._dirty.update(self._slots)
         self._changed.update(dict.fromkeys(self._slots, self.change))
+
+    def mark_emptied(self, tiles: set[int]) -> None:
+        """Record that these tiles have no cells for readers any more, and count as changed."""
+        self.emptied |= tiles
+        self._dirty |= tiles
 
     def changed_at(self, tile: int) -> int:
         """Return the version of a tile: the value of the map's counter of changes when the tile
