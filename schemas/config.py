@@ -254,6 +254,11 @@ class ServiceConfig(MonitoringSettings):
         description="senders that report many places at once and have no path, such as the "
         "witness of `fleet-service cits`",
     )
+    publisher_kb_s: Positive = Field(
+        default=2000.0,
+        description="long-run rate at which each of `publishers` may send [kB/s]; it may send more "
+        "at once than a vehicle by the same factor",
+    )
     fleet: Path | None = Field(
         default=None,
         description="enrolment file; reports of other vehicles are ignored, and an enrolled "

@@ -88,7 +88,11 @@ class Service:
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(
-            config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts
+            config.vehicle_kb_s * 1e3,
+            config.vehicle_burst_kb * 1e3,
+            known,
+            self.engine.counts,
+            shares=dict.fromkeys(config.publishers, config.publisher_kb_s / config.vehicle_kb_s),
         )
         self._replies = MapQueryable(
             Answering(

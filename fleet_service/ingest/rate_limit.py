@@ -1,4 +1,4 @@
-"""Rate limit: a token bucket of bytes per vehicle, applied before a message is parsed.
+"""Rate limit: a token bucket of bytes per sender, applied before a message is parsed.
 
 A bucket fills at a constant rate and holds a burst, so that a vehicle can catch up after an outage.
 Messages beyond the limit are dropped, counted and not acknowledged: the sender keeps them and sends
@@ -9,7 +9,7 @@ that it is the sender's own name.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 from fleet_service.counts import ServiceCounts
@@ -33,6 +33,8 @@ class RateLimiter:
         known: enrolled names; None to accept any name.
         counts: counts of the service; `limited` and `refused["unknown"]` are increased.
         clock: function that returns the time [s].
+        shares: rate of publishers (senders for many vehicles) as a multiple of a vehicle's, by
+            name.
     """
 
     def __init__(
@@ -42,12 +44,14 @@ class RateLimiter:
         known: Collection[str] | None,
         counts: ServiceCounts,
         clock: Callable[[], float] = time.monotonic,
+        shares: Mapping[str, float] | None = None,
     ) -> None:
         self._rate = rate
         self._burst = burst
         self._known = known
         self._counts = counts
         self._clock = clock
+        self._shares = shares or {}
         # remaining amount [bytes] of each name, and the time [s] to which it applies
         self._buckets: dict[str, tuple[float, float]] = {}
         self._swept = -float("inf")
@@ -63,11 +67,11 @@ class RateLimiter:
         now = self._clock()
         if name not in self._buckets and len(self._buckets) >= MOST_NAMES and not self._forget(now):
             name = _OTHERS
-        left, since = self._buckets.get(name, (self._burst, now))
-        left = min(self._burst, left + (now - since) * self._rate)
-        cost = min(
-            max(size, LEAST_BYTES) * (JSON_COST if encoding.startswith(JSON) else 1), self._burst
-        )
+        share = self._shares.get(name, 1.0)
+        burst = self._burst * share
+        left, since = self._buckets.get(name, (burst, now))
+        left = min(burst, left + (now - since) * self._rate * share)
+        cost = min(max(size, LEAST_BYTES) * (JSON_COST if encoding.startswith(JSON) else 1), burst)
         fits = left >= cost
         self._buckets[name] = (left - cost if fits else left, now)
         if not fits:
@@ -82,11 +86,11 @@ class RateLimiter:
         sent recently. Do this at most once per refill time. Return True if there is room for
         another bucket.
         """
-        rate = self._rate
-        burst = self._burst
-        if now - self._swept >= burst / rate:
+        if now - self._swept >= self._burst / self._rate:
             self._swept = now
             self._buckets = {
-                n: b for n, b in list(self._buckets.items()) if b[0] + (now - b[1]) * rate < burst
+                name: (left, since)
+                for name, (left, since) in list(self._buckets.items())
+                if left / self._shares.get(name, 1.0) + (now - since) * self._rate < self._burst
             }
         return len(self._buckets) < MOST_NAMES

@@ -100,6 +100,11 @@ def let_in(made: Service) -> list[bool]:
     ]
 
 
+def let_publisher_in(config: ServiceConfig, root: Path) -> object:
+    """Return what `let_in` returns if the first sender is a publisher."""
+    return of_service(let_in)(config.model_copy(update={"publishers": ["car-1"]}), root)
+
+
 def count_queued(made: Service) -> int:
     for _ in range(5):
         made.inbox.put(Message(Kind.STATE, "", b"", ""))
@@ -186,6 +191,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "vehicle_burst_kb": (100.0, of_service(let_in)),
     "fleet": ("{fleet}", of_service(let_in)),
     "publishers": (["sim-001"], count_far_moves),
+    "publisher_kb_s": (20.0, let_publisher_in),
     "segment_s": (1.0, of_service(turns)),
     "put_s": (0.1, of_service(turns)),
 }

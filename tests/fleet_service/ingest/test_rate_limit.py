@@ -54,6 +54,15 @@ def test_a_vehicle_may_send_a_burst_and_then_its_rate() -> None:
     assert counts == ServiceCounts(limited=200 - 10 - 4)
 
 
+def test_a_publisher_may_send_for_many_vehicles() -> None:
+    clock = Clock()
+    found = RateLimiter(RATE, BURST, None, ServiceCounts(), clock, {"many": 20.0})
+    assert sum(found.allows("obs/many", 5_000) for _ in range(1000)) == 20 * BURST / 5_000
+    assert sum(found.allows("obs/one", 5_000) for _ in range(1000)) == BURST / 5_000
+    clock.now = 2.0
+    assert sum(found.allows("obs/many", 5_000) for _ in range(1000)) == 20 * 2 * RATE / 5_000
+
+
 def test_small_messages_cost_what_it_takes_to_read_one() -> None:
     found, _ = buckets(Clock())
     assert sum(found.allows("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
