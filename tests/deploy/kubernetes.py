@@ -96,6 +96,11 @@ class Pod:
         return list(self.template["spec"]["containers"])
 
     @property
+    def component(self) -> str:
+        """Return the component that the pod runs: router, service or page."""
+        return str(self.template["metadata"]["labels"]["app.kubernetes.io/component"])
+
+    @property
     def grace_s(self) -> float:
         """Return the termination grace period of the pod [s]."""
         return float(self.template["spec"]["terminationGracePeriodSeconds"])
@@ -180,7 +185,8 @@ class Cluster:
                 }
             return json.dumps(fleet)
         for pod in self.pods:
-            if name in (f"{pod.name}.json", "router.json5"):  # settings of this pod itself
+            own = "router.json5" if pod.component == "router" else f"{pod.name}.json"
+            if name == own:
                 for number, port in pod.ports.items():
                     text = text.replace(f'"metrics_port": {number}', f'"metrics_port": {port}')
                     text = text.replace(f"tcp/0.0.0.0:{number}", f"tcp/127.0.0.1:{port}")
@@ -233,7 +239,8 @@ class Cluster:
         words = [self._localize_paths(pod, container, word) for word in container["command"]]
         for name, value in given.items():
             words = [word.replace(f"$({name})", value) for word in words]
-        return words
+        words = [word.replace("0.0.0.0", "127.0.0.1") for word in words]
+        return [str(pod.ports.get(int(word), word)) if word.isdecimal() else word for word in words]
 
     def _environment_value(self, pod: Pod, one: Manifest) -> str:
         if "value" in one:
@@ -325,13 +332,13 @@ class Cluster:
                 )
                 return
 
-    def fetch_page(self, pod: Pod, path: str) -> str:
-        """Return a page of a pod's metrics server. The text is empty if the server does not answer.
-        This happens while a standby (waiting service) takes over, because the standby's server then
-        ends and the service's server starts.
+    def fetch_page(self, pod: Pod, path: str, port: str = "metrics") -> str:
+        """Return a page of a pod's HTTP server, by default that of the metrics. The text is empty
+        if the server does not answer. This happens while a standby (waiting service) takes over,
+        because the standby's server then ends and the service's server starts.
         """
         (container,) = pod.containers
-        address = f"http://127.0.0.1:{pod.port_of(container, 'metrics')}{path}"
+        address = f"http://127.0.0.1:{pod.port_of(container, port)}{path}"
         try:
             with urllib.request.urlopen(address, timeout=5.0) as page:
                 return str(page.read().decode())

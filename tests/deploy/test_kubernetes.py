@@ -28,8 +28,15 @@ pytestmark = pytest.mark.skipif(
 )
 SECRETS = {  # documented secrets of each overlay
     "one-node": set(),
-    "secure": {"router-certs", "service-certs"},
-    "three-regions": {"router-certs", "north-certs", "middle-certs", "south-certs", "bucket"},
+    "secure": {"router-certs", "service-certs", "page-certs"},
+    "three-regions": {
+        "router-certs",
+        "page-certs",
+        "north-certs",
+        "middle-certs",
+        "south-certs",
+        "bucket",
+    },
 }
 
 
@@ -106,9 +113,10 @@ def test_network_policies_reach_routers_but_never_services(overlay: str) -> None
         ways = [rule for one in own for rule in one["egress"] if {"port": 7447} in rule["ports"]]
         to = [peer["podSelector"].get("matchLabels", {}) for rule in ways for peer in rule["to"]]
         assert any(does_select(one, router) for one in to), labels
-        if labels["app.kubernetes.io/component"] == "service" and overlay != "one-node":
+        port = {"service": 9464, "page": 8080}.get(labels["app.kubernetes.io/component"])
+        if port is not None and overlay != "one-node":
             let_in = [rule for one in own for rule in one["ingress"]]
-            assert [rule["ports"] for rule in let_in] == [[{"port": 9464}]]
+            assert [rule["ports"] for rule in let_in] == [[{"port": port}]]
             assert all("namespaceSelector" in peer for rule in let_in for peer in rule["from"])
 
 
@@ -149,9 +157,11 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
     }
     regions: dict[str, list[str]] = {}
     for pod in made.pods:
-        component = pod.template["metadata"]["labels"]["app.kubernetes.io/component"]
-        if component == "router":
+        if pod.component == "router":
             assert listed is None or pod.name in listed.routers
+            continue
+        if pod.component == "page":
+            assert listed is None or pod.name in listed.readers
             continue
         config = ServiceConfig.model_validate_json(configs[f"{pod.name}.json"])
         assert config.name == pod.name
@@ -180,7 +190,7 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(
 ) -> None:
     with kubernetes.open_cluster(overlay, tmp_path) as running:
         assert running.failed == []
-        services = [pod for pod in running.pods if "router" not in pod.name]
+        services = [pod for pod in running.pods if pod.component == "service"]
 
         def list_serving() -> list[str]:
             found = [
@@ -192,6 +202,8 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(
 
         wanted = sorted({pod.name.rpartition("-")[0] for pod in services})
         until(lambda: sorted(list_serving()) == wanted, 120.0)
+        (page,) = (pod for pod in running.pods if pod.component == "page")
+        until(lambda: json.loads(running.fetch_page(page, "/health", "http"))["router"], 120.0)
         with open_reader(running) as session:
             until(
                 lambda: (
@@ -215,7 +227,7 @@ def open_reader(running: Cluster) -> zenoh.Session:
     """Return a reader's Zenoh session at the routers, with its own certificate if the routers
     require one.
     """
-    name = next(pod.name for pod in running.pods if "router" not in pod.name)
+    name = next(pod.name for pod in running.pods if pod.component == "service")
     shipped = ServiceConfig.model_validate_json(read_settings(running, name)).zenoh
     config = {"connect": shipped.connect}
     if running.overlay != "one-node":
