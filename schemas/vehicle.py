@@ -4,6 +4,9 @@ per cent.
 
 from __future__ import annotations
 
+import difflib
+import json
+import logging
 import math
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -21,6 +24,10 @@ Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
 # times too large.
 LEAST_GYRATION: Final = 0.1
 MOST_GYRATION: Final = 2.0
+# Similarity (difflib) from which an unknown name is a misspelt one. "weel_radius" has .96.
+MISSPELT: Final = 0.75
+
+log = logging.getLogger(__name__)
 
 
 Spread = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -79,9 +86,7 @@ class Calibration(BaseModel):
 
 
 class Vehicle(BaseModel):
-    """Nominal parameters of one vehicle, as in its vehicle file, in SI units. Unknown names are
-    refused, so that a misspelt optional name is reported.
-    """
+    """Nominal parameters of one vehicle, as in its vehicle file, in SI units."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -184,17 +189,18 @@ class Vehicle(BaseModel):
 
 def load_vehicle(path: Path | str) -> Vehicle:
     """Read a vehicle file (JSON), or return the parameters of a vehicle class for a path such as
-    "class:compact".
+    "class:compact". A name that resembles no known one, such as a note of the owner, is ignored
+    with a warning.
 
     Raises:
-        InputError: the file cannot be read, a field is unknown, missing or out of range, or fields
-            do not fit together: mass and yaw inertia, or a stiffness and the wheel's load. The
-            error names the field and the fix.
+        InputError: the file cannot be read, a name is misspelt, a field is missing or out of range,
+            or fields do not fit together: mass and yaw inertia, or a stiffness and the wheel's
+            load. The error names the field and the fix.
     """
     if str(path).startswith(PREFIX):
         return Vehicle.model_validate(fields_of_class(str(path).removeprefix(PREFIX)))
     try:
-        vehicle = Vehicle.model_validate_json(Path(path).read_bytes())
+        vehicle = Vehicle.model_validate_json(_drop_foreign_names(Path(path)))
     except OSError as error:
         fix = f"name a vehicle file; of a simulated drive, simulate --vehicle-out {path} writes it"
         raise InputError("vehicle", f"cannot read {path} ({error.strerror})", fix) from error
@@ -216,3 +222,25 @@ def load_vehicle(path: Path | str) -> Vehicle:
             fix = f"give {unit} of one wheel; a car's is 10 to 30 times the load"
             raise InputError(name, problem, fix)
     return vehicle
+
+
+def _drop_foreign_names(path: Path) -> bytes:
+    """Return the content of a vehicle file without names that resemble no known one. Log a warning
+    for each of them.
+    """
+    content = path.read_bytes()
+    try:
+        given = json.loads(content)
+    except ValueError:
+        return content  # the validation explains what is wrong
+    known = list(Vehicle.model_fields)
+    foreign = [
+        name
+        for name in (given if isinstance(given, dict) else ())
+        if name not in known and not difflib.get_close_matches(name, known, 1, MISSPELT)
+    ]
+    for name in foreign:
+        log.warning("vehicle file %s: %s is not a known name; it is ignored", path, name)
+    if not foreign:
+        return content
+    return json.dumps({name: given[name] for name in given if name not in foreign}).encode()

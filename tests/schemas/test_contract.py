@@ -133,7 +133,6 @@ def test_a_vehicle_file_is_read(tmp_path: Path) -> None:
         ({"track_front": "wide"}, "^track_front: "),
         ({"wheel_radius": float("nan")}, "^wheel_radius: "),
         ({"weel_radius_front": 0.3}, "^weel_radius_front: .*; write 'wheel_radius_front' in the"),
-        ({"colour": "red"}, "^colour: is not a known name; remove it, or use one of name, mass"),
         ({"calibration": {"drives": 1, "axe": None}}, "^calibration.axe: .*; write 'ax' in the"),
     ],
 )
@@ -144,6 +143,15 @@ def test_a_wrong_vehicle_field_is_named(
     path.write_text(json.dumps(VEHICLE | change))
     with pytest.raises(InputError, match=complaint):
         load_vehicle(path)
+
+
+def test_a_foreign_name_in_a_vehicle_file_is_ignored_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "vehicle.json"
+    path.write_text(json.dumps(VEHICLE | {"comment": "winter tyres since 2026"}))
+    assert load_vehicle(path) == Vehicle.model_validate(VEHICLE)
+    assert "comment is not a known name; it is ignored" in caplog.text
 
 
 def test_a_missing_vehicle_field_or_file_is_named(tmp_path: Path) -> None:
