@@ -263,10 +263,9 @@ class LocalMap:
         return self._all
 
     def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return arrays for n places (one per map cell and heading sector), given by their keys
-        `key` (n,). They are the belief (probabilities of friction, (n, 32)) and, (n,) each: basis
-        (origin of the values), times of the last observation and of receipt [ns], and number of
-        vehicles.
+        """Return arrays for n places, given by their keys `key` (n,). They are the belief
+        (probabilities of friction, (n, 32)) and, (n,) each: basis (origin of the values), times of
+        the last observation and of receipt [ns], and number of vehicles.
         """
         whole = self._all_cells()
         if not len(whole.key):

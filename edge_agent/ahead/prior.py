@@ -58,9 +58,7 @@ NOWHERE: Final = -1
 
 
 class MapPrior:
-    """Combination of the map's beliefs (probabilities of friction) with the beliefs of the filters
-    of N vehicles.
-    """
+    """Combination of the map's beliefs with the beliefs of the filters of N vehicles."""
 
     def __init__(self, vehicles: int) -> None:
         self._key = np.full(vehicles, NOWHERE)
@@ -77,7 +75,7 @@ class MapPrior:
     def entered_vehicles(self, keys: IntArray) -> list[int]:
         """Return the indices of the vehicles that have entered another place (one map cell and
         heading sector) since the last call of `step`. For each of them the caller must pass the
-        map's belief (probabilities of friction) about the new place to the next call of `step`.
+        map's belief about the new place to the next call of `step`.
         """
         return np.flatnonzero(keys != self._key).tolist()
 

@@ -58,14 +58,13 @@ class RequestLog:
         self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
 
     def request_again(self) -> None:
-        """Clear the log of requested boxes (rectangles of the map), so that everything is requested
-        again after a session has been reopened.
+        """Clear the log of requested boxes, so that everything is requested again after a session
+        has been reopened.
         """
         self._boxes.clear()
 
     def missing_boxes(self, path: Path, pose: Pose, within: float) -> list[Box]:
-        """Return the boxes (rectangles of the map) to request now along a path, and record them as
-        requested.
+        """Return the boxes to request now along a path, and record them as requested.
 
         The result is empty while boxes requested in the last REFRESH_S seconds cover the first
         `within` metres of the path. Otherwise the boxes cover all parts of the path that no

@@ -49,7 +49,7 @@ class Progress:
 
 
 class LoopOptions(NamedTuple):
-    """Options of the live loop (estimation in real time).
+    """Options of the live loop.
 
     Attributes:
         on_status: function that receives the progress every STATUS_EVERY_S seconds.

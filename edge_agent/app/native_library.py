@@ -23,16 +23,15 @@ LIBRARY: Final = KernelLibrary(
 
 
 def use_agent_library() -> bool:
-    """Take the kernels (compiled functions) of this process from the agent's shared library. Call
-    this before other imports. Return False if there is none, see `KernelLibrary.use`.
+    """Take the kernels of this process from the agent's shared library. Call this before other
+    imports. Return False if there is none, see `KernelLibrary.use`.
     """
     return LIBRARY.use()
 
 
 def build_agent_library(path: Path) -> None:
-    """Build the agent's shared library `path`. The library contains the kernels (compiled
-    functions) that a pipeline with one vehicle calls to process a sample and to return its friction
-    beliefs.
+    """Build the agent's shared library `path`. The library contains the kernels that a pipeline
+    with one vehicle calls to process a sample and to return its friction beliefs.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.

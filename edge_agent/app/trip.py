@@ -45,8 +45,8 @@ log = logging.getLogger(__name__)
 
 class Known(BaseModel):
     """Stored knowledge about a car. `of` is a hash of vehicle file and profile. `passed` is True if
-    the signal doctor (automatic check) found no fault in the car's signals. `drives` contains the
-    estimated sensor errors of each section of the car's trips.
+    the signal doctor found no fault in the car's signals. `drives` contains the estimated sensor
+    errors of each section of the car's trips.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -69,7 +69,7 @@ class Trip:
         vehicle: vehicle file of the car.
         profile: assignment of the car's signals to channels.
         path: file with the stored knowledge about the car; it need not exist.
-        trusted: True to publish records whatever the signal doctor (automatic check) finds.
+        trusted: True to publish records whatever the signal doctor finds.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Trip:
         self, source: Generator[Block], ground: Callable[[], FloatArray]
     ) -> Generator[Block]:
         """Yield the blocks of samples of a source after correction of the known sensor errors. The
-        uncorrected blocks are stored for the signal doctor (automatic check).
+        uncorrected blocks are stored for the signal doctor.
 
         The function `ground` returns the speed over ground (T,) [m/s] at the samples of the block
         that the source yielded last.

@@ -24,16 +24,16 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Record(BaseModel):
-    """Base class of the records in a file of tuned memberships (fuzzy sets); unknown field names
-    are rejected.
+    """Base class of the records in a file of tuned memberships; unknown field names are
+    rejected.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Score(Record):
-    """Scores of one set of memberships (fuzzy sets) on one set of drives. Scores that need the true
-    friction are null if the drives do not contain it.
+    """Scores of one set of memberships on one set of drives. Scores that need the true friction are
+    null if the drives do not contain it.
     """
 
     interval_score: Annotated[
@@ -62,8 +62,7 @@ class Score(Record):
 
 
 class SplitScores(Record):
-    """Scores of memberships (fuzzy sets) on the drives that the search used, and on held-out
-    drives."""
+    """Scores of memberships on the drives that the search used, and on held-out drives."""
 
     train: Score
     held_out: Score
@@ -80,8 +79,8 @@ class Budget(Record):
 
 
 class Provenance(Record):
-    """Origin of the scores in a file of tuned memberships (fuzzy sets): all parameters needed to
-    compute these scores again.
+    """Origin of the scores in a file of tuned memberships: all parameters needed to compute these
+    scores again.
     """
 
     command: str
@@ -94,7 +93,7 @@ class Provenance(Record):
 
 
 class Document(Record):
-    """Content of a file of tuned memberships (parameters of fuzzy sets)."""
+    """Content of a file of tuned memberships."""
 
     estimator: str
     memberships: dict[str, list[Finite]]
@@ -112,8 +111,8 @@ class Document(Record):
 
 @dataclass(frozen=True)
 class Tuned:
-    """Content of a file of tuned memberships (parameters of fuzzy sets) after parsing: the
-    validated memberships, and the complete document with scores and origin.
+    """Content of a file of tuned memberships after parsing: the validated memberships, and the
+    complete document with scores and origin.
     """
 
     memberships: Memberships
@@ -121,7 +120,7 @@ class Tuned:
 
 
 def parse_tuned(text: str | bytes, where: str) -> Tuned:
-    """Return the tuned memberships (fuzzy sets) in a document. Errors name its origin `where`.
+    """Return the tuned memberships in a document. Errors name its origin `where`.
 
     Raises:
         InputError: a field is missing, unknown, not a finite number, or a vertex (corner of a fuzzy
@@ -145,7 +144,7 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
 
 
 def load_tuned(path: Path | str) -> Tuned:
-    """Read a file of tuned memberships (fuzzy sets).
+    """Read a file of tuned memberships.
 
     Raises:
         InputError: a field is invalid, or the file cannot be read; the error names the field or the
@@ -163,8 +162,7 @@ def load_tuned(path: Path | str) -> Tuned:
 
 
 def shipped_memberships(estimator: str) -> Memberships:
-    """Return the tuned memberships (parameters of the fuzzy sets) that this package contains for an
-    estimator.
+    """Return the tuned memberships that this package contains for an estimator.
 
     Raises:
         InputError: the package has no memberships for that estimator.
@@ -173,9 +171,9 @@ def shipped_memberships(estimator: str) -> Memberships:
 
 
 def search_results(estimator: str) -> dict[str, list[Memberships]]:
-    """Return the memberships (fuzzy sets) that each search found, by kind of search. They are read
-    from the file of memberships in this package. Return an empty dictionary if that file contains
-    no results of searches.
+    """Return the memberships that each search found, by kind of search. They are read from the file
+    of memberships in this package. Return an empty dictionary if that file contains no results of
+    searches.
     """
     document = load_tuned(FOLDER / f"{estimator}.json").document
     return {
@@ -185,8 +183,8 @@ def search_results(estimator: str) -> dict[str, list[Memberships]]:
 
 
 def save_tuned(path: Path, document: Document) -> None:
-    """Write a document with tuned memberships (fuzzy sets) to a file. It is parsed first, so that
-    `load_tuned` accepts every file that is written.
+    """Write a document with tuned memberships to a file. It is parsed first, so that `load_tuned`
+    accepts every file that is written.
     """
     text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
     parse_tuned(text, f"tuned file {path}")

@@ -151,8 +151,7 @@ def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     drives, or if they cannot be compared because a score is NaN.
 
     Either of two reasons suffices. The mean log-likelihood is lower by more than WORSE. Or, on at
-    least one drive, the share of time with the flag CONTRADICTION (measurements contradict the
-    model) is larger by more than LONGER.
+    least one drive, the share of time with the flag CONTRADICTION is larger by more than LONGER.
     """
     lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = np.max(

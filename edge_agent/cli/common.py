@@ -51,8 +51,8 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
 
 
 def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
-    """Print on stderr the faults that the signal doctor (automatic check) found in a log. Return
-    notes about these faults, which the caller prints after the estimates.
+    """Print on stderr the faults that the signal doctor found in a log. Return notes about these
+    faults, which the caller prints after the estimates.
     """
     found = diagnosis.findings
     for fault in found:

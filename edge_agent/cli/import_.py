@@ -46,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert the recordings to a signal log, write a draft of a profile (assignment of signals to
-    channels), or list the known profiles, as the options ask. Return 1 if the log has none of the
-    signals that the estimators need, else 0.
+    """Convert the recordings to a signal log, write a draft of a profile, or list the known
+    profiles, as the options ask. Return 1 if the log has none of the signals that the estimators
+    need, else 0.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import read_source, write_log

@@ -62,9 +62,7 @@ class LookoutPart:
         self._lookout.believe(pipeline.places, pipeline.beliefs())
 
     def close_part(self) -> Mapping[str, float]:
-        """Stop the lookout (thread that looks ahead in the map); return the counts of warnings and
-        messages.
-        """
+        """Stop the lookout; return the counts of warnings and messages."""
         self._lookout.close()
         return self._lookout.counts.values()
 

@@ -106,8 +106,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search for the best memberships (fuzzy sets), print the comparison on held-out drives, and
-    write the best ones to a file.
+    """Search for the best memberships, print the comparison on held-out drives, and write the best
+    ones to a file.
 
     Raises:
         InputError: an option is out of range.

@@ -30,8 +30,8 @@ PROVENANCE = b"gripmap.import"
 def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
     """Read a recording of any supported file format.
 
-    Return the signals that the profile (assignment of signals to channels) needs, or all signals if
-    `profile` is None. `database` is the CAN database that decodes logs of CAN frames.
+    Return the signals that the profile needs, or all signals if `profile` is None. `database` is
+    the CAN database that decodes logs of CAN frames.
 
     Raises:
         InputError: the file is missing, of an unknown kind, broken or too large for the memory, or
@@ -121,8 +121,8 @@ def _decode_frames(
 
 
 def profile_of(log: Path) -> Profile:
-    """Return the profile (assignment of signals to channels) with which a log was imported. If the
-    log was not imported, return a profile that uses its columns unchanged.
+    """Return the profile with which a log was imported. If the log was not imported, return a
+    profile that uses its columns unchanged.
 
     Raises:
         InputError: the file cannot be read.
@@ -141,8 +141,7 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
     """Write a merged signal log to a Parquet file.
 
     The time column is `timestamp` if the date of the recording is known, else `t`. The file's
-    metadata records the source files, the profile (assignment of signals to channels) and the
-    processing steps.
+    metadata records the source files, the profile and the processing steps.
     """
     columns: dict[str, Any] = {}
     if merged.start_ns is not None:

@@ -70,9 +70,8 @@ def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) ->
 
 
 def lasting_signals(profile: Profile) -> set[str]:
-    """Return the full names of the recorded signals of the `lasting` channels of a profile
-    (assignment of signals to channels). The signals of such a channel are sent only when they
-    change.
+    """Return the full names of the recorded signals of the `lasting` channels of a profile. The
+    signals of such a channel are sent only when they change.
     """
     return {
         name
@@ -83,8 +82,8 @@ def lasting_signals(profile: Profile) -> set[str]:
 
 
 def context_signals(profile: Profile) -> set[str]:
-    """Return the full names of the recorded signals from which a profile (assignment of signals to
-    channels) computes the context channels (controller flags, temperature, wiper).
+    """Return the full names of the recorded signals from which a profile computes the context
+    channels (controller flags, temperature, wiper).
     """
     return {
         name
@@ -97,8 +96,8 @@ def context_signals(profile: Profile) -> set[str]:
 def context_block(
     samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
 ) -> FloatArray:
-    """Return the context signals (controller flags, temperature, wiper) of a block, (T, N,
-    len(CONTEXT)), from the values that a source gives.
+    """Return the context signals of a block, (T, N, len(CONTEXT)), from the values that a source
+    gives.
 
     Signals without a value are NaN (unknown). The function is for sources without a profile
     (assignment of recorded signals to channels), for example a simulation:

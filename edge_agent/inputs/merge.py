@@ -83,7 +83,7 @@ def merge_recordings(
     steering_ratio: float | None = None,
     shifts: Mapping[str, float] | None = None,
 ) -> Merged:
-    """Merge all recordings into one signal log by a profile (assignment of signals to channels).
+    """Merge all recordings into one signal log by a profile.
 
     Args:
         recordings: recordings of the sources.
@@ -153,8 +153,8 @@ def merge_recordings(
 
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
     """Return, for each channel of the signal log that was recorded, a pair (index, rule). The index
-    is that of the recording that contains the channel's signals. The rule, from the profile
-    (assignment of signals to channels), converts these signals to the channel.
+    is that of the recording that contains the channel's signals. The rule, from the profile,
+    converts these signals to the channel.
 
     A recording of a position receiver provides those position channels for which the profile names
     no signal.
@@ -408,7 +408,7 @@ def _row_rate(dense: Mapping[str, Series]) -> float:
 
 
 def sample_at_rows(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
-    """Return a series (recorded signal) sampled at the times `t` (n,) of the log's rows (samples).
+    """Return a series sampled at the times `t` (n,) of the log's rows.
 
     A dense series is interpolated; the result is NaN in rows without readings near enough in time.
     A `sparse` series, for example positions, is not interpolated: each reading is written only into

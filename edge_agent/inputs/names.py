@@ -94,8 +94,7 @@ def place_of(plain: str) -> str | None:
 
 
 def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
-    """Return a draft of a profile (assignment of signals to channels), guessed from the names of
-    the signals.
+    """Return a draft of a profile, guessed from the names of the signals.
 
     Args:
         signals: name -> unit as recorded, "" where it is not given.

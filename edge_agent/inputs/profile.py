@@ -162,7 +162,7 @@ class Profile(Part):
         return {name for channel in self.channels.values() for name in channel.needed_signals()}
 
     def to_json(self) -> str:
-        """Return the profile (assignment of signals to channels) as JSON, without unset fields."""
+        """Return the profile as JSON, without unset fields."""
         return (
             json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1)
             + "\n"
@@ -177,8 +177,8 @@ def shipped_profiles() -> list[str]:
 
 
 def load_profile(name: str) -> tuple[Profile, Path]:
-    """Load a profile (assignment of signals to channels) by path or by the name of a shipped
-    profile; return it with the folder of its CAN database.
+    """Load a profile by path or by the name of a shipped profile; return it with the folder of its
+    CAN database.
 
     Raises:
         InputError: the profile cannot be read, or a field is missing, unknown or out of range.

@@ -74,8 +74,8 @@ class Located(NamedTuple):
     """Cells visited by N vehicles at T samples; each array has the shape (T, N).
 
     Attributes:
-        closes: True at the first sample after the end of a visit (passage of a cell). At this
-            sample the vehicle is in a new cell or sector, or in no cell.
+        closes: True at the first sample after the end of a visit. At this sample the vehicle is in
+            a new cell or sector, or in no cell.
         inside, outside: True where a position fix of this sample lies inside or outside the visited
             cell.
         cell, sector: cell (quadint, zoom 21) and heading sector, -1 when in no cell.
@@ -111,7 +111,7 @@ def locate_vehicles(
         tracks: (N,) states of the cell tracking after the previous block.
         t: (T, N) times of the samples [s].
         signals: (T, N, channels) measurements.
-        lost: True to forget the last position fixes, which ends every visit (passage of a cell).
+        lost: True to forget the last position fixes, which ends every visit.
 
     Returns:
         the states for the next block, and the cells per sample.
@@ -167,8 +167,8 @@ def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 @compiled
 def _stays_in_cell(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
-    """Return True if a position fix still belongs to the visit (passage of a map cell). This
-    includes fixes within a margin around the cell and the heading sector.
+    """Return True if a position fix still belongs to the visit. This includes fixes within a margin
+    around the cell and the heading sector.
     """
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)

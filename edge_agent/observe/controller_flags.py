@@ -58,9 +58,8 @@ REASONS: Final = {
 
 
 class FlagRecord:
-    """State of one controller flag (ABS, ESC or traction control) of one vehicle, from which the
-    filter decides whether the flag is implausible. It is updated with each sample in which the flag
-    is known.
+    """State of one controller flag of one vehicle, from which the filter decides whether the flag
+    is implausible. It is updated with each sample in which the flag is known.
     """
 
     time: float  # [s] time of the flag's last known sample
@@ -84,8 +83,7 @@ def new_flag_records(vehicles: int) -> RecordArray:
 def trusted_context(
     before: RecordArray, t: FloatArray, signals: FloatArray, context: FloatArray
 ) -> tuple[RecordArray, FloatArray]:
-    """Replace implausible controller flags (ABS, ESC, traction control) in the context signals by
-    NaN (unknown).
+    """Replace implausible controller flags in the context signals by NaN (unknown).
 
     Args:
         before: (N, len(FLAGS)) states of the flags after the previous block.

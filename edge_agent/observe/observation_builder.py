@@ -63,9 +63,7 @@ class RecordBlock(NamedTuple):
 
 
 class Visit:
-    """One visit (passage of a map cell by a vehicle) that has begun or has ended, as an array
-    record.
-    """
+    """One visit that has begun or has ended, as an array record."""
 
     sample: int  # index in the block of the sample at which the visit ended
     vehicle: int
@@ -121,8 +119,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class OpenVisits:
-    """Open visits (passages of a map cell) of all vehicles as records (N,), and `slot` (N,), the
-    index of the time slot (reporting interval) of each vehicle's last sample.
+    """Open visits of all vehicles as records (N,), and `slot` (N,), the index of the time slot
+    (reporting interval) of each vehicle's last sample.
     """
 
     visits: RecordArray
@@ -130,9 +128,7 @@ class OpenVisits:
 
     @staticmethod
     def before_any(vehicles: int) -> OpenVisits:
-        """Return the initial records (N,) for N vehicles that have not begun a visit (passage of a
-        map cell).
-        """
+        """Return the initial records (N,) for N vehicles that have not begun a visit."""
         visits = records(Visit, vehicles)
         visits["cell"] = NOWHERE
         return OpenVisits(visits, np.full(vehicles, np.iinfo(np.int64).min))
@@ -162,10 +158,10 @@ def build_records(
     readings: BlockReadings = NO_READINGS,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
     """Build the records of a block of samples with times (T, N) [ns UTC]. `before` has the visits
-    (passages of a map cell) that were open before the block.
+    that were open before the block.
 
     Return the visits open after the block, the observations of ended visits, and the vehicles'
-    states (position, motion and friction at a fixed rate).
+    states.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
@@ -181,7 +177,7 @@ def build_records(
 
 
 class SampleNotes(NamedTuple):
-    """Additional data per sample for the visits (passages of a map cell).
+    """Additional data per sample for the visits.
 
     The friction may change k times within visits of the block. Then `told` (k, 32) has one row per
     change: the log-likelihood of friction from the part of the visit before the change. `row` (T,
@@ -212,7 +208,7 @@ def _sample_notes(
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
     """Return one record with the estimates and the accelerometer readings for each of T samples of
-    N vehicles, (T, N). Visits (passages of a map cell) are computed from these records.
+    N vehicles, (T, N). Visits are computed from these records.
     """
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
@@ -232,8 +228,8 @@ def _advance_visits(
     visits: Records[Visit],
     ended: Records[Visit],
 ) -> int:
-    """Add each sample to its vehicle's visit (passage of a map cell). Write a visit to `ended` at
-    the sample that ends it. Return the number of ended visits.
+    """Add each sample to its vehicle's visit. Write a visit to `ended` at the sample that ends it.
+    Return the number of ended visits.
     """
     count = 0
     for k in range(time.shape[0]):
@@ -265,7 +261,7 @@ def _advance_visits(
 
 @compiled
 def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
-    """Start a new visit (passage of a map cell) in the record `visit`. It has no samples yet."""
+    """Start a new visit in the record `visit`. It has no samples yet."""
     visit.enter_time = time
     visit.cell = cell
     visit.sector = sector
@@ -292,8 +288,7 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
 
 @compiled
 def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
-    """Begin a new part of a visit (passage of a map cell), because the friction changed within the
-    cell.
+    """Begin a new part of a visit, because the friction changed within the cell.
 
     `told` is the log-likelihood of friction from the part that ends. The grip used in that part
     cannot exceed the largest friction that `told` leaves possible. Therefore the stored grip is
@@ -315,8 +310,8 @@ def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
 
 @compiled
 def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
-    """Add one sample at `time` [ns UTC] to a visit (passage of a map cell). `position_std` is the
-    standard deviation of the vehicle's position [m].
+    """Add one sample at `time` [ns UTC] to a visit. `position_std` is the standard deviation of the
+    vehicle's position [m].
     """
     _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
@@ -338,7 +333,7 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
 @compiled
 def _add_context(visit: Visit, context: FloatArray) -> None:
     """Add one sample of the context signals (controller flags, air temperature, wiper),
-    (len(CONTEXT),), to a visit (passage of a map cell). Signals that are NaN are skipped.
+    (len(CONTEXT),), to a visit. Signals that are NaN are skipped.
     """
     for i in range(len(context)):
         if np.isfinite(context[i]):
@@ -348,8 +343,8 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
 
 @compiled
 def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update `visit.felt`, the upper limit of the grip used in a visit (passage of a map cell)
-    according to the accelerometers. `dt` [s] is the time since the previous sample.
+    """Update `visit.felt`, the upper limit of the grip used in a visit according to the
+    accelerometers. `dt` [s] is the time since the previous sample.
 
     The limit is infinite (no limit) in a new visit until the first accelerometer reading.
     """
@@ -375,7 +370,7 @@ def _cast_columns(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Column
 
 def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
     """Return the grip used in longitudinal and in lateral direction of the vehicle, (n,) each, for
-    n ended visits (passages of a map cell). Both are NaN without acceleration readings.
+    n ended visits. Both are NaN without acceleration readings.
 
     The square of the total grip used is divided between the two directions in proportion to their
     summed squared accelerations. A visit may contain both braking and acceleration, or left and
@@ -398,7 +393,7 @@ def _grip_directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 
 def _grip_used(ended: RecordArray) -> FloatArray:
-    """Return the grip used (force over load) in n visits (passages of a map cell), (n,) [1].
+    """Return the grip used (force over load) in n visits, (n,) [1].
 
     The grip used is the largest `mu_utilised` (grip used in the last second), limited to the grip
     that the accelerometers show in this cell. The limit is needed because that second may include
@@ -448,8 +443,7 @@ def _build_observations(
 
 
 def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
-    """Return the observation columns about controllers and surroundings for n visits (passages of a
-    map cell), (n,) each.
+    """Return the observation columns about controllers and surroundings for n visits, (n,) each.
 
     A controller flag is 1 if it was on at any sample. It is 0 if it was never on and was known at
     KNOWN_SHARE of the samples. Otherwise it is unknown.
@@ -469,8 +463,8 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
 def _build_states(
     after: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
 ) -> RecordBlock:
-    """Return the states (position, motion and friction) to publish: for each vehicle, the first
-    sample of each time slot (reporting interval), if its position is known.
+    """Return the states to publish: for each vehicle, the first sample of each time slot, if its
+    position is known.
 
     `after` contains the vehicles' data for the next block of samples. On entry, `after.slot` is the
     index of each vehicle's last time slot before this block. The function updates it.

@@ -77,8 +77,8 @@ class Pipeline:
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
         """Process a block of at least one sample. Return the estimates of all samples, the
-        observations of ended visits (passages of a map cell), and the vehicles' states (position,
-        motion and friction at a fixed rate).
+        observations of ended visits, and the vehicles' states (position, motion and friction at a
+        fixed rate).
 
         For privacy, records near the beginning and end of a trip are left out.
         """
@@ -123,7 +123,7 @@ class Pipeline:
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
         """Return two arrays (N, 32) over the bins of the friction grid, or None if the estimator
         has no grid. The first is log(posterior/uniform) of each vehicle's friction. The second is
-        the log-likelihood of the measurements in the current visit (passage of a map cell) so far.
+        the log-likelihood of the measurements in the current visit so far.
         """
         return self._bank.beliefs()
 
@@ -134,8 +134,7 @@ class Pipeline:
         return doubted_flags(self._flags)
 
     def finish(self) -> RecordBlock | None:
-        """Close the open visits (passages of a map cell) and return their observations; None if no
-        sample was processed.
+        """Close the open visits and return their observations; None if no sample was processed.
 
         The evidence (log-likelihood of friction) of a visit becomes available only at the sample
         after its end. Therefore the method first adds one sample without readings and without a

@@ -35,9 +35,9 @@ from schemas.thresholds import EXCITED_SHARE, VALUE_NATS
 def encode_likelihoods(
     ended: RecordArray, evidence: FloatArray | None, used: FloatArray
 ) -> NDArray[np.uint8]:
-    """Return the likelihoods of n visits (passages of a map cell) in the encoding of the message,
-    (n, 32); (n, 0) for an estimator without `evidence` (likelihood of friction). `used` (n,) is the
-    grip used in each visit.
+    """Return the likelihoods of n visits in the encoding of the message, (n, 32); (n, 0) for an
+    estimator without `evidence` (likelihood of friction). `used` (n,) is the grip used in each
+    visit.
 
     The likelihood is flat for a visit that the estimator did not process from its start.
 

@@ -70,8 +70,8 @@ class AckSettlement:
         self._acks.put((vehicle, payload))
 
     def settle_received(self) -> None:
-        """Apply all queued acknowledgements to the outbox (store of batches on disk). An
-        acknowledgement that is unreadable or names another vehicle is ignored and counted.
+        """Apply all queued acknowledgements to the outbox. An acknowledgement that is unreadable or
+        names another vehicle is ignored and counted.
         """
         while not self._acks.empty():
             vehicle, payload = self._acks.get()

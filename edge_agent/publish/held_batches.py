@@ -33,9 +33,9 @@ class Stream(NamedTuple):
 
 @dataclass(slots=True)
 class HeldBatch:
-    """Data of a batch in the outbox (store on disk), without its payload. `due` is the time [s] at
-    which the batch is sent again if no answer came. It is None while the batch is not in flight
-    (sent and not answered). `is_sent` is True once this run of the agent has sent the batch.
+    """Data of a batch in the outbox, without its payload. `due` is the time [s] at which the batch
+    is sent again if no answer came. It is None while the batch is not in flight (sent and not
+    answered). `is_sent` is True once this run of the agent has sent the batch.
     """
 
     stream: Stream
@@ -50,7 +50,7 @@ class HeldBatch:
 @dataclass
 class _Sequence:
     """Sequence numbers of one stream (vehicle, agent run, kind, region): the next free number, and
-    the key of each of its batches in the outbox (store on disk) by sequence number.
+    the key of each of its batches in the outbox by sequence number.
     """
 
     stream: Stream
@@ -59,8 +59,8 @@ class _Sequence:
     held: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
-        """Return the lowest sequence number of a batch of this stream that is still in the outbox
-        (store on disk). If there is none, return the next free number.
+        """Return the lowest sequence number of a batch of this stream that is still in the outbox.
+        If there is none, return the next free number.
 
         Each call continues the search where the last call ended, so that each number is skipped
         only once.
@@ -71,7 +71,7 @@ class _Sequence:
 
 
 class HeldBatches:
-    """Index of the batches in an outbox (store on disk) by their key, the row number in the file.
+    """Index of the batches in an outbox by their key, the row number in the file.
 
     Attributes:
         bytes: total size of the payloads [bytes].
@@ -142,22 +142,20 @@ class HeldBatches:
 
     def has_stream(self, stream: Stream) -> bool:
         """Return True if the index knows the stream (vehicle, agent run, kind, region): it had
-        batches in this run of the agent, or batches of an earlier run are still in the outbox
-        (store on disk).
+        batches in this run of the agent, or batches of an earlier run are still in the outbox.
         """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
         """Return two sequence numbers of a stream (vehicle, agent run, kind, region): the next free
-        number, and the lowest number of a batch in the outbox (store on disk).
+        number, and the lowest number of a batch in the outbox.
         """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
-        """Return the keys of the batches in the outbox (store on disk) that belong to a stream
-        (vehicle, agent run, kind, region) and whose sequence numbers lie in one of the inclusive
-        `ranges`.
+        """Return the keys of the batches in the outbox that belong to a stream (vehicle, agent run,
+        kind, region) and whose sequence numbers lie in one of the inclusive `ranges`.
         """
         sequence = self._streams.get(stream)
         if sequence is None:

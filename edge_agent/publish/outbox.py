@@ -57,7 +57,7 @@ class StoredBatch:
 class OutboxCounts:
     """Numbers of records that the outbox (store of batches on disk) of this process has handled:
 
-    - `stored`, and `settled` (acknowledged or refused by the service);
+    - `stored`, and `settled`;
     - `evicted` for lack of space, by kind;
     - `damaged`: lost by damage of the file;
     - `unanswered`: given up, because the service answered only later batches.
@@ -75,8 +75,7 @@ class OutboxCounts:
 
 
 class Outbox:
-    """Store on disk of the batches of one agent process that no service has settled (acknowledged
-    or refused by the service).
+    """Store on disk of the batches of one agent process that no service has settled.
 
     Attributes:
         path: the outbox's file.
@@ -108,8 +107,8 @@ class Outbox:
         self._load_batches()
 
     def _load_batches(self) -> None:
-        """Load the batches (messages with records) that the outbox's file contains from an earlier
-        run; all are due at once.
+        """Load the batches that the outbox's file contains from an earlier run; all are due at
+        once.
         """
         for key, (vehicle, boot, kind, region, seq, records), size in self._file.list_batches():
             stream = Stream(vehicle, boot, Kind(kind), region)
@@ -134,9 +133,7 @@ class Outbox:
         self.counts.damaged += max(before - self.held.count_records(), 0)
 
     def _drop_batch(self, key: int) -> int:
-        """Remove a batch (message with records) from the outbox (store on disk), and return the
-        number of its records.
-        """
+        """Remove a batch from the outbox, and return the number of its records."""
         batch = self.held.remove_batch(key)
         self.schedule.record_removal(batch)
         self._deletable.append(key)
@@ -218,14 +215,14 @@ class Outbox:
         self._evict_oldest()
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
-        """Treat all batches of a vehicle that are in flight (sent and not answered) as lost,
-        because the vehicle has just reconnected.
+        """Treat all batches of a vehicle that are in flight as lost, because the vehicle has just
+        reconnected.
         """
         self.schedule.reset_in_flight(vehicle, now)
 
     def _evict_oldest(self) -> None:
-        """Drop batches until the capacity is respected: first the oldest batches of states (regular
-        reports of motion), then the oldest batches of observations.
+        """Drop batches until the capacity is respected: first the oldest batches of states, then
+        the oldest batches of observations.
         """
         for kind in EVICTION_ORDER:
             while self.held.bytes > self.capacity_bytes:
@@ -235,8 +232,7 @@ class Outbox:
                 self.counts.evicted[kind] += self._drop_batch(key)
 
     def delete_settled(self) -> None:
-        """Delete settled (acknowledged or refused by the service) batches from the disk now,
-        instead of with the next `store`.
+        """Delete settled batches from the disk now, instead of with the next `store`.
 
         Raises:
             sqlite3.Error: the disk does not accept the change.

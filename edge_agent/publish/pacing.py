@@ -127,7 +127,7 @@ class Pacer:
     def record_timeout(self, now: float, jitter: float) -> None:
         """Record that a batch in flight (sent, not answered) was not answered in time. After
         SILENT_S without an answer, enter the silent state, in which only single batches are sent as
-        probes. Before that, halve the window (limit of batches in flight).
+        probes. Before that, halve the window.
         """
         self.flying -= 1
         if self.silent:
@@ -147,9 +147,8 @@ class Pacer:
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:
-        """Record that a router is available again at time `now` [s]. Batches in flight (sent and
-        not answered) count as lost. In the silent state (no service answers), a probe is sent
-        immediately.
+        """Record that a router is available again at time `now` [s]. Batches in flight count as
+        lost. In the silent state (no service answers), a probe is sent immediately.
         """
         self.flying = 0
         self._unanswered_since = None
@@ -158,7 +157,7 @@ class Pacer:
 
     def take_due(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
         """Return the keys of at most `most` batches to send at time `now` [s], oldest first. `held`
-        are the keys of the batches in the outbox (store on disk); other keys are dropped.
+        are the keys of the batches in the outbox; other keys are dropped.
         """
         if self._answered:
             self._answered = False

@@ -69,15 +69,14 @@ class PublisherStatus:
 
     @property
     def stranded_records(self) -> int:
-        """Return the number of records in the outbox (store of batches on disk) that are not sent
-        because they belong to vehicle names that this agent does not have, for example after a
-        change of name.
+        """Return the number of records in the outbox that are not sent because they belong to
+        vehicle names that this agent does not have, for example after a change of name.
         """
         return self._outbox.held.count_stranded(self._names)
 
     @property
     def fill_share(self) -> float:
-        """Return the used share [1] of the capacity of the outbox (store of batches on disk)."""
+        """Return the used share [1] of the capacity of the outbox."""
         return self._outbox.held.bytes / self._outbox.capacity_bytes
 
     @property
@@ -89,16 +88,14 @@ class PublisherStatus:
 
     @property
     def damage_counts(self) -> tuple[int, int]:
-        """Return two numbers: how often the outbox (store of batches on disk) was found damaged,
-        and how many records are known to be lost by this.
+        """Return two numbers: how often the outbox was found damaged, and how many records are
+        known to be lost by this.
         """
         return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
     def dropped_records(self) -> int:
-        """Return the number of records dropped for lack of space, in the queue or in the outbox
-        (store of batches on disk).
-        """
+        """Return the number of records dropped for lack of space, in the queue or in the outbox."""
         return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     @property
@@ -110,8 +107,8 @@ class PublisherStatus:
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of records of one kind, or of all kinds, that no service has settled
-        (acknowledged or refused). They are in the outbox (store on disk), where some may come from
-        an earlier run of the agent, or they are not stored yet.
+        (acknowledged or refused). They are in the outbox, where some may come from an earlier run
+        of the agent, or they are not stored yet.
         """
         counts = self.counts
         kinds = Kind if kind is None else (kind,)

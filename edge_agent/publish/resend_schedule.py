@@ -24,8 +24,8 @@ JITTER: Final = 0.25
 
 
 class ResendSchedule:
-    """Schedule of the batches in `held`, the index of the outbox (store on disk). It knows which
-    batches are in flight (sent and not answered), and when they are sent again.
+    """Schedule of the batches in `held`, the index of the outbox. It knows which batches are in
+    flight (sent and not answered), and when they are sent again.
     """
 
     def __init__(self, held: HeldBatches, first_resend_s: float, seed: int) -> None:
@@ -48,14 +48,12 @@ class ResendSchedule:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def queue_batch(self, key: int) -> None:
-        """Queue the batch with the row number `key`. It is sent as soon as its pacer (limit of
-        unanswered batches) allows.
-        """
+        """Queue the batch with the row number `key`. It is sent as soon as its pacer allows."""
         self._pacer_of(self._held[key]).queue_batch(key)
 
     def mark_in_flight(self, key: int, now: float) -> None:
-        """Mark the batch with the row number `key` as in flight (sent and not answered) at time
-        `now` [s], and set the time of its next resend.
+        """Mark the batch with the row number `key` as in flight at time `now` [s], and set the time
+        of its next resend.
         """
         batch = self._held[key]
         delay = min(
@@ -68,9 +66,8 @@ class ResendSchedule:
         self._pacer_of(batch).record_sent(now)
 
     def send_or_queue(self, key: int, now: float) -> bool:
-        """Mark the new batch with the row number `key` as in flight (sent and not answered), and
-        return True. If the service of the batch's region is silent, queue the batch and return
-        False.
+        """Mark the new batch with the row number `key` as in flight, and return True. If the
+        service of the batch's region is silent, queue the batch and return False.
         """
         if self._pacer_of(self._held[key]).silent:
             self.queue_batch(key)
@@ -88,14 +85,14 @@ class ResendSchedule:
 
     def record_removal(self, batch: HeldBatch) -> None:
         """Record that a batch (message with records) was removed from the outbox. If it was in
-        flight (sent and not answered), it counts as answered.
+        flight, it counts as answered.
         """
         if batch.due is not None:
             self._pacer_of(batch).record_settled()
 
     def reset_in_flight(self, vehicle: str, now: float) -> None:
-        """Treat all batches of a vehicle that are in flight (sent and not answered) as lost,
-        because the vehicle has just reconnected.
+        """Treat all batches of a vehicle that are in flight as lost, because the vehicle has just
+        reconnected.
         """
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
@@ -129,9 +126,9 @@ class ResendSchedule:
                 self.queue_batch(key)
 
     def take_due(self, now: float, limit: int, vehicles: Collection[str] | None) -> list[int]:
-        """Mark at most `limit` batches as in flight (sent and not answered), and return their keys,
-        oldest first, so that the caller sends them at `now` [s]. They belong to `vehicles`, or to
-        any vehicle if that is None.
+        """Mark at most `limit` batches as in flight, and return their keys, oldest first, so that
+        the caller sends them at `now` [s]. They belong to `vehicles`, or to any vehicle if that is
+        None.
 
         The oldest batches of all regions come first. A vehicle's records then arrive in the order
         of its drive, as the service's check of impossible paths expects.

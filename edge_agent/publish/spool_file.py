@@ -54,8 +54,7 @@ Row = tuple[object, ...]
 
 
 class SpoolFile:
-    """SQLite file of an outbox (store of batches that no service has answered), as a table of
-    batches. The key of a batch is its row number.
+    """SQLite file of an outbox, as a table of batches. The key of a batch is its row number.
 
     Attributes:
         was_damaged: True if the file was found damaged when it was opened.

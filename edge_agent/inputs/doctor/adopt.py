@@ -34,8 +34,8 @@ from schemas.vehicle import Vehicle
 
 
 class Adopted(NamedTuple):
-    """A signal log after correction, with its vehicle, its diagnosis by the signal doctor
-    (automatic check of the signals), and notes that describe the changes.
+    """A signal log after correction, with its vehicle, its diagnosis by the signal doctor, and
+    notes that describe the changes.
     """
 
     log: SignalLog
@@ -46,15 +46,14 @@ class Adopted(NamedTuple):
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Return `log`, corrected for use by the estimator: first by the vehicle's calibration, then by
-    the measurements of the signal doctor (automatic check of the signals).
+    the measurements of the signal doctor.
     """
     return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
-    """Examine a log with the signal doctor (automatic check of the signals), correct the faults
-    whose size the drive shows, and examine the corrected log. Return the corrected log with the
-    result of this second examination.
+    """Examine a log with the signal doctor, correct the faults whose size the drive shows, and
+    examine the corrected log. Return the corrected log with the result of this second examination.
     """
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     delays = {
@@ -102,9 +101,9 @@ def align_import(
     """Correct the delays of devices in merged recordings. Return the merged recordings, and a
     profile (assignment of signals to channels) that contains the delays.
 
-    The signal doctor (automatic check of the signals) measures the delays. `merge_with` is a
-    function that merges the same recordings with a given profile. If no device is delayed, `merged`
-    and `profile` are returned unchanged.
+    The signal doctor measures the delays. `merge_with` is a function that merges the same
+    recordings with a given profile. If no device is delayed, `merged` and `profile` are returned
+    unchanged.
     """
     signals = np.full((len(merged.t), len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):

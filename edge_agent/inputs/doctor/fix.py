@@ -45,10 +45,9 @@ def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
-    """Return all corrections that must be written into a profile (assignment of signals to
-    channels). These are the faults that the signal doctor has found, and the delays that are too
-    small to count as faults (`small_lags`). The delays are returned as findings of the kind
-    "clock".
+    """Return all corrections that must be written into a profile. These are the faults that the
+    signal doctor has found, and the delays that are too small to count as faults (`small_lags`).
+    The delays are returned as findings of the kind "clock".
     """
     lags = small_lags(diagnosis)
     return [
@@ -60,9 +59,9 @@ def list_corrections(diagnosis: Diagnosis) -> list[Finding]:
 def apply_findings(
     findings: Sequence[Finding], profile: Profile, vehicle: Vehicle
 ) -> tuple[Profile, Vehicle, list[Finding]]:
-    """Correct the faults `findings` in the profile (assignment of signals to channels) and in the
-    vehicle file. Return the corrected profile, the corrected vehicle file, and those faults that
-    cannot be corrected in either of them.
+    """Correct the faults `findings` in the profile and in the vehicle file. Return the corrected
+    profile, the corrected vehicle file, and those faults that cannot be corrected in either of
+    them.
     """
     channels = dict(profile.channels)
     left = list[Finding]()

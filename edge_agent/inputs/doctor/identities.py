@@ -180,7 +180,7 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     on either side does not bias it.
 
     Args:
-        sides: the two sides of the identity (quantities that are equal by physics).
+        sides: the two sides of the identity.
         moving: (n,) 1 where the car moves.
         grips: (n,) 0 where wheels slip; these samples are used for the lag, but not for the fit.
         level: True to fit without an offset, and to use every sample in motion; False to use only

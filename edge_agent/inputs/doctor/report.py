@@ -141,8 +141,8 @@ def _identity_table(fits: dict[str, Fit]) -> str:
 
 
 def _scatter_plot(name: str, fit: Fit) -> str:
-    """Return an SVG scatter plot of both sides of an identity (two quantities that are equal by
-    physics), with the ideal relation (grey) and the measured relation (red).
+    """Return an SVG scatter plot of both sides of an identity, with the ideal relation (grey) and
+    the measured relation (red).
     """
     step = max(1, len(fit.right) // POINTS)
     x = fit.right[::step]

@@ -178,7 +178,7 @@ JOINT: Final = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of the search for faults (wrong units and signs) of measured quantities.
+    """Result of the search for faults of measured quantities.
 
     `faults` has the fault of each quantity in the best explanation, None if there is none.
     `margins` has, for each quantity, the additional cost of the best explanation that gives this
@@ -196,9 +196,8 @@ class Verdict:
 
 
 def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle, fast: float) -> Verdict:
-    """Return the most plausible set of faults (wrong units and signs) that explains the fitted
-    identities `found` (pairs of expressions that are equal by physics). `fast` is the drive's high
-    speed [m/s].
+    """Return the most plausible set of faults that explains the fitted identities `found` (pairs of
+    expressions that are equal by physics). `fast` is the drive's high speed [m/s].
 
     This set has the lowest cost. Each fault adds a fixed cost, because faults are rare. Each
     identity adds the squared normalised error that remains in its gain (ratio of its two sides).

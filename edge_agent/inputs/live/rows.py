@@ -245,8 +245,8 @@ class LiveRows:
 
     def _fill_steering(self, signals: FloatArray) -> None:
         """Fill missing steering angles in the same way as the importer of recorded logs. A front
-        wheel without a channel in the profile (assignment of signals to channels) gets the angle of
-        the other front wheel, and rear wheels get zero.
+        wheel without a channel in the profile gets the angle of the other front wheel, and rear
+        wheels get zero.
         """
         fill_steering(signals, [name not in self._profile.channels for name in STEERING])
 
