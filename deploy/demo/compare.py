@@ -97,8 +97,8 @@ class MapComparison:
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Return the true friction of each visited (cell, sector) at the end of the demo. It is the
-    mean over the visits (passages of a cell) after the road changed at `changed_ns` [ns]. Without
-    such visits it is the mean over all visits.
+    mean over the visits after the road changed at `changed_ns` [ns]. Without such visits it is the
+    mean over all visits.
     """
     keys = _cell_keys(visits)
     after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
@@ -149,7 +149,7 @@ def delay_passes(visits: pa.Table, ice: NewIce, alerts: list[tuple[int, Alert]])
     one patch.
 
     Args:
-        visits: true values of all visits (passages of a map cell).
+        visits: true values of all visits.
         ice: the new ice.
         alerts: pairs of time of receipt [ns] and alert.
     """
@@ -196,8 +196,8 @@ def count_passes(rows: pa.Table) -> int:
 
 
 class DemoRun(NamedTuple):
-    """Results of one run of the demo: the true values of all visits (passages of a map cell), the
-    alerts with their times [ns], the ice that appears, and the counts of the agents.
+    """Results of one run of the demo: the true values of all visits, the alerts with their times
+    [ns], the ice that appears, and the counts of the agents.
     """
 
     visits: pa.Table
@@ -259,8 +259,8 @@ class LostGrip:
     cell: IntArray
 
     def figures(self) -> list[Figure]:
-        """Return the figures (measured values) for warned and for unwarned drivers: the share of
-        passes over new ice in which grip was lost, and the number of passes.
+        """Return the figures for warned and for unwarned drivers: the share of passes over new ice
+        in which grip was lost, and the number of passes.
         """
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         # Without passes there is no share.
@@ -363,7 +363,7 @@ def archive_counts(archive: Path) -> tuple[int, int, int]:
 
 
 def start_time(visits: pa.Table) -> int:
-    """Return the time [ns] of the earliest visit (passage of a map cell) of any vehicle."""
+    """Return the time [ns] of the earliest visit of any vehicle."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 

@@ -42,8 +42,8 @@ def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Tabl
 
 
 def snapshot_table(table: pa.Table, at: int) -> pa.Table:
-    """Return the table of cells with their beliefs (probability of each friction value) in the
-    GeoParquet form of a map snapshot; `at` [ns] is the time of the beliefs.
+    """Return the table of cells with their beliefs in the GeoParquet form of a map snapshot; `at`
+    [ns] is the time of the beliefs.
     """
     time = pa.array(np.full(table.num_rows, at // US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by(

@@ -82,8 +82,7 @@ def require_empty(out: Path) -> None:
 
 
 def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
-    """Rebuild all zones (map squares of zoom 7) of an archive; yield the result of each zone, in
-    order.
+    """Rebuild all zones of an archive; yield the result of each zone, in order.
 
     Raises:
         InputError: there are no compacted (sorted) observations, a file has a newer version, or the
@@ -103,17 +102,15 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
 
 
 def zones_of(root: Path) -> list[int]:
-    """Return the zones (map squares of zoom 7) for which an archive has compacted (sorted)
-    observations.
-    """
+    """Return the zones for which an archive has compacted (sorted) observations."""
     return sorted(
         {layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)}
     )
 
 
 def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
-    """Rebuild one zone (map square of zoom 7) of an archive. Repeated or concurrent calls are
-    harmless, because they write the same files.
+    """Rebuild one zone of an archive. Repeated or concurrent calls are harmless, because they write
+    the same files.
 
     Raises:
         InputError: a file has a newer version.

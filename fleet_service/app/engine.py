@@ -99,8 +99,8 @@ class Engine:
 
     def reload_state(self, before: Callable[[], None]) -> None:
         """Call the function `before`, which may change the archive. Then load the map, the alerts
-        and the record of admitted batches (messages with records) from the archive again, and use
-        them as the state. Use this only in a function that `run_between_segments` calls.
+        and the record of admitted batches from the archive again, and use them as the state. Use
+        this only in a function that `run_between_segments` calls.
 
         Raises:
             OSError: the archive cannot be read; the state stays unchanged.
@@ -127,8 +127,7 @@ class Engine:
 
         Another thread calls this. A child process with a copy of the memory writes the files, so
         that the service continues meanwhile. The worker (the thread that processes messages) starts
-        it directly after a segment (file of new rows) was written, when all rows in the state are
-        on disk.
+        it directly after a segment was written, when all rows in the state are on disk.
 
         Raises:
             OSError: the disk is full, no segment could be written for too long, or the operating
@@ -162,7 +161,7 @@ class Engine:
 
     def close(self, *, has_failed: bool = False) -> None:
         """Stop all parts of the service and release the archive. `has_failed` is True if an error
-        ended the service; the checkpoint (saved state) from which it started may be the cause.
+        ended the service; the checkpoint from which it started may be the cause.
         """
         self.queries.close()
         if not has_failed:

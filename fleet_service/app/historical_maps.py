@@ -147,8 +147,8 @@ class _Process:
         self._is_silent = False
 
     def ask(self, question: PastQuery) -> bytes:
-        """Send a query about a past map to the process; return the head (tile number and length) of
-        the first reply. If this fails, the process is ended.
+        """Send a query about a past map to the process; return the head of the first reply. If this
+        fails, the process is ended.
         """
         try:
             self._in.write(encode_question(question))
@@ -159,9 +159,7 @@ class _Process:
             raise
 
     def head(self) -> bytes:
-        """Return the head (tile number and length) of the next reply. Raise ChildProcessError if
-        the process has ended.
-        """
+        """Return the head of the next reply. Raise ChildProcessError if the process has ended."""
         head = self._read_bytes(_HEAD.size)
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")

@@ -31,15 +31,15 @@ LIBRARY: Final = KernelLibrary(
 
 
 def use_service_library() -> bool:
-    """Take the kernels (compiled functions) of this process from the service's shared library. Call
-    this before other imports. Return False if there is none, see `KernelLibrary.use`.
+    """Take the kernels of this process from the service's shared library. Call this before other
+    imports. Return False if there is none, see `KernelLibrary.use`.
     """
     return LIBRARY.use()
 
 
 def build_service_library(path: Path, calls: Path) -> None:
-    """Build the service's shared library `path`. The library contains the kernels (compiled
-    functions) whose calls the file `calls` lists.
+    """Build the service's shared library `path`. The library contains the kernels whose calls the
+    file `calls` lists.
 
     This process may compile for a processor with instructions that the processor of this machine
     lacks. Therefore it does not run the kernels.
@@ -58,8 +58,8 @@ def build_service_library(path: Path, calls: Path) -> None:
 
 @contextmanager
 def recorded_calls() -> Iterator[Path]:
-    """Yield a file with the calls of kernels (compiled functions) by `precompile.exercise_map`. A
-    separate process records them, because it runs the kernels.
+    """Yield a file with the calls of kernels by `precompile.exercise_map`. A separate process
+    records them, because it runs the kernels.
 
     Raises:
         subprocess.CalledProcessError: the process has failed; it has printed the reason.
@@ -71,9 +71,7 @@ def recorded_calls() -> Iterator[Path]:
 
 
 def record_calls(path: Path) -> None:
-    """Run `precompile.exercise_map`, and write the calls of kernels (compiled functions) to the
-    file `path`.
-    """
+    """Run `precompile.exercise_map`, and write the calls of kernels to the file `path`."""
     from schemas.runtime.native_build import CallRecorder
 
     recorder = CallRecorder(runs=True)

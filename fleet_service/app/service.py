@@ -181,9 +181,9 @@ class Service:
     def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
         """Return True if another service has taken over the archive.
 
-        Normally this service learns this from the lease (time-limited ownership), which is stored
-        in the bucket (object store) with the archive's copy. If the bucket does not answer, this
-        service calls `came`, which returns True if another service has announced the same regions.
+        Normally this service learns this from the lease, which is stored in the bucket (object
+        store) with the archive's copy. If the bucket does not answer, this service calls `came`,
+        which returns True if another service has announced the same regions.
         """
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
@@ -205,7 +205,7 @@ class Service:
 
     def _works(self) -> bool:
         """Return True if this service can serve its regions: a router is connected, and the worker
-        (the thread that processes messages) makes progress.
+        makes progress.
         """
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at

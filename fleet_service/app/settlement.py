@@ -34,8 +34,8 @@ T = TypeVar("T")
 
 
 class Settlement:
-    """Writing of segments (files of new rows), and the acknowledgements that follow; used by the
-    worker (the thread that processes messages).
+    """Writing of segments, and the acknowledgements that follow; used by the worker (the thread
+    that processes messages).
 
     Args:
         shared: state of the service.
@@ -67,22 +67,20 @@ class Settlement:
     @property
     def is_full(self) -> bool:
         """Return True if the service must not accept more messages for now. Either too many rows
-        wait to be written to disk, or too many batches (messages with records) wait to be uploaded
-        to the archive's copy in a bucket (object store).
+        wait to be written to disk, or too many batches wait to be uploaded to the archive's copy in
+        a bucket.
         """
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
     def unsettled(self) -> int:
-        """Return the number of admitted batches (messages with records) that are not on disk
-        yet.
-        """
+        """Return the number of admitted batches that are not on disk yet."""
         return self._log.unsettled
 
     @property
     def hangs_s(self) -> float:
-        """Return the time [s] since the current writing of a segment (file of new rows) began; 0 if
-        none is being written.
+        """Return the time [s] since the current writing of a segment began; 0 if none is being
+        written.
         """
         return self._log.hangs_s
 
@@ -104,19 +102,19 @@ class Settlement:
 
     def call_when_written(self, wake: Callable[[], None]) -> None:
         """Register the function `wake`. Another thread calls it whenever the writing of a segment
-        (file of new rows) has ended.
+        has ended.
         """
         self._log.on_written = wake
 
     @property
     def newest_segment(self) -> Cut:
-        """Return the position (epoch and number) of the last written segment (file of new rows)."""
+        """Return the position (epoch and number) of the last written segment."""
         return self._log.newest
 
     def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker (the thread that processes messages) run `work` directly after a segment
-        (file of new rows), when all rows that the service accepted are on disk. Return the result
-        of `work`, or None if `stop` is set meanwhile. Other threads call this.
+        """Let the worker run `work` directly after a segment, when all rows that the service
+        accepted are on disk. Return the result of `work`, or None if `stop` is set meanwhile. Other
+        threads call this.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -124,8 +122,8 @@ class Settlement:
         return self._tasks.ask(work, stop)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write the waiting rows as durable segments (files of new rows); return (vehicle, bytes)
-        of each acknowledgement to send.
+        """Write the waiting rows as durable segments; return (vehicle, bytes) of each
+        acknowledgement to send.
 
         If the disk is full, the failure is counted, nothing is acknowledged, and the next call
         tries again.
@@ -169,5 +167,5 @@ class Settlement:
         return self._intake.acks.messages(self._intake.now) if self._holding.may_acknowledge else []
 
     def close(self) -> None:
-        """Stop the thread that writes segments (files of new rows)."""
+        """Stop the thread that writes segments."""
         self._log.close()

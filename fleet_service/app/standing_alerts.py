@@ -41,7 +41,7 @@ class StandingAlerts:
 
     @property
     def slots(self) -> IntArray:
-        """Return the slots (cell and heading sector) with an active alert, (k,)."""
+        """Return the slots with an active alert, (k,)."""
         return np.array(sorted(self._shared.state.alerts.slots), np.int64)
 
     @property

@@ -84,8 +84,8 @@ class ServiceState(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """Return the content of a checkpoint (saved state) that includes all rows up to the segment
-        (file of new rows) `cut`, and the given weather files.
+        """Return the content of a checkpoint that includes all rows up to the segment (file of new
+        rows) `cut`, and the given weather files.
         """
         tables = image_of(self.fusion, self.alerts.standing_alerts, self.streams)
         if self.public is not None:
@@ -135,8 +135,8 @@ class SharedState:
 
 
 def public_tables(public: PublicCells) -> dict[str, pa.Table]:
-    """Return the public copy of the map (cells that readers may see) as tables for a checkpoint
-    (saved state). All columns of a table have the same length.
+    """Return the public copy of the map (cells that readers may see) as tables for a checkpoint.
+    All columns of a table have the same length.
     """
     columns = public.visitors.columns()
     part = np.full(len(columns["bits"]), columns["part"][0])
@@ -150,9 +150,9 @@ def public_tables(public: PublicCells) -> dict[str, pa.Table]:
 def _load_public(
     least: int, fusion: Fusion, kept: Mapping[str, dict[str, IntArray]]
 ) -> PublicCells | None:
-    """Return the public copy of the map (cells that readers may see) from the tables of a
-    checkpoint (saved state); None if readers may see all cells. If the checkpoint does not contain
-    it, a cell is shown only after new visits. `least` is the number of vehicles of a public cell.
+    """Return the public copy of the map from the tables of a checkpoint; None if readers may see
+    all cells. If the checkpoint does not contain it, a cell is shown only after new visits. `least`
+    is the number of vehicles of a public cell.
     """
     if least <= 1:
         return None
@@ -167,8 +167,8 @@ def load_state(
     damaged: Callable[[Path, str], None] = skip_damaged,
     until: Cut | None = None,
 ) -> ServiceState:
-    """Load the state from the archive. If `until` is given, use only segments (files of new rows)
-    up to this position in their sequence.
+    """Load the state from the archive. If `until` is given, use only segments up to this position
+    in their sequence.
 
     Raises:
         OSError: the archive cannot be read.

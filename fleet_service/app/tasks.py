@@ -32,11 +32,11 @@ class Tasks:
         return not self._queue.empty()
 
     def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Queue the function `work`, wait until the worker (the thread that processes messages) has
-        run it, and return its result; None if `stop` is set meanwhile.
+        """Queue the function `work`, wait until the worker has run it, and return its result; None
+        if `stop` is set meanwhile.
 
         Raises:
-            OSError: no segment (file of new rows) could be written for too long.
+            OSError: no segment could be written for too long.
         """
         done: Future[T] = Future()
         self._queue.put((done, work))
@@ -51,7 +51,7 @@ class Tasks:
                 raise OSError("no segment could be written within the time limit")
 
     def do(self) -> None:
-        """Run all queued functions; the worker (the thread that processes messages) calls this."""
+        """Run all queued functions; the worker calls this."""
         while self:
             done, work = self._queue.get()
             if done.set_running_or_notify_cancel():

@@ -27,7 +27,7 @@ Upload = Callable[[Sequence[Path]], None]
 
 class _Load(Generic[Batch]):
     """Load: rows that are written to disk together, by kind (observations or states), and the
-    batches (messages with records) to which the rows belong.
+    batches to which the rows belong.
     """
 
     def __init__(self) -> None:
@@ -51,9 +51,8 @@ class _Load(Generic[Batch]):
         self.batches += other.batches
 
     def write(self, writer: Writer, upload: Upload | None) -> None:
-        """Write one segment per kind (observations or states) that has waiting rows. Then make all
-        segments (files of new rows) durable: on disk and, if `upload` is given, also in another
-        storage.
+        """Write one segment per kind that has waiting rows. Then make all segments (files of new
+        rows) durable: on disk and, if `upload` is given, also in another storage.
         """
         try:
             for kind, waiting in self.waiting.items():
@@ -80,7 +79,7 @@ class SegmentLog(Generic[Batch]):
         root: folder of the archive.
         shard: name of the service.
         upload: function that copies segments to another storage, such as a bucket (object store).
-            If given, a batch (message with records) is durable only when it is on disk and there.
+            If given, a batch is durable only when it is on disk and there.
         epoch: smallest allowed epoch, the number in segment names that increases with every start
             of a service. If services own the archive in turn by a lease, pass the epoch of the
             lease; without a lease pass 0.
@@ -108,9 +107,7 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def newest(self) -> Cut:
-        """Return the position of the last written segment (file of new rows) in the sequence of all
-        segments.
-        """
+        """Return the position of the last written segment in the sequence of all segments."""
         return self._writer.newest
 
     @property
@@ -127,15 +124,15 @@ class SegmentLog(Generic[Batch]):
 
     @property
     def unsettled(self) -> int:
-        """Return the number of accepted batches (messages with records) that are not yet durable:
-        written to disk and, if `upload` is given, also copied to the other storage.
+        """Return the number of accepted batches that are not yet durable: written to disk and, if
+        `upload` is given, also copied to the other storage.
         """
         return len(self._next.batches) + len(self._load.batches)
 
     @property
     def can_begin(self) -> bool:
-        """Return True if batches (messages with records) wait to be written to disk, and no earlier
-        write still has to be collected with `end`.
+        """Return True if batches wait to be written to disk, and no earlier write still has to be
+        collected with `end`.
         """
         return self._written is None and bool(self._next.batches)
 
@@ -145,9 +142,7 @@ class SegmentLog(Generic[Batch]):
         return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
-        """Add rows, and the batches (messages with records) to which they belong, to the queue for
-        the next write.
-        """
+        """Add rows, and the batches to which they belong, to the queue for the next write."""
         self._next.waiting[kind].append(rows)
         self._next.batches += batches
 
@@ -189,8 +184,8 @@ class SegmentLog(Generic[Batch]):
         return durable
 
     def flush(self) -> list[Batch]:
-        """Write all waiting rows to disk and wait until this is done; return the batches (messages
-        with records) that became durable. Each batch is returned once.
+        """Write all waiting rows to disk and wait until this is done; return the batches that
+        became durable. Each batch is returned once.
 
         Raises:
             OSError: the disk is full or broken; rows that are not durable wait for the next write.
@@ -202,5 +197,5 @@ class SegmentLog(Generic[Batch]):
         return self.end()
 
     def close(self) -> None:
-        """Stop the thread that writes segments (files of new rows), after its current write."""
+        """Stop the thread that writes segments, after its current write."""
         self._thread.shutdown()

@@ -18,9 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Hand the region over to the standby (a waiting service), and print how long no service served
-    it.
-    """
+    """Hand the region over to the standby, and print how long no service served it."""
     from fleet_service.client import map_client
     from fleet_service.shards.handover import hand_over
     from schemas.config import REGION_PATTERN

@@ -151,8 +151,8 @@ def _force_exit_when_stuck(
     or a long compaction (move of new rows into sorted files).
 
     Every running operation may be interrupted, because vehicles keep each report until it is
-    acknowledged. The lease (ownership of the archive) is released, because a standby (waiting
-    service) would otherwise wait until it expires.
+    acknowledged. The lease (ownership of the archive) is released, because a standby would
+    otherwise wait until it expires.
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):

@@ -20,9 +20,7 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """Collected acknowledgements that have not been sent yet, grouped by stream (batches of one
-    vehicle, start, kind and region).
-    """
+    """Collected acknowledgements that have not been sent yet, grouped by stream."""
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
@@ -32,9 +30,7 @@ class Acks:
         )
 
     def record_durable(self, batches: Iterable[BatchId]) -> None:
-        """Record that batches (messages with records) are durable on disk, so that their senders
-        get an acknowledgement.
-        """
+        """Record that batches are durable on disk, so that their senders get an acknowledgement."""
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)
@@ -47,8 +43,8 @@ class Acks:
             self._late[stream].add(seq)
 
     def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
-        """Record that a batch (message with records) was rejected because of the row `row`, and the
-        reason that is sent to its sender.
+        """Record that a batch was rejected because of the row `row`, and the reason that is sent to
+        its sender.
         """
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append(
             (batch.seq, row, reason)

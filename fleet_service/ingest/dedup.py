@@ -34,7 +34,7 @@ StreamKey = tuple[int, int, Kind, int]
 
 
 class SequenceTracker:
-    """Accepted batches (messages with records) of one stream (vehicle, start, kind, region).
+    """Accepted batches of one stream (vehicle, start, kind, region).
 
     Attributes:
         key: name of the stream.
@@ -59,16 +59,16 @@ class SequenceTracker:
         self.runs: list[int] | tuple[int, ...] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if the batch (message with records) of this stream (vehicle, start, kind,
-        region) with this sequence number was accepted before.
+        """Return True if the batch of this stream (vehicle, start, kind, region) with this sequence
+        number was accepted before.
         """
         # An odd number of limits up to `seq` means that it lies in a run.
         return seq <= self.low or bisect_right(self.runs, seq) % 2 == 1
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Record the sequence number of an accepted batch (message with records), and the newest
-        time of the batch's records [ns]. Return False and record nothing if the number would begin
-        another run and the stream has MAX_GAPS runs.
+        """Record the sequence number of an accepted batch, and the newest time of the batch's
+        records [ns]. Return False and record nothing if the number would begin another run and the
+        stream has MAX_GAPS runs.
         """
         if seq == self.low + 1:
             self.raise_to(seq + 1)
@@ -79,8 +79,8 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Mark sequence numbers of batches (messages with records) of this stream (vehicle, start,
-        kind, region), given in ascending order, as accepted.
+        """Mark sequence numbers of batches of this stream (vehicle, start, kind, region), given in
+        ascending order, as accepted.
         """
         # the most frequent case: consecutive numbers
         if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:
@@ -119,8 +119,8 @@ BatchId = tuple[SequenceTracker, int]  # stream and sequence number
 
 
 class ArchivedRows(NamedTuple):
-    """Columns (n,) of archived rows that identify their batches (messages with records); `time`
-    [ns] is the time of each record.
+    """Columns (n,) of archived rows that identify their batches; `time` [ns] is the time of each
+    record.
     """
 
     vehicle: IntArray
@@ -132,9 +132,7 @@ class ArchivedRows(NamedTuple):
 
 
 class SequenceTrackers:
-    """Accepted batches (messages with records) of all streams (vehicle, start, kind, region) of one
-    service.
-    """
+    """Accepted batches of all streams (vehicle, start, kind, region) of one service."""
 
     def __init__(self) -> None:
         self._streams: dict[StreamKey, SequenceTracker] = {}
@@ -156,13 +154,12 @@ class SequenceTrackers:
 
     @property
     def newest(self) -> int:
-        """Return the time of the newest accepted batch (message with records) [ns], or 0."""
+        """Return the time of the newest accepted batch [ns], or 0."""
         return max((stream.newest for stream in self._streams.values()), default=0)
 
     def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
-        """Return a mask (n,): True for batches (messages with records) that were accepted before.
-        `names` is (n, 4): numbers of the vehicle, of the vehicle's start and of the region, and
-        sequence number.
+        """Return a mask (n,): True for batches that were accepted before. `names` is (n, 4):
+        numbers of the vehicle, of the vehicle's start and of the region, and sequence number.
         """
         get = self._streams.get
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
@@ -175,11 +172,10 @@ class SequenceTrackers:
         )
 
     def columns(self) -> tuple[dict[str, IntArray], IntArray]:
-        """Return two items: all streams (batches of one vehicle, start, kind and region) as columns
-        (n,), and the runs of accepted sequence numbers above the watermarks (numbers up to which no
-        batch is expected any more) of all streams in one array (k, 2): first number of the run, and
-        the number after its last one. The column `above` is the number of rows of this array that
-        belong to each stream.
+        """Return two items: all streams as columns (n,), and the runs of accepted sequence numbers
+        above the watermarks (numbers up to which no batch is expected any more) of all streams in
+        one array (k, 2): first number of the run, and the number after its last one. The column
+        `above` is the number of rows of this array that belong to each stream.
         """
         streams = list(self._streams.values())
         table = {
@@ -197,8 +193,8 @@ class SequenceTrackers:
 
     @staticmethod
     def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
-        """Return the streams (batches of one vehicle, start, kind and region) that are described by
-        `columns` and `above`, the result of the method `columns`.
+        """Return the streams that are described by `columns` and `above`, the result of the method
+        `columns`.
         """
         out = SequenceTrackers()
         at = 0
@@ -215,9 +211,8 @@ class SequenceTrackers:
         return out
 
     def forget(self, before: int) -> None:
-        """Drop streams (batches of one vehicle, start, kind and region) whose newest record is
-        older than `before` [ns]. Duplicates of their batches are still not accepted, because they
-        are refused as too old.
+        """Drop streams whose newest record is older than `before` [ns]. Duplicates of their batches
+        are still not accepted, because they are refused as too old.
         """
         for key in [key for key, stream in self._streams.items() if stream.newest < before]:
             del self._streams[key]
@@ -227,8 +222,8 @@ class SequenceTrackers:
         kind: Kind,
         rows: ArchivedRows,
     ) -> None:
-        """Record the batches (messages with records) of archived rows of one kind, (n,), as
-        accepted; rows may be in any order.
+        """Record the batches of archived rows of one kind, (n,), as accepted; rows may be in any
+        order.
         """
         vehicle, boot, region, seq, first_held, time = rows
         if not len(seq):

@@ -146,8 +146,8 @@ class Inbox:
 
 
 class AcceptedBatches(NamedTuple):
-    """Accepted batches (messages with records) of one kind (observations or states), and their rows
-    for the archive (without the columns `late` and `weight`).
+    """Accepted batches of one kind, and their rows for the archive (without the columns `late` and
+    `weight`).
     """
 
     batches: list[BatchId]
@@ -155,8 +155,8 @@ class AcceptedBatches(NamedTuple):
 
 
 class BatchIntake:
-    """Intake of batches (messages with records): decodes and validates messages, detects
-    duplicates, and refuses invalid batches. Python code runs per message, not per row.
+    """Intake of batches: decodes and validates messages, detects duplicates, and refuses invalid
+    batches. Python code runs per message, not per row.
 
     Args:
         streams: accepted batches per stream (batches of one vehicle, start, kind and region);
@@ -193,9 +193,8 @@ class BatchIntake:
         self.times: dict[str, int] = {}
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
-        """Decode and check messages. Return the rows of those batches (messages with records) that
-        are valid and new, by kind (observations or states). Invalid batches are refused, and
-        repeated ones are counted.
+        """Decode and check messages. Return the rows of those batches that are valid and new, by
+        kind. Invalid batches are refused, and repeated ones are counted.
         """
         self.times.clear()
         self._now = clock.now / NS
@@ -219,7 +218,7 @@ class BatchIntake:
 
     def sync(self) -> None:
         """Write the numbers and pseudonyms (names in the archive) of the vehicles of accepted
-        batches (messages with records) durably to disk.
+        batches durably to disk.
 
         Raises:
             OSError: the disk is full or broken.
@@ -227,9 +226,7 @@ class BatchIntake:
         self._witnesses.sync()
 
     def acknowledge(self, batches: Sequence[BatchId]) -> None:
-        """Queue acknowledgements for batches (messages with records) whose rows are now durable on
-        disk.
-        """
+        """Queue acknowledgements for batches whose rows are now durable on disk."""
         self._pending.difference_update(batches)
         self._acks.record_durable(batches)
 
@@ -285,9 +282,8 @@ class BatchIntake:
                 del known[name]
 
     def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
-        """Return a mask of batches (n,), True for a batch (message with records) that must be
-        refused because data of its time were erased: the data of all vehicles, or those of the
-        vehicle that sent the batch.
+        """Return a mask of batches (n,), True for a batch that must be refused because data of its
+        time were erased: the data of all vehicles, or those of the vehicle that sent the batch.
         """
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
@@ -305,9 +301,8 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Return the batches (messages with records) that are valid (mask `good`) and that were not
-        accepted before, each once, with their positions in `heads` (fields of the batches other
-        than records).
+        """Return the batches that are valid (mask `good`) and that were not accepted before, each
+        once, with their positions in `heads` (fields of the batches other than records).
         """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
@@ -339,9 +334,8 @@ class BatchIntake:
     def _look_up(
         self, kind: Kind, name: tuple[str, int, int, int], time: int
     ) -> SequenceTracker | None:
-        """Return the stream of a (vehicle, start, region, day): the record of its accepted batches
-        (messages with records). Return None in two cases, in which the vehicle keeps its batch and
-        sends it again later:
+        """Return the stream of a (vehicle, start, region, day): the record of its accepted batches.
+        Return None in two cases, in which the vehicle keeps its batch and sends it again later:
 
         - The key for the vehicle's pseudonym cannot be read. A batch is accepted when the disk
         works again.
@@ -418,9 +412,9 @@ class BatchIntake:
     def _refuse_unusable(
         self, kind: Kind, owner: Parsed, message: Message, error: InputError
     ) -> None:
-        """Refuse a batch (message with records) whose records cannot be used. If its sender and
-        sequence number can be read, send a rejection, because otherwise the vehicle would send the
-        batch for ever. If they cannot be read, only count the refusal.
+        """Refuse a batch whose records cannot be used. If its sender and sequence number can be
+        read, send a rejection, because otherwise the vehicle would send the batch for ever. If they
+        cannot be read, only count the refusal.
         """
         head = head_of(kind, message.payload, message.encoding)
         named = (
@@ -455,8 +449,8 @@ def _newest_times(time: IntArray, sizes: IntArray) -> IntArray:
 
 
 def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
-    """Return rows, heads (other fields) and numbers of rows of the batches (messages with records)
-    at the positions `indices` (ascending).
+    """Return rows, heads (other fields) and numbers of rows of the batches at the positions
+    `indices` (ascending).
     """
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):

@@ -104,8 +104,8 @@ class Refusal(NamedTuple):
 
 def is_doubted(refusal: Refusal, time: int, clock: Clock) -> bool:
     """Return True if a record at `time` [ns] is too far in the future only because the service's
-    clock may be wrong. Its batch (message with records) is then neither accepted nor refused, so
-    the sender keeps and repeats it.
+    clock may be wrong. Its batch is then neither accepted nor refused, so the sender keeps and
+    repeats it.
     """
     return refusal.rule == "time" and 0 < time - clock.now - clock.ahead <= clock.doubt
 
@@ -113,8 +113,8 @@ def is_doubted(refusal: Refusal, time: int, clock: Clock) -> bool:
 def check_heads(
     kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check the heads (fields other than records) of batches (messages with records): owner and
-    region must agree with the key, sequence numbers must be valid, and times must be acceptable.
+    """Check the heads (fields other than records) of batches: owner and region must agree with the
+    key, sequence numbers must be valid, and times must be acceptable.
 
     Args:
         kind: kind of the batches.
@@ -200,8 +200,7 @@ def owner_of(key: str) -> keys.Parsed | None:
 def check_rows(
     kind: Kind, columns: Columns, region: IntArray, clock: Clock
 ) -> tuple[IntArray, tuple[Refusal, ...]]:
-    """Check every row (record) of batches (messages with records), and return the first rule that
-    it breaks.
+    """Check every row (record) of batches, and return the first rule that it breaks.
 
     Args:
         kind: kind of the batches.
@@ -241,9 +240,8 @@ TOO_LONG: Final = Refusal(
 
 
 def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
-    """Return a mask of batches (k,): True if the batch (message with records) spans more than
-    MAX_SPAN_NS. `time` (n,) [ns] contains the times of all rows, `sizes` (k,) the number of rows of
-    each batch.
+    """Return a mask of batches (k,): True if the batch spans more than MAX_SPAN_NS. `time` (n,)
+    [ns] contains the times of all rows, `sizes` (k,) the number of rows of each batch.
     """
     if not len(time):
         return np.zeros(len(sizes), bool)

@@ -133,9 +133,9 @@ class Passes(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """Reports about n visits (passages of cells): reading z of the friction (n,) and its standard
-    deviation σ (n,), grip used (n,), manoeuvre (n,), log-likelihood (n, 32). Reading and standard
-    deviation are NaN if too little grip was used to measure the friction.
+    """Reports about n visits: reading z of the friction (n,) and its standard deviation σ (n,),
+    grip used (n,), manoeuvre (n,), log-likelihood (n, 32). Reading and standard deviation are NaN
+    if too little grip was used to measure the friction.
     """
 
     reading: FloatArray
@@ -146,18 +146,17 @@ class SimulatedReports:
 
 
 def used_shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
-    """Return the share of the grip used in each visit (passage of a cell), (n,). In an excited
-    visit (one that measures the friction) it is drawn from `model.share`, else from .05 to .5,
-    which is ordinary driving.
+    """Return the share of the grip used in each visit, (n,). In an excited visit (one that measures
+    the friction) it is drawn from `model.share`, else from .05 to .5, which is ordinary driving.
     """
     ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
     return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
 def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
-    """Return the correlated noise of the readings in successive visits (passages of cells), (n,),
-    with standard deviation 1. `along` (n,) counts the visits of a drive from 0. If `tails` is
-    finite, the noise follows Student's t with this number of degrees of freedom.
+    """Return the correlated noise of the readings in successive visits, (n,), with standard
+    deviation 1. `along` (n,) counts the visits of a drive from 0. If `tails` is finite, the noise
+    follows Student's t with this number of degrees of freedom.
     """
     e = rng.normal(size=len(along))
     heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
@@ -169,7 +168,7 @@ def reading_noise(rng: Generator, along: IntArray, tails: float = np.inf) -> Flo
 
 def draw_reports(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     """Draw at random the reports that simulated vehicles with their own `errors` send about the
-    visits `p` (passages of cells), (n,).
+    visits `p`, (n,).
     """
     model = errors.model
     who = p.vehicle

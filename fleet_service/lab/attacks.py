@@ -103,8 +103,8 @@ def _attacking_rows(v: Visits, count: int) -> BoolArray:
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits (passages of cells) of a drive with the attackers' reports replaced: at
-    every visit they claim a random friction, with high confidence.
+    """Return the visits of a drive with the attackers' reports replaced: at every visit they claim
+    a random friction, with high confidence.
     """
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
@@ -123,8 +123,8 @@ def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits (passages of cells) of a drive in which the attackers report wrong cells:
-    their measurements are correct, but all their positions are shifted along the town.
+    """Return the visits of a drive in which the attackers report wrong cells: their measurements
+    are correct, but all their positions are shifted along the town.
     """
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
@@ -148,9 +148,9 @@ def victim_cells(drive: AttackedDrive) -> IntArray:
 
 
 def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits (passages of cells) of a drive and of the attackers. The attackers send
-    hundreds of false reports per minute, of ice in the driest cell and of a dry road in the iciest.
-    The values vary, because equal values would count as repetitions.
+    """Return the visits of a drive and of the attackers. The attackers send hundreds of false
+    reports per minute, of ice in the driest cell and of a dry road in the iciest. The values vary,
+    because equal values would count as repetitions.
     """
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
@@ -162,9 +162,9 @@ def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
-    """Return the visits (passages of cells) of a drive and of the attackers: forty additional
-    vehicle names that each pass once and agree with each other. They report ice on the road that
-    contains the driest cell, and a dry road on the road that contains the iciest cell.
+    """Return the visits of a drive and of the attackers: forty additional vehicle names that each
+    pass once and agree with each other. They report ice on the road that contains the driest cell,
+    and a dry road on the road that contains the iciest cell.
     """
     roads = victim_cells(drive) // LENGTH * LENGTH
     who, which, along = (

@@ -33,8 +33,8 @@ CELL: Final = cell_numbers()
 
 
 def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
-    """Return simulated visits (passages of cells) as the archive columns from which a map is
-    computed; every row is a separate batch (message with records).
+    """Return simulated visits as the archive columns from which a map is computed; every row is a
+    separate batch (message with records).
 
     `cells` contains the grid number of each place of the town.
     """
@@ -73,9 +73,9 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
 
 
 def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
-    """Draw at random how the reports of the visits (passages of cells) are delivered: some come
-    late, some twice. Return two arrays with one item per delivery: the arrival time [s], in
-    ascending order, and the index of the visit.
+    """Draw at random how the reports of the visits are delivered: some come late, some twice.
+    Return two arrays with one item per delivery: the arrival time [s], in ascending order, and the
+    index of the visit.
     """
     n = len(v)
     delay = rng.exponential(DELAY_S, n) + np.where(
@@ -90,7 +90,7 @@ def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
     """Return the indices of the deliveries that the service accepts: the first delivery of each
-    visit (passage of a cell). It drops later deliveries of the same visit as duplicates.
+    visit. It drops later deliveries of the same visit as duplicates.
     """
     streams = SequenceTrackers()
     kept = []
@@ -149,9 +149,9 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 def watch_drive(
     rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
 ) -> AlertWatch:
-    """Deliver simulated visits (passages of cells) to a new `Fusion` (a map's beliefs) for `count`
-    minutes. Return the map with the beliefs and alerts that were read after each minute, or only at
-    the minutes in `asked`.
+    """Deliver simulated visits to a new `Fusion` (a map's beliefs) for `count` minutes. Return the
+    map with the beliefs and alerts that were read after each minute, or only at the minutes in
+    `asked`.
     """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)

@@ -251,8 +251,8 @@ def slots_with_truth(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatA
 
 
 def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return a mask of slots (cell and heading sector), (slots,): True if all visits (passages of
-    cells) to the slot truly had the same friction.
+    """Return a mask of slots, (slots,): True if all visits to the slot truly had the same
+    friction.
     """
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     mu = visits["mu"].to_numpy()
@@ -265,8 +265,8 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited_vehicles(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Return, for each slot (cell and heading sector), the number of distinct vehicles that used at
-    least the share EXCITED_SHARE of the grip there, (slots,).
+    """Return, for each slot, the number of distinct vehicles that used at least the share
+    EXCITED_SHARE of the grip there, (slots,).
     """
     rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))

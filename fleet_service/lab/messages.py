@@ -21,9 +21,7 @@ BATCH_ROWS = 12  # number of cells of one road
 
 
 class SentMessage(NamedTuple):
-    """Message of a simulated vehicle, and the index of the last visit (passage of a cell) that it
-    reports.
-    """
+    """Message of a simulated vehicle, and the index of the last visit that it reports."""
 
     message: Message
     last: int
@@ -42,8 +40,8 @@ def clock_of(seconds: float) -> int:
 
 
 def make_messages(v: Visits) -> list[SentMessage]:
-    """Return each vehicle's visits (passages of cells) as messages with batches, in order of time
-    per vehicle and region.
+    """Return each vehicle's visits as messages with batches, in order of time per vehicle and
+    region.
     """
     rows = rows_of(v)
     out = []

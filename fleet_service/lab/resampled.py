@@ -42,8 +42,8 @@ FARTHEST: Final = 0.35
 
 
 class TrueVisits(NamedTuple):
-    """True values of visits (passages of cells), each (m,): number of the vehicle, start [ns], mean
-    friction, and largest share of the friction that was used.
+    """True values of visits, each (m,): number of the vehicle, start [ns], mean friction, and
+    largest share of the friction that was used.
     """
 
     vehicle: IntArray
@@ -53,7 +53,7 @@ class TrueVisits(NamedTuple):
 
 
 class DrivenVisits(NamedTuple):
-    """Visits (passages of cells) of simulated drives with the real estimator, each attribute (k,).
+    """Visits of simulated drives with the real estimator, each attribute (k,).
 
     Attributes:
         vehicle: number of the vehicle.
@@ -70,7 +70,7 @@ class DrivenVisits(NamedTuple):
 
 def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisits:
     """Return the observations of a drive (columns of `end_to_end.read_observations`) with the true
-    values at the middle of each visit (passage of a cell).
+    values at the middle of each visit.
     """
     vehicle = observations["vehicle"].astype(np.int64)
     middle = (observations["enter_time"] + observations["leave_time"]) // 2
@@ -95,8 +95,8 @@ def attach_truth(observations: dict[str, Any], truth: TrueVisits) -> DrivenVisit
 
 
 def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
-    """Return the visits (passages of cells) of several drives as one. Vehicles of different drives
-    remain different vehicles.
+    """Return the visits of several drives as one. Vehicles of different drives remain different
+    vehicles.
     """
     begins = np.cumsum([0, *(int(way.vehicle.max()) + 1 for way in ways)])
     columns = zip(*(vars(way.reports).values() for way in ways), strict=True)
@@ -109,11 +109,10 @@ def join_ways(ways: Sequence[DrivenVisits]) -> DrivenVisits:
 
 
 def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles: int) -> Visits:
-    """Return the visits (passages of cells) in a town with reports drawn from the simulated drives
-    `ways`. Each of the `vehicles` vehicles of the town is assigned one vehicle of the drives and
-    gets reports of this vehicle. Where that vehicle visited no road of similar friction, a report
-    of any vehicle of the drives is used. If the drives have enough vehicles, each is assigned at
-    most once.
+    """Return the visits in a town with reports drawn from the simulated drives `ways`. Each of the
+    `vehicles` vehicles of the town is assigned one vehicle of the drives and gets reports of this
+    vehicle. Where that vehicle visited no road of similar friction, a report of any vehicle of the
+    drives is used. If the drives have enough vehicles, each is assigned at most once.
     """
     there = np.unique(ways.vehicle)
     who = rng.choice(there, vehicles, replace=vehicles > len(there))

@@ -95,7 +95,7 @@ def fuse_by_rules(
     five simple rules: the rules of RULES except the median, in the same order.
 
     Args:
-        place: cell of each visit (passage of a cell), (n,).
+        place: cell of each visit, (n,).
         seconds: time of each visit [s], (n,).
         sent: posterior (mean, variance) of the vehicle's own filter after each visit, (n, 2). All
             rules but "federated reset" use it.

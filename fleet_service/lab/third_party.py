@@ -83,9 +83,7 @@ class ForeignDrive(NamedTuple):
 def make_reports(
     rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray
 ) -> SimulatedReports:
-    """Return the reports about n visits (passages of cells) by vehicles with gain errors `gain`
-    (V,).
-    """
+    """Return the reports about n visits by vehicles with gain errors `gain` (V,)."""
     n = len(mu)
     share = np.where(excited, rng.uniform(*SHARE, n), rng.uniform(*GENTLE, n))
     seen = mu * (1.0 + gain[vehicle])
@@ -104,8 +102,8 @@ def make_reports(
 
 
 def make_observations(drive: ForeignDrive) -> Observations:
-    """Return the visits (passages of cells) of a drive as observations that a `Fusion` (the map's
-    beliefs) accepts; their optional columns are absent.
+    """Return the visits of a drive as observations that a `Fusion` (the map's beliefs) accepts;
+    their optional columns are absent.
     """
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(
@@ -140,7 +138,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
 
 
 def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return the simulated visits (passages of cells) with the given row numbers."""
+    """Return the simulated visits with the given row numbers."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
@@ -149,8 +147,8 @@ def select_visits(v: Visits, rows: IntArray) -> Visits:
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
     """Return three results at the end of a drive of an honest fleet: the scores of the map, a mask
-    of cells with an alert, and a number for each cell. This is the number of visits (passages of
-    the cell) in which the vehicle used enough grip to measure the friction.
+    of cells with an alert, and a number for each cell. This is the number of visits in which the
+    vehicle used enough grip to measure the friction.
     """
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
@@ -167,8 +165,8 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
-    """Return the row numbers of visits (passages of cells) at the times `seconds` (n,), divided
-    into one array for each period of `step` seconds. The times must be in ascending order.
+    """Return the row numbers of visits at the times `seconds` (n,), divided into one array for each
+    period of `step` seconds. The times must be in ascending order.
     """
     borders = np.flatnonzero(np.diff(seconds // step)) + 1
     return np.split(np.arange(len(seconds)), borders)

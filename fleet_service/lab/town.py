@@ -141,7 +141,7 @@ def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
 ) -> Visits:
     """Simulate the drives of a fleet through a town: each vehicle passes a whole road every minute
-    on average, at random times. Return the visits (passages of cells).
+    on average, at random times. Return the visits.
 
     Args:
         rng: random generator.
@@ -186,7 +186,7 @@ def drive_fleet(
 
 
 def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return the simulated visits (passages of cells) that `rows` (numbers or a mask) selects."""
+    """Return the simulated visits that `rows` (numbers or a mask) selects."""
     reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(
         v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
@@ -194,8 +194,8 @@ def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
 
 
 def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
-    """Return the visits (passages of cells) with false reports: the vehicles that the mask `liars`
-    (V,) selects report the friction `claim` with high confidence, instead of their own values.
+    """Return the visits with false reports: the vehicles that the mask `liars` (V,) selects report
+    the friction `claim` with high confidence, instead of their own values.
     """
     lying = liars[v.vehicle]
     readings = np.where(lying, claim, v.reports.reading)

@@ -54,9 +54,7 @@ SEEDS: Final = 3
 
 
 class TownTraffic(NamedTuple):
-    """Visits (passages of cells) in a town, and a mask of visits in which a slip controller
-    intervened, (n,).
-    """
+    """Visits in a town, and a mask of visits in which a slip controller intervened, (n,)."""
 
     visits: Visits
     limited: BoolArray
@@ -109,8 +107,8 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
 
 
 def make_observations(traffic: TownTraffic) -> Observations:
-    """Return the visits (passages of cells) as observations that a `Fusion` (the map's beliefs)
-    accepts, with the flags of the slip controllers.
+    """Return the visits as observations that a `Fusion` (the map's beliefs) accepts, with the flags
+    of the slip controllers.
     """
     rows = rows_of(traffic.visits)
     rows["abs_active"] = traffic.limited.astype(np.int8)
@@ -141,8 +139,8 @@ def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
 
 
 def read_map(place: Town, traffic: TownTraffic) -> Readings:
-    """Compute the map from the visits (passages of cells) minute by minute, and read the map every
-    STEP minutes from minute BEGIN on.
+    """Compute the map from the visits minute by minute, and read the map every STEP minutes from
+    minute BEGIN on.
     """
     o = make_observations(traffic)
     fusion = Fusion(LATENESS_S, enrolled=True)

@@ -129,7 +129,7 @@ class Watchers:
         return {"now": time.time(), "heard": self._world.heard, **self._state()}
 
     def push(self, changes: list[TileBlock]) -> None:
-        """Send changed blocks (encoded cells of tiles) to the browsers whose view they touch."""
+        """Send changed blocks to the browsers whose view they touch."""
         # blocks by (tile, level), each encoded once for all browsers that show it
         lines: dict[tuple[int, int], bytes] = {}
         for watcher in list(self._watchers.values()):

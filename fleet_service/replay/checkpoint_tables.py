@@ -22,8 +22,8 @@ _KEY: Final = b"gripmap.checkpoint"
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
-    """Return the complete state of a fusion (beliefs about the friction of all cells) as tables by
-    name. Each column is stored as one list, because columns may differ in length.
+    """Return the complete state of a fusion as tables by name. Each column is stored as one list,
+    because columns may differ in length.
     """
     out = {}
     for name, columns in image_of(fusion).items():
@@ -54,9 +54,8 @@ def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
 
 
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
-    """Restore a fusion (beliefs about the friction of all cells) from its tables. With the same
-    later observations, it gives exactly the same results as the fusion that was passed to
-    `tables_of`.
+    """Restore a fusion from its tables. With the same later observations, it gives exactly the same
+    results as the fusion that was passed to `tables_of`.
 
     Raises:
         InputError: the tables are of another version, or incomplete.

@@ -46,7 +46,7 @@ class Taken(NamedTuple):
 
     Attributes:
         tables: tables by name.
-        cut: position of the last segment (file of new rows) that the tables include.
+        cut: position of the last segment that the tables include.
         weather: names of the files of weather reports that the tables include.
     """
 
@@ -56,7 +56,7 @@ class Taken(NamedTuple):
 
 
 def save_checkpoint(root: Path, taken: Taken) -> Path:
-    """Store a checkpoint (saved state of a service), and keep the previous one; return the folder.
+    """Store a checkpoint, and keep the previous one; return the folder.
 
     Raises:
         OSError: the disk is full; earlier checkpoints stay.
@@ -95,7 +95,7 @@ def list_checkpoints(root: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path) -> Taken:
-    """Return a checkpoint (saved state of a service) after verification.
+    """Return a checkpoint after verification.
 
     Raises:
         InputError: the checkpoint is damaged, has an old form, or too many starts with it have
@@ -121,22 +121,20 @@ def load_checkpoint(path: Path) -> Taken:
 
 
 def mark_begun(path: Path) -> None:
-    """Record that a service is starting from a checkpoint (saved state); `mark_survived` removes
-    the record.
-    """
+    """Record that a service is starting from a checkpoint; `mark_survived` removes the record."""
     with suppress(OSError):  # a service must start even if the disk is full
         (path / _TRIED).write_text(str(_count_tries(path) + 1))
 
 
 def mark_survived(root: Path) -> None:
-    """Record that the service runs well with the checkpoint (saved state) from which it started."""
+    """Record that the service runs well with the checkpoint from which it started."""
     for path in _checkpoint_folders(root):
         (path / _TRIED).unlink(missing_ok=True)
 
 
 def file_digest(path: Path) -> str:
-    """Return the hash of a file of a checkpoint (saved state of a service); if the file does not
-    exist, the hash of empty content.
+    """Return the hash of a file of a checkpoint; if the file does not exist, the hash of empty
+    content.
     """
     state = blake2b(digest_size=16)
     with suppress(FileNotFoundError), path.open("rb") as file:

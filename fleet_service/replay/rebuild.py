@@ -176,8 +176,8 @@ def first_day(root: Path) -> int | None:
     """Return the first day that matters to a service (days since 1970): layout.MAP_DAYS before the
     last day with rows; None for an empty archive.
 
-    Vehicles do not send older batches (messages with records) again (ServiceConfig.oldest_s), and
-    older batches no longer affect the map.
+    Vehicles do not send older batches again (ServiceConfig.oldest_s), and older batches no longer
+    affect the map.
     """
     found = [
         layout.day_of(folder)
@@ -236,9 +236,7 @@ def replay(
 
 
 def _are_known(rows: segments.Rows, known: SequenceTrackers) -> BoolArray:
-    """Return a mask of archived rows (n,): True if the row's batch (message with records) is in
-    `known`.
-    """
+    """Return a mask of archived rows (n,): True if the row's batch is in `known`."""
     vehicle, boot, region, seq = (rows[name] for name in IDENTITY)
     stream, _ = group_rows(vehicle.copy(), boot, region)
     batch, first = group_rows(stream.astype(np.int64), seq, seq)

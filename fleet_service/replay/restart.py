@@ -29,7 +29,7 @@ ABOVE: Final = "streams_above"
 
 
 class Restart(NamedTuple):
-    """Initial state of a service, from a checkpoint (saved state).
+    """Initial state of a service, from a checkpoint.
 
     Attributes:
         fusion: fusion (beliefs about the friction of all cells) of the checkpoint, or a new one.
@@ -55,8 +55,8 @@ class Restart(NamedTuple):
 def load_restart(
     root: Path, lateness_s: float, extra_tables: Sequence[str] = (), *, enrolled: bool = False
 ) -> Restart:
-    """Return the initial state from the newest usable checkpoint (saved state) of an archive; an
-    empty state if there is none.
+    """Return the initial state from the newest usable checkpoint of an archive; an empty state if
+    there is none.
 
     A checkpoint contains the tables that `image_of` makes. The service may have added further
     tables; `extra_tables` are the names of those to read. `enrolled` is True if the service accepts
@@ -96,9 +96,8 @@ def load_restart(
 def image_of(
     fusion: Fusion, standing: list[Alert], streams: SequenceTrackers
 ) -> dict[str, pa.Table]:
-    """Return the tables of a checkpoint (saved state) by name: the tables of the fusion (beliefs
-    about the friction of all cells), the active alerts, and the record of accepted batches
-    (messages with records). `load_restart` restores the state from them.
+    """Return the tables of a checkpoint by name: the tables of the fusion, the active alerts, and
+    the record of accepted batches. `load_restart` restores the state from them.
     """
     columns, above = streams.columns()
     return tables_of(fusion) | {

@@ -42,8 +42,7 @@ def restore_streams(
     begin: Begin = Begin(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
 ) -> None:
-    """Record every archived batch (message with records) as accepted, so that duplicates are
-    detected after a restart.
+    """Record every archived batch as accepted, so that duplicates are detected after a restart.
 
     Args:
         root: folder of the archive.
@@ -56,7 +55,7 @@ def restore_streams(
 
 
 def read_streams(root: Path, begin: Begin, damaged: Damaged) -> Iterator[tuple[Kind, ArchivedRows]]:
-    """Yield the identity and times of the rows of every archived batch (message with records), for
+    """Yield the identity and times of the rows of every archived batch, for
     `SequenceTrackers.restore`. See `restore_streams` for the arguments.
     """
     for kind, first in layout.FIRST_TIME.items():

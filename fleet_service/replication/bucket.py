@@ -96,8 +96,7 @@ class ObjectBucket:
             ) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Upload an object to the bucket (object store); an existing object of this name is
-        replaced.
+        """Upload an object to the bucket; an existing object of this name is replaced.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -107,9 +106,8 @@ class ObjectBucket:
             self._do.put(self._store, name, content)
 
     def put_new(self, name: str, content: bytes) -> None:
-        """Upload an object to the bucket (object store); its name must be new. An existing object
-        with the same content is accepted, because an earlier upload may have timed out although it
-        succeeded.
+        """Upload an object to the bucket; its name must be new. An existing object with the same
+        content is accepted, because an earlier upload may have timed out although it succeeded.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded, or the existing object has other
@@ -125,8 +123,8 @@ class ObjectBucket:
                     ) from None
 
     def create(self, name: str, content: bytes) -> bool:
-        """Create an object in the bucket (object store) if its name is new. Return True if it was
-        created, or exists with the same content.
+        """Create an object in the bucket if its name is new. Return True if it was created, or
+        exists with the same content.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -139,8 +137,7 @@ class ObjectBucket:
         return True
 
     def list_names(self, folder: str) -> list[str]:
-        """Return the names of the objects in a folder of the bucket (object store) and its
-        subfolders.
+        """Return the names of the objects in a folder of the bucket and its subfolders.
 
         Raises:
             CopyError: the objects cannot be listed.
@@ -173,7 +170,7 @@ class ObjectBucket:
                 yield bytes(part)
 
     def list_sizes(self) -> dict[str, int]:
-        """Return names and sizes [bytes] of all objects in the bucket (object store).
+        """Return names and sizes [bytes] of all objects in the bucket.
 
         Raises:
             CopyError: the objects cannot be listed.

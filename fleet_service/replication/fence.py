@@ -69,8 +69,8 @@ def put_fence(bucket: ObjectBucket, number: int, turn: int, fence: Fence) -> Non
 
 
 def fence_of(bucket: ObjectBucket) -> Fence:
-    """Return the last owner's fence (list of valid objects) from the bucket. If there is none,
-    return a fence for which all objects are valid.
+    """Return the last owner's fence from the bucket. If there is none, return a fence for which all
+    objects are valid.
 
     Raises:
         CopyError: the fence cannot be read.

@@ -13,8 +13,8 @@ from fleet_service.replication.fence import Fence, Term, fence_of, put_fence
 
 
 class FencedBucket:
-    """Bucket of a replica, with the lease (ownership limited in time) of its owner if there is one,
-    and with the fence (list of valid objects) against former owners.
+    """Bucket of a replica, with the lease of its owner if there is one, and with the fence against
+    former owners.
 
     Attributes:
         objects: the bucket.
@@ -32,8 +32,7 @@ class FencedBucket:
         self._turn = 0
 
     def attach_lease(self, may_write: Callable[[], bool], assert_alone: Callable[[], None]) -> None:
-        """From now on, check the lease (ownership of the archive) before files in the bucket are
-        changed or deleted.
+        """From now on, check the lease before files in the bucket are changed or deleted.
 
         Args:
             may_write: returns True while this service certainly has the lease; makes no request to
@@ -45,7 +44,7 @@ class FencedBucket:
         self.assert_alone = assert_alone
 
     def require_lease(self) -> None:
-        """Check in the bucket that no later lease (ownership of the archive) exists.
+        """Check in the bucket that no later lease exists.
 
         Raises:
             CopyError: a later lease exists, or the check fails.
@@ -55,7 +54,7 @@ class FencedBucket:
 
     def list_valid(self) -> dict[str, int]:
         """Return names and sizes [bytes] of the objects that are valid according to the bucket's
-        fence (list of valid objects).
+        fence.
 
         Raises:
             CopyError: the bucket cannot be read.
@@ -65,8 +64,7 @@ class FencedBucket:
         return {name: size for name, size in there.items() if fence.counts_object(name)}
 
     def raise_fence(self, term: Term, names: Iterable[str]) -> None:
-        """Write the fence (list of valid objects) of a new owner, and delete all objects that are
-        not valid.
+        """Write the fence of a new owner, and delete all objects that are not valid.
 
         Args:
             term: lease number and epoch (number in file names) of the new owner.
@@ -83,9 +81,9 @@ class FencedBucket:
                 self.objects.delete(name)
 
     def admit_objects(self, names: Iterable[str]) -> None:
-        """Add to the fence (list of valid objects) those of the owner's uploaded objects that are
-        not valid yet. Such an object was written by a compaction (merge of files) that started
-        before the owner's term. Its name therefore has an older epoch (number of a term).
+        """Add to the fence those of the owner's uploaded objects that are not valid yet. Such an
+        object was written by a compaction (merge of files) that started before the owner's term.
+        Its name therefore has an older epoch (number of a term).
         """
         if strays := [name for name in names if not self._fence.counts_object(name)]:
             fence = self._fence._replace(names=self._fence.names.union(strays))
@@ -98,9 +96,9 @@ class FencedBucket:
         self._fence = fence
 
     def create_key(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
-        """Upload a file of the archive's secret keys to the bucket (object store); its name must be
-        new. There is one exception. If a former service uploaded a file of this name after it had
-        lost its lease (ownership), the file belongs to rows that are not valid, and is replaced.
+        """Upload a file of the archive's secret keys to the bucket; its name must be new. There is
+        one exception. If a former service uploaded a file of this name after it had lost its lease
+        (ownership), the file belongs to rows that are not valid, and is replaced.
         """
         if self.assert_alone is None or bucket.create(name, content):
             bucket.put_new(name, content)

@@ -35,8 +35,8 @@ class FileTransfer:
         self._pool = pool
 
     def upload_file(self, path: Path, bucket: ObjectBucket) -> None:
-        """Upload a file through `bucket`, and record it in the upload journal (list of uploaded
-        files). The caller chooses a `bucket` whose time limit for a request suits this file.
+        """Upload a file through `bucket`, and record it in the upload journal. The caller chooses a
+        `bucket` whose time limit for a request suits this file.
 
         Raises:
             CopyError: it is unknown whether the upload succeeded.
@@ -67,9 +67,8 @@ class FileTransfer:
         return True
 
     def download_missing(self, there: Mapping[str, int]) -> int:
-        """Download the files that only the bucket (object store) has; return their number. Also
-        remove from the journal (list of uploaded files) the entries of files that the bucket lacks,
-        or has with another size.
+        """Download the files that only the bucket has; return their number. Also remove from the
+        journal the entries of files that the bucket lacks, or has with another size.
 
         `there` contains the names and sizes [bytes] of the valid objects in the bucket.
         """

@@ -129,9 +129,7 @@ class LeaseRecord(NamedTuple):
 
     @property
     def content(self) -> bytes:
-        """Return the JSON content of the lease object (it states the owner of the archive) in the
-        bucket.
-        """
+        """Return the JSON content of the lease object in the bucket."""
         return json.dumps(
             {name: value for name, value in self._asdict().items() if name != "number"}
         ).encode()
@@ -155,8 +153,7 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """Lease (ownership limited in time) of one archive's copy: `wait` for it, then call
-    `start_renewal`, and finally `release`.
+    """Lease of one archive's copy: `wait` for it, then call `start_renewal`, and finally `release`.
 
     Args:
         holder: identity of this folder, see `folder_identity`. This process has locked the folder,
@@ -203,9 +200,7 @@ class Lease:
 
     @property
     def former_holders(self) -> tuple[str, ...]:
-        """Return the names of the services that had the lease (ownership of the archive)
-        earlier.
-        """
+        """Return the names of the services that had the lease earlier."""
         return () if self._mine is None else self._mine.before
 
     @property
@@ -245,8 +240,7 @@ class Lease:
         epoch: Callable[[], int],
         standby: Standby | None,
     ) -> bool:
-        """Wait until this service has the lease (ownership of the archive); return False if `stop`
-        is set first.
+        """Wait until this service has the lease; return False if `stop` is set first.
 
         Args:
             stop: event that ends the wait.
@@ -289,16 +283,16 @@ class Lease:
         return False
 
     def start_renewal(self) -> None:
-        """Start a thread that renews the lease (ownership of the archive) while `serves` returns
-        True. Otherwise the lease expires, and another service takes over.
+        """Start a thread that renews the lease while `serves` returns True. Otherwise the lease
+        expires, and another service takes over.
         """
         self._thread = threading.Thread(target=self._renew_until_stopped, name="lease", daemon=True)
         self._thread.start()
 
     def release(self, to: str = "") -> None:
-        """Release the lease (ownership of the archive) if this service still has it. Then the
-        service named `to` may take over at once, or any service if `to` is empty. This service must
-        not acknowledge anything afterwards.
+        """Release the lease if this service still has it. Then the service named `to` may take over
+        at once, or any service if `to` is empty. This service must not acknowledge anything
+        afterwards.
         """
         self._stop.set()
         if self._thread is not None:
@@ -320,10 +314,10 @@ class Lease:
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
-        """Renew the lease (ownership of the archive): write its object in the bucket again, with
-        the same lease number and a turn (count of renewals) that is one higher. The renewal is
-        valid if no object with a higher lease number exists afterwards, because each service that
-        takes over creates the next lease number.
+        """Renew the lease: write its object in the bucket again, with the same lease number and a
+        turn (count of renewals) that is one higher. The renewal is valid if no object with a higher
+        lease number exists afterwards, because each service that takes over creates the next lease
+        number.
 
         Raises:
             CopyError: it is unknown whether the renewal is valid.
@@ -349,8 +343,7 @@ class Lease:
     def _can_take(
         self, found: LeaseRecord | None, watch: _HolderWatch, standby: Standby | None
     ) -> bool:
-        """Return True if this service may take over the lease (ownership of the archive), whose
-        newest record is `found`.
+        """Return True if this service may take over the lease, whose newest record is `found`.
 
         Raises:
             InputError: a live service has the lease, and this service is no standby or has another
@@ -400,7 +393,7 @@ class Lease:
 
 
 class _HolderWatch:
-    """Observation of the holder of a lease (ownership of the archive) by a waiting service."""
+    """Observation of the holder of a lease by a waiting service."""
 
     def __init__(self, lease_s: float) -> None:
         self._lease_s = lease_s
@@ -449,8 +442,7 @@ def _check_settings(found: LeaseRecord, lease_s: float) -> None:
 
 
 def _read_newest_record(bucket: ObjectBucket) -> LeaseRecord | None:
-    """Return the record of the newest lease (ownership of the archive) in the bucket; None if there
-    is none.
+    """Return the record of the newest lease in the bucket; None if there is none.
 
     Raises:
         CopyError: the bucket does not answer.
@@ -496,7 +488,7 @@ def _parse_record(name: str, content: bytes) -> LeaseRecord | None:
 
 def _unknown_holder(name: str, content: bytes, previous: LeaseRecord | None) -> LeaseRecord:
     """Return a lease record that stands for a damaged lease object: its holder is unknown, and its
-    turn (count of renewals) changes whenever the content of the object changes.
+    turn changes whenever the content of the object changes.
     """
     log.warning("the lease object %s is damaged", name)
     turn = int.from_bytes(blake2b(content, digest_size=6).digest(), "big")

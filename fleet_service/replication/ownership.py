@@ -75,9 +75,7 @@ class Ownership:
 
     @property
     def all_holders(self) -> tuple[str, ...]:
-        """Return the names of this and all earlier holders of the lease (ownership of the archive);
-        empty without a lease.
-        """
+        """Return the names of this and all earlier holders of the lease; empty without a lease."""
         return () if self.lease is None else (*self.lease.former_holders, self.lease.service)
 
     def mark_lost(self) -> None:

@@ -142,8 +142,8 @@ class BucketReplica:
 
     def prefetch(self) -> None:
         """Download files that a later `sync_under_lease` will need, and remove those that the
-        bucket no longer has. A standby (waiting service) calls this in advance, while another
-        service still owns the bucket.
+        bucket no longer has. A standby calls this in advance, while another service still owns the
+        bucket.
 
         Raises:
             CopyError, OSError: the download is incomplete, for example because the owner's
@@ -157,7 +157,7 @@ class BucketReplica:
     def _remove_unlisted(self, there: Mapping[str, int]) -> None:
         """Remove files of the archive's folder that the bucket does not contain with the same size.
         `there` has names and sizes of the bucket's valid objects. Then remove the journal entries
-        (list of uploaded files) of all files that the folder does not contain.
+        of all files that the folder does not contain.
 
         Files of the folder `keys` are always removed, and so downloaded again: two secret keys of
         one month have the same name and size, and only the bucket's belongs to valid rows.
@@ -170,9 +170,9 @@ class BucketReplica:
                 self._journal.remove(name)
 
     def upload_segments(self, segments: Iterable[Path]) -> None:
-        """Upload written segments (files of new rows), and the files of the folder `keys` that are
-        new or have changed. These contain the secret keys for pseudonyms, and vehicle identities.
-        All of them are in the bucket when this returns.
+        """Upload written segments, and the files of the folder `keys` that are new or have changed.
+        These contain the secret keys for pseudonyms, and vehicle identities. All of them are in the
+        bucket when this returns.
 
         Raises:
             CopyError: some files are not in the bucket; the next call continues and uploads no file
@@ -196,12 +196,11 @@ class BucketReplica:
         """Upload new and rewritten files of the archive to the bucket, then delete removed ones;
         return the number of changed objects.
 
-        Segments (files of new rows) in the inbox folder are excluded; only `upload_segments`
-        uploads them.
+        Segments in the inbox folder are excluded; only `upload_segments` uploads them.
 
         Raises:
             CopyError: the work is incomplete; the next call continues.
-            OSError: the journal (list of uploaded files) cannot be written.
+            OSError: the journal cannot be written.
         """
         return self._upload_changes(with_log=False).changed
 
@@ -283,7 +282,7 @@ def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
     Raises:
         InputError: the address or an option cannot be used, or the bucket cannot be reached or
             belongs to another service.
-        OSError: the folder or the journal (list of uploaded files) cannot be read or written.
+        OSError: the folder or the journal cannot be read or written.
     """
     wanted = config.archive
     if wanted.second is None:

@@ -14,8 +14,8 @@ MOST_BACK_OFF_S: Final = 8.0
 
 
 class UploadBackoff:
-    """Record of failing uploads to the bucket (object store) at `url`. After a failure there is a
-    pause, which grows with each further failure.
+    """Record of failing uploads to the bucket at `url`. After a failure there is a pause, which
+    grows with each further failure.
 
     Attributes:
         failures: number of failed uploads.
@@ -31,7 +31,7 @@ class UploadBackoff:
 
     @property
     def away_s(self) -> float:
-        """Return the time [s] for which the bucket (object store) has not accepted data on which an
+        """Return the time [s] for which the bucket has not accepted data on which an
         acknowledgement depends; 0 if it accepts them.
         """
         since = self._since

@@ -110,9 +110,8 @@ class UploadJournal:
         self._lines += 1
 
     def sync(self) -> None:
-        """Write the recorded lines of the upload journal (list of uploaded files) durably to disk
-        (fsync). If most lines are out of date, write the whole file again. One thread at a time may
-        call this.
+        """Write the recorded lines of the upload journal durably to disk (fsync). If most lines are
+        out of date, write the whole file again. One thread at a time may call this.
 
         Raises:
             OSError: the disk is full or broken; the file stays as it is.
@@ -126,13 +125,13 @@ class UploadJournal:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file of the upload journal (list of uploaded files)."""
+        """Close the file of the upload journal."""
         self._file.close()
 
 
 def last_copy_url(root: Path) -> str | None:
     """Return the URL of the bucket to which an archive was last copied; None if there is no
-    readable upload journal (list of uploaded files).
+    readable upload journal.
     """
     with suppress(OSError, ValueError, KeyError, TypeError), (root / NAME).open() as file:
         return str(json.loads(file.readline())["copy"])

@@ -96,8 +96,8 @@ class Alerts:
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def update(self, slots: IntArray) -> list[Alert]:
-        """Return the alerts that are raised or cleared because the given slots (one per cell and
-        heading sector), (k,), were updated.
+        """Return the alerts that are raised or cleared because the given slots, (k,), were
+        updated.
         """
         slippery = self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
@@ -114,9 +114,8 @@ class Alerts:
         ]
 
     def _raise_likely(self, icy: IntArray, updated: IntArray) -> list[Alert]:
-        """Return the alerts that are raised because the slots `icy` (one per cell and heading
-        sector), (k,), were updated, in which vehicles reported ice. They are some of the slots
-        `updated`, (n,).
+        """Return the alerts that are raised because the slots `icy`, (k,), were updated, in which
+        vehicles reported ice. They are some of the slots `updated`, (n,).
         """
         likely = self._suspects(icy)
         likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
@@ -151,9 +150,8 @@ class Alerts:
         )
 
     def _suspects(self, slots: IntArray) -> IntArray:
-        """Return the slots (one per cell and heading sector) that are candidates for a new alert. A
-        "source" of a slot is a vehicle that reported ice there within the hour before the slot's
-        last report.
+        """Return the slots that are candidates for a new alert. A "source" of a slot is a vehicle
+        that reported ice there within the hour before the slot's last report.
 
         The given `slots` (k,) all have a source. They are checked, and also the other slots on the
         same slippery stretches of road. Slots with an active alert are left out. A slot becomes a
@@ -181,15 +179,14 @@ class Alerts:
 
     def _own_sources(self, slots: IntArray, side: Side) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in
-        each slot (cell and heading sector), (k, SOURCES); 0 means no vehicle. Only reports within
-        the hour before the slot's last report count.
+        each slot, (k, SOURCES); 0 means no vehicle. Only reports within the hour before the slot's
+        last report count.
         """
         return self._fusion.sources(slots, side, self._fusion.live.time[slots] - c.SOURCE_NS)
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
-        """Return a mask of slots (one per cell and heading sector), (k,): True if the alert may be
-        cleared. Within the hour before the last report, at least two more vehicles must have
-        reported grip than ice.
+        """Return a mask of slots, (k,): True if the alert may be cleared. Within the hour before
+        the last report, at least two more vehicles must have reported grip than ice.
 
         The map remembers at most SOURCES vehicles per slot that reported grip, and at most SOURCES
         that reported ice. Therefore SOURCES vehicles that reported grip always suffice, because a

@@ -81,8 +81,8 @@ class MapState:
         return sorted(self._slots)
 
     def slots(self, tile: int) -> IntArray:
-        """Return the slots (row numbers, one per cell and heading sector), (n,), of a tile, in the
-        order of their first visit (passage of a cell).
+        """Return the slots, (n,), of a tile, in the order of their first visit (passage of
+        a cell).
         """
         self._index()
         if tile not in self._slots:
@@ -92,7 +92,7 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """Return the number of slots (one per cell and heading sector) of a tile."""
+        """Return the number of slots of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
     def rebuild(self) -> None:
@@ -120,7 +120,5 @@ class MapState:
 
 
 def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
-    """Return the tile number (n,) of each slot (cell and heading sector), given by row numbers
-    (n,).
-    """
+    """Return the tile number (n,) of each slot, given by row numbers (n,)."""
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)

@@ -36,9 +36,9 @@ def impute_cells(
     (one per cell and heading sector), in the same sector. With a `route`, only cells along it are
     returned.
 
-    Each estimated belief is a weighted mean of the prior (belief before any measurement) and the
-    neighbours' beliefs. The prior has the weight PRIOR_SHARE if a neighbour is adjacent. If the
-    nearest neighbour along a route is farther away, the prior has more weight.
+    Each estimated belief is a weighted mean of the prior and the neighbours' beliefs. The prior has
+    the weight PRIOR_SHARE if a neighbour is adjacent. If the nearest neighbour along a route is
+    farther away, the prior has more weight.
 
     The result counts as many `vehicles` as the neighbour with the fewest, so that readers never see
     an estimate whose source is hidden from them. `first` and `last` are the oldest and the newest
@@ -95,9 +95,9 @@ def _route_gaps(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return the visited cells from which the unvisited cells of a route in a tile are estimated.
 
-    The result consists of three arrays (k,). The first contains keys of unvisited cells (cell and
-    heading sector). The second contains the slot of the nearest visited cell before or behind this
-    cell on the route. The third contains the weight of this visited cell in the estimate, [0, 1].
+    The result consists of three arrays (k,). The first contains keys of unvisited cells. The second
+    contains the slot of the nearest visited cell before or behind this cell on the route. The third
+    contains the weight of this visited cell in the estimate, [0, 1].
 
     A key appears once per side (before, behind) that has a visited cell at most REACH positions
     away. A visited cell at the next position of the route is left out, because `impute_cells`

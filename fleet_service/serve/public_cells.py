@@ -130,16 +130,12 @@ class PublicCells:
         self._copy_more_slippery(voted[voted >= 0], now)
 
     def select(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers, one per cell and heading sector) that are public
-        at `now` [ns].
-        """
+        """Return those of the slots that are public at `now` [ns]."""
         self.publish(now)
         return slots[self._shown[slots]]
 
     def take_published(self) -> IntArray:
-        """Return the slots (row numbers, one per cell and heading sector) that were copied for
-        readers since the last call.
-        """
+        """Return the slots that were copied for readers since the last call."""
         found = np.concatenate([np.zeros(0, np.int64), *self._published])
         self._published.clear()
         return found
@@ -183,9 +179,9 @@ class PublicCells:
             self._published.append(slots)
 
     def columns(self) -> dict[str, dict[str, IntArray]]:
-        """Return the state as tables of integer columns for a checkpoint (saved state). They
-        contain the cells whose public copy differs from the true beliefs, and the recent vehicles
-        of each tile. The tables do not include the counts of `visitors`.
+        """Return the state as tables of integer columns for a checkpoint. They contain the cells
+        whose public copy differs from the true beliefs, and the recent vehicles of each tile. The
+        tables do not include the counts of `visitors`.
         """
         self._add_slots()
         used = slice(self._size)
@@ -224,8 +220,8 @@ class PublicCells:
         self._period = int(present["period"].max(initial=0))
 
     def _copy_more_slippery(self, slots: IntArray, now: int) -> None:
-        """Publish (copy for readers) those of the slots (one per cell and heading sector) that have
-        become clearly more slippery than readers see.
+        """Publish (copy for readers) those of the slots that have become clearly more slippery than
+        readers see.
         """
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
@@ -236,16 +232,14 @@ class PublicCells:
         self._pending[slots[self._shown[slots]]] = 0
 
     def _copy(self, slots: IntArray) -> None:
-        """Copy the current state of the slots (one per cell and heading sector) to the public copy,
-        which readers see.
-        """
+        """Copy the current state of the slots to the public copy, which readers see."""
         live = self._fusion.store.state.live
         self._rows.belief[slots] = live.belief[slots]
         self._rows.cells[slots] = live.cells[slots]
 
     def _add_slots(self) -> None:
-        """Add new slots (one per cell and heading sector) to the public copy, in the state of an
-        unvisited cell. The memory is doubled when it is full, so that this is rare.
+        """Add new slots to the public copy, in the state of an unvisited cell. The memory is
+        doubled when it is full, so that this is rare.
         """
         if self._size == self._fusion.size:
             return
@@ -260,9 +254,7 @@ class PublicCells:
         self._size = self._fusion.size
 
     def _take_rows(self, slots: IntArray, room: int | None = None) -> None:
-        """Keep only the rows `slots` (one per cell and heading sector) of the public copy, in
-        arrays with room for `room` rows.
-        """
+        """Keep only the rows `slots` of the public copy, in arrays with room for `room` rows."""
         room = len(slots) if room is None else room
         rows = Rows(no_beliefs(room), rows_of_lines(room, CELL), self._rows.reporters)
         rows.belief[: len(slots)] = self._rows.belief[slots]

@@ -34,7 +34,7 @@ def answer_query(
         cache: the tiles of the map.
         query: parameters of the query.
         wanted: function that returns True if a tile's key matches the query's key.
-        now: time [ns] for which beliefs (probability of each friction value) and ages are computed.
+        now: time [ns] for which beliefs and ages are computed.
         only: the only matching tile, if the query's key names a single tile.
 
     Raises:

@@ -167,9 +167,7 @@ class TileCache:
         return cells if self._public is None else coarsen_cells(cells)
 
     def public(self, slots: IntArray, now: int) -> IntArray:
-        """Return those of the slots (row numbers, one per cell and heading sector) that are public
-        at `now` [ns].
-        """
+        """Return those of the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)
 

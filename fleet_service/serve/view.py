@@ -67,8 +67,8 @@ class Readable(Protocol):
         """
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
-        sector), (k, 32), predicted to `now` [ns].
+        """Return the belief about the road (32 probabilities of μ) for each slot, (k, 32),
+        predicted to `now` [ns].
         """
 
     def slots_of(self, cell: IntArray, sector: IntArray) -> IntArray:
@@ -78,9 +78,8 @@ class Readable(Protocol):
 
 
 def view_cells(source: Readable, slots: IntArray, now: int) -> CellView:
-    """Return a copy of the state of `slots` (one per cell and heading sector), with beliefs
-    (probability of each friction value) for the time `now` [ns]. The map may be updated afterwards
-    without changing the copy.
+    """Return a copy of the state of `slots`, with beliefs for the time `now` [ns]. The map may be
+    updated afterwards without changing the copy.
     """
     live = source.live
     key = live.key[slots]

@@ -58,8 +58,8 @@ class Visitors:
         return self._part * PART_NS
 
     def count(self, slots: IntArray, now: int) -> IntArray:
-        """Return the number of distinct vehicles in each slot (cell and heading sector), (k,),
-        within the time window that ends at `now` [ns].
+        """Return the number of distinct vehicles in each slot, (k,), within the time window that
+        ends at `now` [ns].
         """
         self._grow()
         ago = max(now // PART_NS - self._part, 0)
@@ -98,8 +98,8 @@ class Visitors:
         return made
 
     def _grow(self) -> None:
-        """Enlarge the memory for new slots (one per cell and heading sector). The memory is doubled
-        when it is full, so that this is rare.
+        """Enlarge the memory for new slots. The memory is doubled when it is full, so that this is
+        rare.
         """
         if len(self._bits) < self._fusion.size:
             longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)

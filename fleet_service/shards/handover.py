@@ -70,9 +70,9 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
 def hand_over(
     session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
 ) -> HandoverResult | None:
-    """Ask the service of a region to hand over to a standby (a waiting service), and wait until the
-    standby serves the region. Return the name of the former service and the duration of the
-    interruption, or None if the standby already serves the region.
+    """Ask the service of a region to hand over to a standby, and wait until the standby serves the
+    region. Return the name of the former service and the duration of the interruption, or None if
+    the standby already serves the region.
 
     Args:
         session: Zenoh session of a client with a service certificate.
@@ -111,8 +111,8 @@ def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
 
 
 def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
-    """Send a request to a service to hand over its regions to the standby (waiting service) named
-    `to`; return the regions that the service hands over, as text.
+    """Send a request to a service to hand over its regions to the standby named `to`; return the
+    regions that the service hands over, as text.
     """
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:

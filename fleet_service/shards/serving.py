@@ -137,11 +137,11 @@ def _declare_tokens(
 def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
-    """Yield three functions that a standby (waiting service) calls while it waits for the lease
-    (ownership of the archive). The first returns True if a router is reachable, the second if the
-    service of a given name is present. The third is the argument `alive`. The standby calls it at
-    each check of the lease, so that a watchdog can detect a standby that hangs. Yield None if the
-    service is no standby, or was stopped before it reached a router.
+    """Yield three functions that a standby (waiting service) calls while it waits for the lease.
+    The first returns True if a router is reachable, the second if the service of a given name is
+    present. The third is the argument `alive`. The standby calls it at each check of the lease, so
+    that a watchdog can detect a standby that hangs. Yield None if the service is no standby, or was
+    stopped before it reached a router.
     """
     session = (
         zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None

@@ -38,17 +38,14 @@ class _Native:
 
 
 def use_native_kernels(library: Library) -> None:
-    """From now on, give each newly imported module its kernels (compiled numerical functions) from
-    the shared library `library`. If the library lacks a kernel, Numba compiles that kernel at its
-    first call.
+    """From now on, give each newly imported module its kernels from the shared library `library`.
+    If the library lacks a kernel, Numba compiles that kernel at its first call.
     """
     _Native.library = library
 
 
 def uses_native_kernels() -> bool:
-    """Return True if this process takes its kernels (compiled numerical functions) from a shared
-    library.
-    """
+    """Return True if this process takes its kernels from a shared library."""
     return _Native.library is not None
 
 
@@ -164,9 +161,9 @@ def _cache_of(package: str) -> str | None:
 
 
 def native_library_path(package: str) -> Path | None:
-    """Return the path of the shared library with a package's kernels (compiled functions), in the
-    package's cache folder. The name contains digests of all source files and of the processor's
-    features. Return None if the cache cannot be written.
+    """Return the path of the shared library with a package's kernels, in the package's cache
+    folder. The name contains digests of all source files and of the processor's features. Return
+    None if the cache cannot be written.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     folder = Path(given) if given else cache_root()

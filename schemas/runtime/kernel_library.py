@@ -41,9 +41,8 @@ class KernelLibrary(NamedTuple):
     shipped: Path
 
     def use(self) -> bool:
-        """Take the kernels (compiled functions) of this process from a shared library: one of the
-        package if it suits this machine, else one that was built on this machine, now or at an
-        earlier start.
+        """Take the kernels of this process from a shared library: one of the package if it suits
+        this machine, else one that was built on this machine, now or at an earlier start.
 
         Return True if a library is used. Return False if there is no linker or no folder for the
         library, or if the build fails; Numba then compiles the kernels.
@@ -70,9 +69,9 @@ class KernelLibrary(NamedTuple):
 
 
 def _load_library(path: Path) -> bool:
-    """Take the kernels (compiled functions) of this process from the library at `path`, and return
-    True. If the operating system refuses to load the library, report the reason and return False.
-    Also return False if this Python has another layout of array objects than a library needs.
+    """Take the kernels of this process from the library at `path`, and return True. If the
+    operating system refuses to load the library, report the reason and return False. Also return
+    False if this Python has another layout of array objects than a library needs.
     """
     array = np.zeros(1)
     if ctypes.c_void_p.from_address(id(array) + DATA_OFFSET).value != array.ctypes.data:

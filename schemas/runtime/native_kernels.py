@@ -37,9 +37,7 @@ class OtherTypesError(TypeError):
 
 
 class Library:
-    """Shared library of kernels (compiled numerical functions); if `path` is None, the library
-    contains no functions.
-    """
+    """Shared library of kernels; if `path` is None, the library contains no functions."""
 
     def __init__(self, path: Path | None) -> None:
         # PyDLL keeps the interpreter lock (GIL) during a call; CDLL releases it.

@@ -19,9 +19,9 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToken]:
-    """Return the Zenoh liveliness tokens (signs that a process is alive) of services that are
-    active now and visible to this session. `root` is the first part of the tokens' Zenoh keys.
-    Another root selects another kind of tokens, such as those of standby services.
+    """Return the Zenoh liveliness tokens of services that are active now and visible to this
+    session. `root` is the first part of the tokens' Zenoh keys. Another root selects another kind
+    of tokens, such as those of standby services.
     """
     found = set[ServiceToken]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
@@ -32,8 +32,8 @@ def active_tokens(session: zenoh.Session, root: str = SERVES) -> set[ServiceToke
 
 
 class PresenceTracker:
-    """Set of the Zenoh liveliness tokens (signs that a process is alive) of services that are
-    active now, updated as tokens come and go.
+    """Set of the Zenoh liveliness tokens of services that are active now, updated as tokens come
+    and go.
     """
 
     def __init__(self) -> None:
@@ -44,31 +44,27 @@ class PresenceTracker:
 
     @property
     def active(self) -> set[ServiceToken]:
-        """Return the liveliness tokens (signs that a process is alive) of services that are active
-        now.
-        """
+        """Return the liveliness tokens of services that are active now."""
         with self._guard:
             return set(self._here)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
-        """Return the services' liveliness tokens (signs that a process is alive) that were active
-        earlier and are no longer active.
+        """Return the services' liveliness tokens that were active earlier and are no
+        longer active.
         """
         with self._guard:
             return set(self._withdrawn)
 
     @property
     def ever_lost(self) -> set[ServiceToken]:
-        """Return all services' liveliness tokens (signs that a process is alive) that were ever
-        lost; some may be active again.
-        """
+        """Return all services' liveliness tokens that were ever lost; some may be active again."""
         with self._guard:
             return set(self._fell)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
-        """Query the liveliness tokens (signs that a service is alive) that are active now. Return
-        the union of the queried tokens and the tracked tokens.
+        """Query the liveliness tokens that are active now. Return the union of the queried tokens
+        and the tracked tokens.
 
         Both sources are needed. A router's answer may lack a token that the router is just sending
         to the subscription of the same session. The subscription then delivers that token before
@@ -89,8 +85,8 @@ class PresenceTracker:
 
 @contextmanager
 def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
-    """Yield a tracker of the services' liveliness tokens (signs that a service is alive). It
-    contains the tokens that are active now, and follows changes until the `with` block ends.
+    """Yield a tracker of the services' liveliness tokens. It contains the tokens that are active
+    now, and follows changes until the `with` block ends.
     """
     tokens = PresenceTracker()
 

@@ -36,8 +36,8 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """Head of a batch (message with records): all fields of the message except its records, such as
-    the vehicle's name and the sequence number.
+    """Head of a batch: all fields of the message except its records, such as the vehicle's name and
+    the sequence number.
     """
 
     kind: Kind
@@ -61,7 +61,7 @@ class Heads(NamedTuple):
     estimator: list[str]
 
     def at(self, index: int) -> Head:
-        """Return the head (fields other than records) of the batch at position `index`."""
+        """Return the head of the batch at position `index`."""
         return Head(
             self.kind,
             self.vehicle[index],
@@ -73,9 +73,7 @@ class Heads(NamedTuple):
         )
 
     def take(self, kept: BoolArray) -> Heads:
-        """Return the heads (fields other than records) of the batches that the mask `kept` (k,)
-        selects.
-        """
+        """Return the heads of the batches that the mask `kept` (k,) selects."""
         return Heads(
             self.kind,
             list(compress(self.vehicle, kept)),
@@ -93,7 +91,7 @@ class Decoded(NamedTuple):
 
     Attributes:
         indices: for each batch, the index of the message from which it was decoded, (k,).
-        heads: heads (fields other than records) of the batches.
+        heads: head of each batch.
         sizes: number of records of each batch, (k,).
         columns: every column of the table for this kind of records, by name, (n,); the n records of
             all batches follow each other. `log_likelihood` is (n, 32).
@@ -142,8 +140,8 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
 
 
 def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
-    """Return the head (fields other than records) of a batch whose records are invalid, so that the
-    sender can be informed. Return None if the head cannot be read either.
+    """Return the head of a batch whose records are invalid, so that the sender can be informed.
+    Return None if the head cannot be read either.
     """
     try:
         found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
@@ -154,8 +152,8 @@ def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
 
 
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
-    """Decode the bytes of one batch (message with records). For the columns that were sent, this is
-    the inverse of `codec.encode`. Other columns are filled with defaults.
+    """Decode the bytes of one batch. For the columns that were sent, this is the inverse of
+    `codec.encode`. Other columns are filled with defaults.
 
     Raises:
         WireError: the payload is too large or not the expected message, a required column is
@@ -311,8 +309,8 @@ def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray)
 
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
-    """Return the heads (fields other than records) of the batches. If a head has no region, the
-    region of the batch's first record is used.
+    """Return the heads of the batches. If a head has no region, the region of the batch's first
+    record is used.
     """
     heads = found.heads
     region_missing = found.heads.region == 0

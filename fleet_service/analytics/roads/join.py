@@ -230,7 +230,7 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
 
 def _nearby_cells(marks: _Marks, side: float) -> IntArray:
     """Return the numbers (n,) of the cells that may lie on a road link: all cells within REACH_M
-    metres of a mark (point on a link), and some others.
+    metres of a mark, and some others.
     """
     x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
     wide = int(np.ceil(REACH_M / side))

@@ -104,7 +104,7 @@ def require_archive(root: Path) -> None:
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
     """Return two arrays (n,), computed from the times [ns] and cells of rows: the day (days since
-    1970) and the zone (map square of zoom 7) of each row.
+    1970) and the zone of each row.
     """
     return time // DAY_NS, grid.zone_of(cell)
 
@@ -120,8 +120,8 @@ def day_of(folder: Path) -> int:
 
 
 def partition_of(path: Path) -> Partition:
-    """Return the partition of a compacted (sorted) file: its day and its zone (map square of zoom
-    7). Both are read from the names of the folders in which the file lies.
+    """Return the partition of a compacted (sorted) file: its day and its zone. Both are read from
+    the names of the folders in which the file lies.
     """
     return Partition(
         day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q"))
@@ -132,8 +132,8 @@ def compacted_files(
     root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
 ) -> Iterator[Path]:
     """Yield the compacted (sorted) files of a kind (observations or states), sorted by date, zone
-    (map square of zoom 7) and age. Only days (since 1970) from `since_day` to `until_day`, both
-    included, are read; None means no limit.
+    and age. Only days (since 1970) from `since_day` to `until_day`, both included, are read; None
+    means no limit.
     """
     for folder in day_folders(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
@@ -155,8 +155,8 @@ def day_folders(
 
 
 def segment_name(prefix: str, number: int) -> str:
-    """Return the file name of a segment (file of new rows); `prefix` has the form SHARD-EPOCH: name
-    of the service, and number of its start.
+    """Return the file name of a segment; `prefix` has the form SHARD-EPOCH: name of the service,
+    and number of its start.
     """
     return f"{prefix}-{number:08d}.parquet"
 
@@ -172,8 +172,7 @@ def with_term(name: str, term: int) -> str:
 
 def compacted_name(name: str, term: int) -> str:
     """Return the name of a compacted (sorted) file. It is made from the name of the file's newest
-    segment (file of new rows) and the term (lease epoch) of the compacting service; the term is 0
-    without a lease.
+    segment and the term (lease epoch) of the compacting service; the term is 0 without a lease.
     """
     shard, epoch, number = name.rsplit("-", 2)
     return f"{with_term(shard, term)}-{epoch}-{number}"
@@ -194,9 +193,9 @@ def term_of(name: str) -> int | None:
 
 
 def age_key(name: str) -> tuple[int, int, str]:
-    """Return a sort key for the name of a segment (file of new rows) or of a compacted (sorted)
-    file. Sorting by the key gives the order from old to new. The key consists of the epoch (number
-    of the writer's start), the number of the segment, and the name of the service.
+    """Return a sort key for the name of a segment or of a compacted (sorted) file. Sorting by the
+    key gives the order from old to new. The key consists of the epoch (number of the writer's
+    start), the number of the segment, and the name of the service.
     """
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
     return int(epoch), int(number), shard

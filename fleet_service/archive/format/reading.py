@@ -59,9 +59,9 @@ class Wanted(NamedTuple):
     box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
-        """Return True if a file was written after the position `after` in the sequence of segments
-        (files of new rows). The file is a segment, or a compacted (sorted) file, which is named
-        after its newest segment.
+        """Return True if a file was written after the position `after` in the sequence of segments.
+        The file is a segment, or a compacted (sorted) file, which is named after its newest
+        segment.
         """
         return self.after is None or layout.age_key(path.name)[:2] > self.after
 
@@ -165,8 +165,8 @@ class Listing:
 
 
 def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
-    """Return those of the compacted (sorted) files in zones (map squares of zoom 7) that touch a
-    box [deg]; all files if the box is None.
+    """Return those of the compacted (sorted) files in zones that touch a box [deg]; all files if
+    the box is None.
     """
     if box is None or not files:
         return list(files)
@@ -198,8 +198,8 @@ def _read_inbox(
 
 
 def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
-    """Return, for each segment (file of new rows), the partitions whose rows from this segment are
-    already in compacted (sorted) files.
+    """Return, for each segment, the partitions whose rows from this segment are already in
+    compacted (sorted) files.
 
     A compacted file is named after its newest segment. Therefore files older than all given
     segments need not be opened.
@@ -232,8 +232,8 @@ def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Tabl
 
 
 def sources_of(path: Path) -> set[str]:
-    """Return the names of the segments (files of new rows) from which a compacted (sorted) file
-    contains rows; empty if the file is missing or damaged.
+    """Return the names of the segments from which a compacted (sorted) file contains rows; empty if
+    the file is missing or damaged.
 
     Raises:
         InputError: the file has a newer major version.

@@ -43,16 +43,14 @@ def segment_folder(root: Path, kind: Kind) -> Path:
 
 
 def list_segments(root: Path, kind: Kind) -> list[Path]:
-    """Return the segments (files of new rows) of a kind (observations or states), sorted from old
-    to new by epoch and number.
-    """
+    """Return the segments of a kind, sorted from old to new by epoch and number."""
     return sorted(
         segment_folder(root, kind).glob("*.parquet"), key=lambda path: layout.age_key(path.name)
     )
 
 
 class Writer:
-    """Writer of segments (files of new rows) during one run of one service.
+    """Writer of segments during one run of one service.
 
     Args:
         root: folder of the archive.
@@ -92,9 +90,7 @@ class Writer:
 
     @property
     def newest(self) -> layout.Cut:
-        """Return the position of the last written segment (file of new rows) in the sequence of all
-        segments.
-        """
+        """Return the position of the last written segment in the sequence of all segments."""
         return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
@@ -115,8 +111,8 @@ class Writer:
         return path
 
     def sync(self) -> None:
-        """Make the names of the written segments (files of new rows) durable. If this fails, call
-        it again; the segments need not be written again.
+        """Make the names of the written segments durable. If this fails, call it again; the
+        segments need not be written again.
 
         Raises:
             OSError: a folder cannot be synced.

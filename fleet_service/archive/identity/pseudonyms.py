@@ -123,7 +123,7 @@ def _read_key(path: Path) -> bytes:
 
     Raises:
         OSError: the key is damaged. With a wrong key all pseudonyms would differ, and every batch
-            (message with records) would be accepted again.
+            would be accepted again.
     """
     data = path.read_bytes()
     key = data[:KEY_BYTES]

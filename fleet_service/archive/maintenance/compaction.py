@@ -38,7 +38,7 @@ ROUND_ROWS: Final = 1_000_000
 
 class CompactionResult(NamedTuple):
     """Result of a compaction (move of new rows into sorted files): numbers of rows moved, of
-    segments (files of new rows) deleted, and of files added.
+    segments deleted, and of files added.
     """
 
     rows: int
@@ -116,10 +116,9 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Rest(NamedTuple):
-    """Segments (files of new rows) whose rows are not yet in compacted (sorted) files, oldest
-    first. `done` contains, for each segment, the partitions (date and map square) to which an
-    earlier, interrupted run already moved its rows. `term` is the lease term, a number in the names
-    of new files.
+    """Segments whose rows are not yet in compacted (sorted) files, oldest first. `done` contains,
+    for each segment, the partitions (date and map square) to which an earlier, interrupted run
+    already moved its rows. `term` is the lease term, a number in the names of new files.
     """
 
     root: Path
@@ -130,8 +129,8 @@ class _Rest(NamedTuple):
 
 
 def _compact_round(rest: _Rest, most: int) -> CompactionResult:
-    """Move the rows of the next segments (files of new rows) into compacted (sorted) files: about
-    `most` rows, but at least one segment.
+    """Move the rows of the next segments into compacted (sorted) files: about `most` rows, but at
+    least one segment.
     """
     sources: list[Path] = []
     tables: list[pa.Table] = []
@@ -162,7 +161,7 @@ def _compact_round(rest: _Rest, most: int) -> CompactionResult:
 
 
 def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
-    """Join tables from segments (files of new rows) of several format versions.
+    """Join tables from segments of several format versions.
 
     The result has the known columns, null where a segment does not have the column. Columns that
     only a newer version knows are added at the end, so that a downgrade loses no data.
@@ -192,8 +191,8 @@ def _place_files(
 
 
 def consecutive_runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Return runs of consecutive numbers of segments (files of new rows), each as (SHARD-EPOCH,
-    first number, last number). `names` are the names of the files in order of age.
+    """Return runs of consecutive numbers of segments, each as (SHARD-EPOCH, first number, last
+    number). `names` are the names of the files in order of age.
     """
     out: list[tuple[str, int, int]] = []
     for name in names:

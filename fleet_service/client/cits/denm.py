@@ -123,7 +123,7 @@ def encode_denm(denm: Denm) -> bytes:
 
 
 def decode_denm(data: bytes) -> Denm:
-    """Return the DENM (hazard message) that is encoded in `data`.
+    """Return the DENM that is encoded in `data`.
 
     Raises:
         InputError: the bytes are not a DENM.
@@ -155,9 +155,7 @@ def utc_of(its_ms: int) -> int:
 
 @cache
 def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
-    """Return a general encoder and decoder of DENM (hazard messages), compiled from the
-    specification `denm.asn`.
-    """
+    """Return a general encoder and decoder of DENM, compiled from the specification `denm.asn`."""
     try:
         import asn1tools
     except ImportError as error:
@@ -221,9 +219,9 @@ def _write_location(out: BitWriter, denm: Denm) -> None:
 
 
 def _encode_deltas(origin: Point, points: Iterable[Point]) -> list[int]:
-    """Return the offsets of points from `origin` in the encoding of a DENM (hazard message). Each
-    number contains the offsets to the north and to the east, and a height marked as unavailable.
-    Points too far away for the encoding are left out.
+    """Return the offsets of points from `origin` in the encoding of a DENM. Each number contains
+    the offsets to the north and to the east, and a height marked as unavailable. Points too far
+    away for the encoding are left out.
     """
     found = list[int]()
     height = 12_800 - LEAST["height"]

@@ -147,9 +147,9 @@ class EventBook:
         )
 
     def _common_fields(self, event: OpenEvent, now: int, termination: Termination | None) -> Denm:
-        """Return a DENM (hazard message) of an event. Only the fields that every message of an
-        event contains are set. Both the detection time and the reference time (the time of this
-        version of the message) are `now` [ns UTC].
+        """Return a DENM of an event. Only the fields that every message of an event contains are
+        set. Both the detection time and the reference time (the time of this version of the
+        message) are `now` [ns UTC].
         """
         return Denm(
             self.station,

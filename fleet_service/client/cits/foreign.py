@@ -80,7 +80,7 @@ def encode_reports(
 
 
 def _headings(denm: Denm) -> tuple[float, ...]:
-    """Return the headings [deg from north] of the traffic that a DENM (hazard message) concerns.
+    """Return the headings [deg from north] of the traffic that a DENM concerns.
 
     If the DENM states no heading, return both directions of the road. The direction of the road is
     estimated by the line between the event and another position in the message. This position is

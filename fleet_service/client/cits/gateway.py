@@ -41,8 +41,8 @@ class Sending(NamedTuple):
 
 
 class Receiving(NamedTuple):
-    """Settings for receiving DENM (hazard messages): address at the AMQP server, filter on the
-    messages, and the vehicle name under which reports are made from received DENM.
+    """Settings for receiving DENM: address at the AMQP server, filter on the messages, and the
+    vehicle name under which reports are made from received DENM.
     """
 
     source: str
@@ -51,8 +51,8 @@ class Receiving(NamedTuple):
 
 
 class Witness:
-    """Publisher that converts received DENM (hazard messages) to reports of one vehicle name and
-    publishes them on Zenoh.
+    """Publisher that converts received DENM to reports of one vehicle name and publishes them on
+    Zenoh.
 
     Attributes:
         refused: number of messages that are not a DENM.
@@ -74,9 +74,7 @@ class Witness:
         self._session.close()
 
     def publish_report(self, body: bytes, _: Mapping[str, Any]) -> None:
-        """Publish on Zenoh the report about friction that a received DENM (hazard message)
-        contains.
-        """
+        """Publish on Zenoh the report about friction that a received DENM contains."""
         try:
             batches = encode_reports(
                 decode_denm(body), self._name, self._boot, self._seq, self._clock()
@@ -98,7 +96,7 @@ def run_gateway(
     receiving: Receiving | None,
     stop: threading.Event,
 ) -> None:
-    """Send and receive DENM (hazard messages) until `stop` is set.
+    """Send and receive DENM until `stop` is set.
 
     Raises:
         InputError: no service answers, a package is missing, or the file `sending.state` is damaged

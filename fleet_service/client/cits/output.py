@@ -71,8 +71,8 @@ class DenmOutput:
         return time.monotonic() >= self._checked + CHECK_S
 
     def mark_accepted(self, name: str) -> None:
-        """Record that the interchange accepted the DENM (hazard message) with this name, so that it
-        is not sent again.
+        """Record that the interchange accepted the DENM with this name, so that it is not sent
+        again.
         """
         with self._lock:
             self._pending.pop(name, None)
@@ -80,7 +80,7 @@ class DenmOutput:
     def keep_up(
         self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]
     ) -> None:
-        """Send the DENM (hazard messages) that are due.
+        """Send the DENM that are due.
 
         Args:
             standing: every stretch of road with an active alert.
