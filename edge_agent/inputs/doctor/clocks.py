@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_agent.inputs.doctor.diagnosis import Diagnosis, Finding
 from edge_agent.inputs.doctor.identities import Fit
-from edge_agent.inputs.doctor.scales import CLOCK_CENTRE_S
+from edge_agent.inputs.doctor.scales import CLOCK_CENTRE_S, CLOCK_SETTLED, late_clocks
 from edge_agent.inputs.doctor.slip import measure_lags_twice
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
@@ -21,7 +21,7 @@ FILTER_BEARS_S: Final = 0.025
 LARGEST_LAG_S: Final = 0.085
 
 
-def wheels_speak_late(axle: Fit, seconds: float) -> bool:
+def _wheels_turn_late(axle: Fit, seconds: float) -> bool:
     """Return True if the wheels' yaw rate (computed from the wheel speeds) confirms that the wheel
     signals lag by `seconds`. `axle` is the fit of this yaw rate to the gyroscope's yaw rate. The
     lag found by the fit must have the same sign and be larger than half of `seconds`.
@@ -33,12 +33,34 @@ def wheels_speak_late(axle: Fit, seconds: float) -> bool:
     )
 
 
+def find_late_clocks(diagnosis: Diagnosis) -> bool:
+    """Look for a device whose clock is late, in the lags of the fitted identities. Add it to the
+    findings, or to the unknown channels if another explanation is nearly as good. Return True if
+    there is such a device.
+
+    In a slide, the wheels slow down before the car does. Therefore a late speed of the wheels
+    without a late yaw rate of the wheels is no fault of their clock.
+    """
+    late = late_clocks(diagnosis.fits)
+    if "wheels" in late and not _wheels_turn_late(diagnosis.fits["axle"], late["wheels"][0]):
+        return False
+    for device, (seconds, margin) in late.items():
+        if margin < CLOCK_SETTLED:
+            diagnosis.unknown.append(f"clock of the {device}")
+            continue
+        way = "late" if seconds > 0.0 else "early"
+        words = f"the clock of the {device} is {abs(seconds):.2f} s {way}"
+        diagnosis.findings.append(
+            Finding(device, "clock", words, delay_s=seconds, confidence=margin)
+        )
+    return bool(late)
+
+
 def measure_clocks(
     t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis
 ) -> None:
     """Measure the delays of wheel speeds and steering relative to the inertial unit, and store them
-    in the diagnosis. Add a finding (reported fault) to the diagnosis for each delay that is too
-    large.
+    in the diagnosis. Add a finding to the diagnosis for each delay that is too large.
     """
     diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     listed = late_devices(diagnosis)

@@ -57,3 +57,8 @@ class Diagnosis:
     def is_passed(self) -> bool:
         """Return True if the check found every channel to be free of faults."""
         return not self.findings and not self.unknown
+
+    def list_channel(self, channel: str, *, is_sound: bool) -> None:
+        """Add a channel to `sound`, or to `unknown` if `is_sound` is False."""
+        listed = self.sound if is_sound else self.unknown
+        listed.append(channel)

@@ -14,7 +14,8 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from edge_agent.inputs.doctor.findings import Diagnosis, diagnose
+from edge_agent.inputs.doctor.diagnosis import Diagnosis
+from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.units import DEG, SPEED
 from edge_agent.lab.simulation import SimulatedFleet
 from schemas.numeric import FloatArray
