@@ -29,7 +29,7 @@ LARGEST_FACTOR = math.exp(LARGEST_SCALE)
 @compiled
 def infer_step(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
     """Return the logarithm of the factor on the measurement noise R [nat] for a mismatch of the
-    variance of the innovations (measurement minus prediction) [1].
+    variance of the innovations [1].
 
     The result is the mean of `outputs` (5,), weighted by the memberships (degrees, 0 to 1) of the
     mismatch in triangular fuzzy sets with peaks `inputs` (5,). Each triangle ends at its
@@ -61,8 +61,8 @@ def adapted_factor(
 ) -> float:
     """Return the next factor on the measurement noise R: factor*exp(infer_step(actual/theoretical -
     1)), limited to [LEAST_FACTOR, LARGEST_FACTOR]. `factor` is the present factor. `actual` and
-    `theoretical` are variances of the innovations (measurement minus prediction). `inputs` (5,) are
-    the peaks of the fuzzy sets, and `outputs` (5,) the change of ln R for each set.
+    `theoretical` are variances of the innovations. `inputs` (5,) are the peaks of the fuzzy sets,
+    and `outputs` (5,) the change of ln R for each set.
     """
     limits = FactorLimits(1.0, LEAST_FACTOR, LARGEST_FACTOR)
     return adapted_within(factor, actual, theoretical, inputs, outputs, limits)

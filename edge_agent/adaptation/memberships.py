@@ -194,13 +194,13 @@ class Memberships:
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:
-        """Return the memberships (fuzzy sets) as a dictionary for a JSON file."""
+        """Return the memberships as a dictionary for a JSON file."""
         return {name: list(getattr(self, name)) for name in LENGTHS}
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """Read the memberships (fuzzy sets) from a parsed JSON document, and return them. If the
-        document has no rules, the untuned rules are used.
+        """Read the memberships from a parsed JSON document, and return them. If the document has no
+        rules, the untuned rules are used.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.

@@ -20,8 +20,8 @@ from schemas.runtime.jit import compiled
 
 @compiled
 def push_innovation(window: FloatArray, innovation: float) -> None:
-    """Insert the newest innovation (measurement minus prediction) at the front of the window (N,),
-    and drop the oldest innovation.
+    """Insert the newest innovation at the front of the window (N,), and drop the oldest
+    innovation.
     """
     for j in range(window.shape[0] - 1, 0, -1):
         window[j] = window[j - 1]
@@ -32,9 +32,8 @@ def push_innovation(window: FloatArray, innovation: float) -> None:
 def weighted_noise(
     window: FloatArray, predicted: float, nominal: float, least: float, largest: float
 ) -> float:
-    """Return the noise variance R of one measurement from its last innovations (measurement minus
-    prediction), `window` (N,), limited to [least, largest]*nominal. While the window is not full,
-    return `nominal`.
+    """Return the noise variance R of one measurement from its last innovations, `window` (N,),
+    limited to [least, largest]*nominal. While the window is not full, return `nominal`.
 
     `predicted` is the variance of the predicted measurement, without noise.
     """

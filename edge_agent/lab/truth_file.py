@@ -84,9 +84,7 @@ class TruthRecorder:
         return visit
 
     def write(self, path: Path) -> None:
-        """Write all recorded visits (passages of a map cell) as a Parquet file, including visits
-        that have not ended.
-        """
+        """Write all recorded visits as a Parquet file, including visits that have not ended."""
         visits = [visit for _, visit in self.rows]
         columns: dict[str, list[str] | list[int] | list[float]] = {
             "vehicle": [name for name, _ in self.rows],

@@ -199,9 +199,9 @@ class Fusion(BeliefMap):
         return self.store.untouched(before)
 
     def drop(self, dropped: BoolArray) -> IntArray:
-        """Delete the slots (one per cell and heading sector) that the mask `dropped` (size,)
-        selects; all must be `untouched` (not visited recently, and not referred to). Return the new
-        number of each slot, -1 for deleted ones.
+        """Delete the slots that the mask `dropped` (size,) selects; all must be `untouched` (not
+        visited recently, and not referred to). Return the new number of each slot, -1 for deleted
+        ones.
         """
         return self.store.drop(dropped)
 

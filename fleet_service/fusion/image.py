@@ -116,9 +116,8 @@ def image_of(fusion: Fusion) -> Image:
 
 
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
-    """Return the fusion (beliefs about all cells) that an image (tables of arrays) describes.
-    `lateness_s` [s] must be the allowed delay of observations in the fusion from which the image
-    was made.
+    """Return the fusion that an image (tables of arrays) describes. `lateness_s` [s] must be the
+    allowed delay of observations in the fusion from which the image was made.
     """
     fusion = Fusion(lateness_s)
     records = {

@@ -33,8 +33,8 @@ _BORDERS: Final = np.arange(-c.SPREAD_CELLS - 1, c.SPREAD_CELLS + 2)  # k ± 1 o
 def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:
-    """Return the other cells in which the vehicles of n visits (passages of a cell) may have been,
-    and the probability of each; both arrays are (n, 2·SPREAD_CELLS).
+    """Return the other cells in which the vehicles of n visits may have been, and the probability
+    of each; both arrays are (n, 2·SPREAD_CELLS).
 
     An item is -1 with probability 0 in three cases: the probability is below SPREAD_LEAST; the yaw
     angle or the standard deviation is unknown; or the other cell lies in another region, which
@@ -58,9 +58,9 @@ def other_cells(
 
 
 def cell_shares(std: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the probabilities π that a visit (passage of a cell) was in a cell behind or ahead of
-    the reported one, (n, 2·SPREAD_CELLS). `std` is the position's standard deviation and `length`
-    the cell length along the heading, both (n,) [m].
+    """Return the probabilities π that a visit was in a cell behind or ahead of the reported one,
+    (n, 2·SPREAD_CELLS). `std` is the position's standard deviation and `length` the cell length
+    along the heading, both (n,) [m].
     """
     ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
     integral = _cdf_integral(_BORDERS * ratio)

@@ -24,7 +24,7 @@ def stretch_slots(fusion: Fusion, slots: IntArray) -> IntArray:
 
 
 class StretchSources(NamedTuple):
-    """Reports of ice on the slippery stretches around k slots (one per cell and heading sector).
+    """Reports of ice on the slippery stretches around k slots.
 
     Attributes:
         second: time by which two vehicles had reported [ns], that is, of the newest report of a
@@ -38,9 +38,9 @@ class StretchSources(NamedTuple):
 
 
 def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> StretchSources:
-    """Return when two vehicles had reported ice on the slippery stretches of road around the slots
-    (one per cell and heading sector), and whether ice was reported on both sides. Only reports
-    after the times `since` (k,) [ns] count.
+    """Return when two vehicles had reported ice on the slippery stretches of road around the slots,
+    and whether ice was reported on both sides. Only reports after the times `since` (k,) [ns]
+    count.
     """
     who, when = _reports_of_ice(fusion, slots, since)
     first, middle, end = (SOURCES * place for place in (1, 1 + NEIGHBOURS, 1 + 2 * NEIGHBOURS))
@@ -53,7 +53,7 @@ def stretch_sources(fusion: Fusion, slots: IntArray, since: IntArray) -> Stretch
 
 def witnesses_of(fusion: Fusion, slot: int, since: int) -> list[int]:
     """Return the numbers of the vehicles that reported ice on the slippery stretch of road around a
-    slot (cell and heading sector) after `since` [ns].
+    slot after `since` [ns].
     """
     who, when = _reports_of_ice(fusion, np.array([slot]), np.array([since]))
     return [int(fusion.store.names["key"][index]) for index in np.unique(who[when > 0]).tolist()]

@@ -225,8 +225,8 @@ def unit_of(measure: str) -> str:
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
-    """Return all figures (named numbers) of the evaluation. Figures with a target come first. With
-    `quick`, figures with a target are left out if they were not measured.
+    """Return all figures of the evaluation. Figures with a target come first. With `quick`, figures
+    with a target are left out if they were not measured.
 
     Most other figures are named `KIND.SCENARIO.ESTIMATOR.MEASURE` and are means over several
     drives. A figure with the suffix `.sd` is the standard deviation over these drives.
@@ -256,9 +256,9 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
 
 
 def _consistency_figures(results: Results) -> list[Figure]:
-    """Return the figures (named numbers) on filter consistency: the bounds within which the means
-    of NEES and NIS (normalised squared errors and innovations) should lie, and for every estimator
-    the share of true frictions below each stated quantile.
+    """Return the figures on filter consistency: the bounds within which the means of NEES and NIS
+    (normalised squared errors and innovations) should lie, and for every estimator the share of
+    true frictions below each stated quantile.
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():

@@ -148,7 +148,7 @@ def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
 
 
 def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
-    """Return the estimates of motion and friction that an estimator bank (one filter per drive)
-    computes from the signals of the drives.
+    """Return the estimates of motion and friction that an estimator bank computes from the signals
+    of the drives.
     """
     return bank.advance(batch.t, batch.signals)

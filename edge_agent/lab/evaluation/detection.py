@@ -193,9 +193,9 @@ def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTall
 
 
 def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
-    """Evaluate all samples of the town, and add the results to the tally (sums of the evaluation):
-    coverage and interval score of the friction interval, false ice (a road with grip reported as
-    slippery), and false grip (lower end of the interval too far above the true friction).
+    """Evaluate all samples of the town, and add the results to the tally: coverage and interval
+    score of the friction interval, false ice (a road with grip reported as slippery), and false
+    grip (lower end of the interval too far above the true friction).
     """
     mu = drive.mu
     apart = ~drive.stood
@@ -282,7 +282,7 @@ def _add_seconds(tally: DetectionTally, key: str, activity: str, wait: float) ->
 def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
     """Count the slides of car n on slippery road, and among them the found slides. A slide is found
     if the estimator reports a slippery road during the slide or at most TOLD_AFTER_S [s] after it.
-    Add both counts to the tally (sums of the evaluation).
+    Add both counts to the tally.
     """
     beyond = drive.theta[:, n] > SLIDING
     for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
@@ -324,7 +324,7 @@ def _judge_contradictions(
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
     """Count false reports of slippery road by car n, at least SETTLED_S [s] after snow and ice, and
-    add the counts to the tally (sums of the evaluation).
+    add the counts to the tally.
 
     The reports of the estimator and of the slip flag (ordinary ABS logic) are counted separately.
     For the ROC curve, they are counted again with other limits. For the estimator, these are limits
@@ -410,17 +410,14 @@ class DetectionResults:
     towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
     def add(self, length: str, kind: str, town: TownTally) -> None:
-        """Add the results of a town (sums and counts), under the length of its drives and the kind
-        of its cars.
-        """
+        """Add the results of a town, under the length of its drives and the kind of its cars."""
         self.towns.setdefault((length, kind), []).append(town)
 
     def pool_towns(
         self, lengths: Sequence[str], kind: str, *, winter: bool | None = None
     ) -> DetectionTally:
-        """Return the sum of the tallies (sums and counts) of all towns with this kind of cars and
-        these lengths of drives. If `winter` is True or False, only winter towns or only other towns
-        are included.
+        """Return the sum of the tallies of all towns with this kind of cars and these lengths of
+        drives. If `winter` is True or False, only winter towns or only other towns are included.
         """
         found = DetectionTally()
         for length in lengths:

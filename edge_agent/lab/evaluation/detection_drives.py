@@ -39,8 +39,8 @@ Samples: TypeAlias = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class DetectionVisits:
-    """V published visits (passages of a map cell): index of the vehicle (V,), index of the first
-    and last sample (V,), log-likelihood ln L on the friction grid (V, 32).
+    """V published visits: index of the vehicle (V,), index of the first and last sample (V,),
+    log-likelihood ln L on the friction grid (V, 32).
     """
 
     vehicle: IntArray
@@ -67,7 +67,7 @@ class DetectionDrive:
         controlled: True while ABS, traction control or ESC acts; always False for cars without
             winter equipment.
         stood: True where ice or snow appeared under the standing car, until the car leaves it.
-        visits: the published visits (passages of a map cell).
+        visits: the published visits.
     """
 
     speed: Samples
@@ -91,7 +91,7 @@ class DetectionDrive:
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:
     """Simulate a fleet for `seconds` [s], estimate motion and friction from the cars' signals with
-    the estimator bank (one filter per car), and compute the cars' visits (passages of a map cell).
+    the estimator bank (one filter per car), and compute the cars' visits.
     """
     vehicles = fleet.vehicles
     config = AgentConfig()
@@ -222,9 +222,9 @@ def _samples_of(
 
 
 def _bytes_of(column: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Return the encoded likelihoods of V visits (passages of a map cell), (V, 32) bytes, from the
-    table column of the visits' likelihoods. If the estimator computes no likelihood of friction,
-    all bytes are zero, which encodes a flat likelihood.
+    """Return the encoded likelihoods of V visits, (V, 32) bytes, from the table column of the
+    visits' likelihoods. If the estimator computes no likelihood of friction, all bytes are zero,
+    which encodes a flat likelihood.
     """
     found = np.asarray(column, dtype=np.uint8)
     return found if found.shape[1] else np.zeros((len(found), mugrid.BINS), np.uint8)

@@ -77,8 +77,8 @@ LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
 class OracleSignals(NamedTuple):
-    """Data for the oracle (an ideal observer) from drives with sine steering while the speed rises
-    (paper 002): readings and true values (`batch`), and effects of the body's tilt.
+    """Data for the oracle from drives with sine steering while the speed rises (paper 002):
+    readings and true values (`batch`), and effects of the body's tilt.
 
     The body rolls with a lag after a_y, and pitches with a lag after a_x. `rolled` and `pitched`
     (T,) are a_y and a_x with this lag [m/s^2]. `felt` (T, 2) are the readings of a_x and a_y
@@ -92,8 +92,8 @@ class OracleSignals(NamedTuple):
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
-    """Return the RMSE of v_x [m/s] as estimated by the oracle (an ideal observer), one value per
-    seed. The drive is that of paper 002: sine steering while the speed rises from 20 to 25 m/s.
+    """Return the RMSE of v_x [m/s] as estimated by the oracle, one value per seed. The drive is
+    that of paper 002: sine steering while the speed rises from 20 to 25 m/s.
     """
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
@@ -159,8 +159,8 @@ def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-    """Return two arrays with one value per seed: the friction error of the oracle (an ideal
-    observer), and the error that the oracle itself expects.
+    """Return two arrays with one value per seed: the friction error of the oracle, and the error
+    that the oracle itself expects.
 
     The drive is an acceleration of .6 g on dry road (paper 003). At the end of the drive, the
     oracle's estimate of friction is the median of its posterior. The first array is the distance of

@@ -269,8 +269,8 @@ class RealWorldResults:
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
-    """Run towns whose cars have large sensor errors (as in real cars), and cars that stand on
-    slopes, for every estimator. The first town is stored for plots.
+    """Run towns whose cars have large sensor errors, and cars that stand on slopes, for every
+    estimator. The first town is stored for plots.
     """
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies = {name: Tally() for name in (*estimators, "baseline")}

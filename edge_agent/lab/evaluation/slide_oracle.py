@@ -64,9 +64,9 @@ def tyres_drawn() -> FloatArray:
 def visit_evidence(
     force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return the evidence that the oracle (an ideal observer) gets from a visit (passage of a map
-    cell): the log-likelihood ln L (BINS,) on the friction grid, with maximum 0. The function first
-    adds noise to the true values that it gets.
+    """Return the evidence that the oracle (an ideal observer) gets from a visit: the log-likelihood
+    ln L (BINS,) on the friction grid, with maximum 0. The function first adds noise to the true
+    values that it gets.
 
     Args:
         force: true force over load (T, 4) [1].

@@ -234,8 +234,8 @@ def figures(scores: Scores) -> list[Figure]:
 
 
 def barred_figures(scores: Scores) -> list[Figure]:
-    """Return all figures (named numbers) of the comparison of filter variants: first the ratios,
-    which have targets, then all others.
+    """Return all figures of the comparison of filter variants: first the ratios, which have
+    targets, then all others.
     """
     barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
     plain = [

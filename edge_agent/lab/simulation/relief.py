@@ -168,9 +168,7 @@ def level_relief(_seed: int) -> Relief:
 
 
 def rolling_relief(seed: int) -> Relief:
-    """Return a relief (slopes of the road surface) with two waves along the road, 300 and 120 m
-    long, whose slopes reach 3 %.
-    """
+    """Return a relief with two waves along the road, 300 and 120 m long, whose slopes reach 3 %."""
     key = key_of(seed, RELIEF_STREAM)
     return Relief(
         tuple(
@@ -180,8 +178,8 @@ def rolling_relief(seed: int) -> Relief:
 
 
 def stepped_relief(seed: int) -> Relief:
-    """Return a relief (slopes of the road surface) whose slope alternates between +4 % and -4 %
-    every 60 m, with kinks between.
+    """Return a relief whose slope alternates between +4 % and -4 % every 60 m, with kinks
+    between.
     """
     return Relief(
         (Wave(0.04, 120.0, 0.0, _random_turn(key_of(seed, RELIEF_STREAM), 0), stepped=True),)
@@ -189,9 +187,7 @@ def stepped_relief(seed: int) -> Relief:
 
 
 def banked_relief(_seed: int) -> Relief:
-    """Return a relief (slopes of the road surface) with a crossfall of 4 % and no longitudinal
-    slope.
-    """
+    """Return a relief with a crossfall of 4 % and no longitudinal slope."""
     return Relief(crossfall=0.04)
 
 
@@ -226,8 +222,8 @@ ROADS: Final[dict[str, Callable[[int], Relief]]] = {
 
 
 def road_named(name: str | Relief, seed: int, slope: float = 0.0) -> Relief:
-    """Return the relief (slopes of the road surface) called `name`, or the given relief, with a
-    constant `slope` [1] along the track added.
+    """Return the relief called `name`, or the given relief, with a constant `slope` [1] along the
+    track added.
 
     Raises:
         InputError: there is no relief with that name, or the slope is too steep.

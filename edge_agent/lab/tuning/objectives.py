@@ -126,8 +126,8 @@ class TuningSet:
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships (parameters of the fuzzy sets) on simulated drives. Interval score and
-    coverage are NaN if the true friction is unknown.
+    """Scores of memberships on simulated drives. Interval score and coverage are NaN if the true
+    friction is unknown.
     """
 
     interval_score: float  # less is better [1]
@@ -293,9 +293,9 @@ def _share(of: BoolArray, among: BoolArray) -> float:
 
 
 def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
-    """Return the objective called `name` as a function. The function takes a vector of memberships
-    (parameters of the fuzzy sets), and returns their score with `estimator` on `drives`. For an
-    invalid vector it returns the worst value, -infinity.
+    """Return the objective called `name` as a function. The function takes a vector of memberships,
+    and returns their score with `estimator` on `drives`. For an invalid vector it returns the worst
+    value, -infinity.
 
     Raises:
         InputError: there is no objective with that name.

@@ -88,7 +88,7 @@ def likelihood(sets: Sets, drive: LevelDrive) -> float:
 def mismatch(sets: Sets, drive: LevelDrive) -> float:
     """Run paper 004's filter with the given fuzzy sets on a drive. Return the tuning objective of
     the paper's equation (33): 1/(1 + |e|), where |e| is the mean absolute difference between actual
-    and theoretical variance of the innovations (measurement minus prediction).
+    and theoretical variance of the innovations.
     """
     batch = drive.batch
     filters = make_bank(batch.vehicles, sets, drive.setting)
@@ -162,8 +162,8 @@ def tune(
     seed: int,
     habits: Habits | None = None,
 ) -> PaperTuning:
-    """Tune the lower vertices (feet of the fuzzy sets) with the ant colony; the objective is
-    averaged over all noise levels."""
+    """Tune the lower vertices with the ant colony; the objective is averaged over all
+    noise levels."""
     score = OBJECTIVES[objective]
     laid: list[FloatArray] = []
 

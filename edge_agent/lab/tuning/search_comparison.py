@@ -151,7 +151,7 @@ def _mean(name: str, values: Sequence[float]) -> list[Figure]:
 
 def comparison_markdown(figures: Sequence[Figure]) -> str:
     """Return the report of the comparison of search methods as Markdown, computed only from its
-    figures (named numbers).
+    figures.
     """
     return (
         "# Search methods with equal budgets on the filter of paper 004\n\n"

@@ -173,8 +173,8 @@ def setting(condition: Condition) -> Setting:
 
 
 def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
-    """Return the scores of memberships (fuzzy sets) on the drives under the condition of the
-    measurement noise R called `name`.
+    """Return the scores of memberships on the drives under the condition of the measurement noise R
+    called `name`.
     """
     filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
@@ -214,9 +214,9 @@ def overall(memberships: Memberships, drives: StudySet) -> float:
 
 
 def memberships_of(vector: FloatArray) -> Memberships:
-    """Return the memberships (fuzzy sets) with the ten vertices (corners) in `vector`. All other
-    parameters keep their untuned values. Noise scales are not tuned either, because each condition
-    of the study fixes the measurement noise R.
+    """Return the memberships with the ten vertices (corners) in `vector`. All other parameters keep
+    their untuned values. Noise scales are not tuned either, because each condition of the study
+    fixes the measurement noise R.
     """
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
@@ -246,8 +246,8 @@ def search(
     seed: int,
     progress: Progress | None = None,
 ) -> Result:
-    """Search for the best vertices (corners of the fuzzy sets) by the method `way`, "random" or
-    "colony", and return the result. `seed` is the seed of the search.
+    """Search for the best vertices by the method `way`, "random" or "colony", and return the
+    result. `seed` is the seed of the search.
     """
     return WAYS[way](
         problem,

@@ -60,7 +60,7 @@ class Study:
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
-        """Return the memberships (fuzzy sets) found by each search of the kind `way`.
+        """Return the memberships found by each search of the kind `way`.
 
         `way` may also be a name in GIVEN, the table of fuzzy sets that need no search. The list
         then contains only the sets with this name.
@@ -70,8 +70,8 @@ class Study:
         return [memberships_of(result.best) for result in self.found[way]]
 
     def best(self, way: str) -> Memberships:
-        """Return the best memberships (fuzzy sets) found by the searches of the kind `way`, judged
-        by the objective on the drives of the search.
+        """Return the best memberships found by the searches of the kind `way`, judged by the
+        objective on the drives of the search.
 
         `way` may also be a name in GIVEN, the table of fuzzy sets that need no search. The result
         is then the sets with this name.
@@ -111,9 +111,9 @@ def run(
 
 
 def figures(done: Study) -> list[Figure]:
-    """Return the figures (named numbers) of the study for each kind of search. These are the scores
-    on held-out drives under each condition of the study (right or wrong measurement noise R), the
-    objective on search and held-out drives, and the progress of the searches.
+    """Return the figures of the study for each kind of search. These are the scores on held-out
+    drives under each condition of the study (right or wrong measurement noise R), the objective on
+    search and held-out drives, and the progress of the searches.
     """
     listed = []
     overalls: dict[str, list[float]] = {}
@@ -186,8 +186,8 @@ def markdown(listed: Sequence[Figure]) -> str:
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:
-    """Return the scores that are stored in the file of tuned memberships (fuzzy sets): one `Score`
-    for the drives of the search ("train"), and one for the held-out drives ("held_out").
+    """Return the scores that are stored in the file of tuned memberships: one `Score` for the
+    drives of the search ("train"), and one for the held-out drives ("held_out").
 
     The scores belong to the best memberships found by the kind of search `way`. Each score is the
     mean over all conditions of the study (CONDITIONS), for example a measurement noise R that is

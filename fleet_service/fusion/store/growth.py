@@ -74,7 +74,7 @@ def resize_pairs(state: State, places: int) -> State:
 
 def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State:
     """Return the fusion's state after records that can no longer change have been moved to compact
-    storage. A pair is the record of one vehicle in one slot (cell and heading sector).
+    storage. A pair is the record of one vehicle in one slot.
 
     If all observations of a pair are final, its reports move from the hash table `State.pairs` to
     the sorted arrays `State.settled`. Reports that are too old to have an effect at `now` [s] are
@@ -101,9 +101,9 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
 
 def rebuild_reporters(state: State, size: int, least: int) -> State:
     """Return the fusion's state without outdated lists of reporters. Each list belongs to one slot
-    (cell and heading sector) and contains the vehicles that recently reported there. A list is
-    deleted if its newest report is older than `least` [s] and all observations in its slot are
-    final. `size` is the number of slots in use.
+    and contains the vehicles that recently reported there. A list is deleted if its newest report
+    is older than `least` [s] and all observations in its slot are final. `size` is the number of
+    slots in use.
     """
     live = state.live
     cells = live.cells[:size]

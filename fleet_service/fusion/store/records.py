@@ -336,7 +336,7 @@ VEHICLE: Final = record_type(VehicleRecord)
 
 
 class Rows(NamedTuple):
-    """State of slots (one per cell and heading sector), in three arrays.
+    """State of slots, in three arrays.
 
     Attributes:
         belief: packed beliefs, (n, 32).

@@ -152,8 +152,8 @@ class Reproduction:
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:
-        """Return all figures (named numbers) of the reproduction: those of its tables first, then
-        the additional ones.
+        """Return all figures of the reproduction: those of its tables first, then the additional
+        ones.
         """
         listed = []
         for row in self.rows:
