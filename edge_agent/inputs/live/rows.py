@@ -21,10 +21,11 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.block import Block
+from edge_agent.inputs.channel_readings import make_channel, select_signals
 from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
 from edge_agent.inputs.log_columns import GROUND, fill_steering, remove_null_positions
-from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, make_channel, sample_at_rows
+from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, sample_at_rows
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
 from schemas.errors import InputError
@@ -144,7 +145,7 @@ class LiveRows:
         context = np.full((size, len(CONTEXT)), np.nan)
         self.ground = np.full(size, np.nan)
         fixes: dict[str, Series] = {}
-        for name, (place, channel) in found_in(recordings, self._profile).items():
+        for name, (place, channel) in select_signals(recordings, self._profile).items():
             # Position fixes have exact times. Other readings have times of arrival, which
             # `make_channel` smooths.
             sparse = name in SPARSE
@@ -179,24 +180,16 @@ class LiveRows:
         those that were already used for rows. `place` is the index of the source.
         """
         kept = self._readings[place]
-        fresh_ones = feed.take()
-        if "course" not in fresh_ones:
+        arrived = feed.take()
+        if "course" not in arrived:
             passed = oldest + KEPT_S - 1.0 / self.rate_hz
-            self.late += max(
-                (int((fresh.t < passed).sum()) for fresh in fresh_ones.values()), default=0
-            )
-        for name, fresh in fresh_ones.items():
-            before = kept.get(name)
-            t = fresh.t
-            values = fresh.values
-            if before is not None:
-                t = np.concatenate([before.t, t])
-                values = np.concatenate([before.values, values])
-            order = np.argsort(t, kind="stable")
-            kept[name] = Series(t[order], values[order], fresh.unit)
+            late = [int((series.t < passed).sum()) for series in arrived.values()]
+            self.late += max(late, default=0)
+        for name, series in arrived.items():
+            kept[name] = _join_series(kept.get(name), series)
         for name, series in list(kept.items()):
             first = int(np.searchsorted(series.t, oldest))
-            if name in self._context:
+            if name in self._context:  # its last reading before `oldest` may still be valid
                 first = max(min(first, int(np.searchsorted(series.t, oldest, side="right")) - 1), 0)
             if first == len(series.t):
                 del kept[name]
@@ -213,30 +206,21 @@ class LiveRows:
         speed = fixes.get(GROUND)
         course = fixes.get("yaw")
         for name, series in fixes.items():
-            fresh = (
-                (series.t > self._used[name])
-                & (series.t < t[-1] + half)
-                & np.isfinite(series.values)
-            )
-            fresh &= series.t > t[0] - OLDEST_FIX_S
-            times = series.t[fresh]
-            values = series.values[fresh]
+            is_fresh = (series.t > self._used[name]) & (series.t > t[0] - OLDEST_FIX_S)
+            is_usable = (series.t < t[-1] + half) & np.isfinite(series.values)
+            times = series.t[is_fresh & is_usable]
+            values = series.values[is_fresh & is_usable]
             if not len(times):
                 continue
             self._used[name] = float(times[-1])
-            v, yaw = (_readings_at(other, times) for other in (speed, course))
+            v = _readings_at(speed, times)
             if name == "yaw":
                 values = np.where(np.isnan(v) | (v > COURSE_SPEED), values, np.nan)
             elif name in ("latitude", "longitude") and speed is not None and course is not None:
-                late = np.maximum(t[0] - half - times, 0.0)
-                along = np.nan_to_num(
-                    v * late * (np.sin(yaw) if name == "latitude" else np.cos(yaw))
-                )
-                if name == "longitude":
-                    along /= math.cos(
-                        math.radians(float(np.mean(_readings_at(fixes.get("latitude"), times))))
-                    )
-                values = values + np.degrees(along / EARTH_RADIUS_M)
+                distance = v * np.maximum(t[0] - half - times, 0.0)
+                yaw = _readings_at(course, times)
+                latitude = float(np.mean(_readings_at(fixes.get("latitude"), times)))
+                values = values + _angle_moved(name, distance, yaw, latitude)
             rows = np.clip(np.searchsorted(t, times - half), 0, len(t) - 1)
             if name == GROUND:
                 self.ground[rows] = values
@@ -276,3 +260,24 @@ def _readings_at(series: Series | None, times: FloatArray) -> FloatArray:
         same = series.t[place] == times
         found[same] = series.values[place[same]]
     return found
+
+
+def _join_series(before: Series | None, fresh: Series) -> Series:
+    """Return the readings of two series of one signal in order of time."""
+    t = fresh.t
+    values = fresh.values
+    if before is not None:
+        t = np.concatenate([before.t, t])
+        values = np.concatenate([before.values, values])
+    order = np.argsort(t, kind="stable")
+    return Series(t[order], values[order], fresh.unit)
+
+
+def _angle_moved(name: str, distance: FloatArray, yaw: FloatArray, latitude: float) -> FloatArray:
+    """Return the change [deg] of latitude or longitude, as `name` says, after a `distance` (n,) [m]
+    in the direction `yaw` (n,) [rad]; 0 where one of them is NaN. `latitude` is in degrees.
+    """
+    along = np.nan_to_num(distance * (np.sin(yaw) if name == "latitude" else np.cos(yaw)))
+    if name == "longitude":
+        along /= math.cos(math.radians(latitude))
+    return np.degrees(along / EARTH_RADIUS_M)
