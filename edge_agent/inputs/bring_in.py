@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,47 +43,26 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
 
 
 def _read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
-    wanted = None if profile is None else profile.needed_signals()
+    _require_readable(path)
     suffix = path.suffix.lower()
-    if not path.exists():
-        raise InputError("source", f"{path} does not exist", "give the path of a recording")
-    if not path.is_file() and not path.is_dir():  # a pipe, for example, may never end
-        raise InputError("source", f"{path} is not a file", "write the recording to a file first")
     if rosbag.is_bag(path):
-        with rosbag.open_bag(path) as reader:
-            if rosbag.has_frames(reader):
-                return _decode_frames(
-                    lambda ids: rosbag.bag_frames(reader, path, ids), path, profile, database
-                )
-            return rosbag.read_bag(reader, path, wanted)
+        return _read_bag(path, profile, database)
     if suffix in mdf.SUFFIXES:
-        identifiers = (
-            None if database is None else {message.identifier for message in database.values()}
-        )
-        content = mdf.read_isolated(path, identifiers, wanted)
-        if content.recording is not None:
-            return content.recording
-        return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)
+        return _read_mdf(path, profile, database)
     if path.name.lower().startswith(RLOGS):
-        fix = "export CAN frames (candump) or a CSV with openpilot's LogReader"
         raise InputError(
-            "source", f"{path} is an openpilot log, which this command cannot read", fix
+            "source",
+            f"{path} is an openpilot log, which this command cannot read",
+            "export CAN frames (candump) or a CSV with openpilot's LogReader",
         )
-    if suffix == ".trc" and can_text.is_bare_trace(path):
-        return _decode_frames(lambda ids: can_text.trace_frames(path, ids), path, profile, database)
-    if suffix in can_log.SUFFIXES:
-        return _decode_frames(lambda ids: can_log.log_frames(path, ids), path, profile, database)
     if suffix in gnss.SUFFIXES:
         return gnss.read_gnss(path)
-    if suffix in racelogic.SUFFIXES:
+    if _is_vbo(path):
         return racelogic.read_vbo(path)
+    take_frames = _frame_reader(path)
+    if take_frames is not None:
+        return _decode_frames(take_frames, path, profile, database)
     if suffix in tabular.SUFFIXES:
-        if suffix != ".parquet" and racelogic.is_vbo(path):
-            return racelogic.read_vbo(path)
-        if suffix == ".csv" and can_text.is_gvret(path):
-            return _decode_frames(
-                lambda ids: can_text.gvret_frames(path, ids), path, profile, database
-            )
         time, unit = (profile.time, profile.time_unit) if profile else (None, None)
         return tabular.read_table(path, time, unit)
     known = sorted(
@@ -102,6 +82,51 @@ def _read_source(path: Path, profile: Profile | None, database: Database | None)
     )
 
 
+def _require_readable(path: Path) -> None:
+    """Raise an InputError if a path does not exist, or is neither a file nor a folder."""
+    if not path.exists():
+        raise InputError("source", f"{path} does not exist", "give the path of a recording")
+    if not path.is_file() and not path.is_dir():  # a pipe, for example, may never end
+        raise InputError("source", f"{path} is not a file", "write the recording to a file first")
+
+
+def _is_vbo(path: Path) -> bool:
+    """Return True for a VBO file, also if it has the suffix of a text table."""
+    suffix = path.suffix.lower()
+    may_be_text = suffix in tabular.SUFFIXES and suffix != ".parquet"
+    return suffix in racelogic.SUFFIXES or (may_be_text and racelogic.is_vbo(path))
+
+
+def _frame_reader(path: Path) -> can_log.Taker | None:
+    """Return the function that reads the CAN frames of a log; None if the file has no frames."""
+    suffix = path.suffix.lower()
+    if suffix == ".trc" and can_text.is_bare_trace(path):
+        return partial(can_text.trace_frames, path)
+    if suffix in can_log.SUFFIXES:
+        return partial(can_log.log_frames, path)
+    if suffix == ".csv" and can_text.is_gvret(path):
+        return partial(can_text.gvret_frames, path)
+    return None
+
+
+def _read_bag(path: Path, profile: Profile | None, database: Database | None) -> Recording:
+    with rosbag.open_bag(path) as reader:
+        if rosbag.has_frames(reader):
+            return _decode_frames(partial(rosbag.bag_frames, reader, path), path, profile, database)
+        return rosbag.read_bag(reader, path, None if profile is None else profile.needed_signals())
+
+
+def _read_mdf(path: Path, profile: Profile | None, database: Database | None) -> Recording:
+    identifiers = (
+        None if database is None else {message.identifier for message in database.values()}
+    )
+    wanted = None if profile is None else profile.needed_signals()
+    content = mdf.read_isolated(path, identifiers, wanted)
+    if content.recording is not None:
+        return content.recording
+    return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)
+
+
 def _decode_frames(
     frames: can_log.Taker, path: Path, profile: Profile | None, database: Database | None
 ) -> Recording:
@@ -111,11 +136,8 @@ def _decode_frames(
         f"{message.name}.{signal}" for message in database.values() for signal in message.signals
     }
     wanted = every if profile is None else profile.needed_signals()
-    buses = (
-        {c.message: c.bus for c in profile.channels.values() if c.message and c.bus is not None}
-        if profile
-        else {}
-    )
+    rules = list(profile.channels.values()) if profile else []
+    buses = {rule.message: rule.bus for rule in rules if rule.message and rule.bus is not None}
     with foreign_errors(path, "CAN log"):
         return can_log.decode_log(frames, path.name, database, wanted, buses)
 

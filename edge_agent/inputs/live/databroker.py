@@ -73,8 +73,10 @@ class DatabrokerFeed(Feed):
             )
             try:
                 for place, update in enumerate(self._call):
-                    self.openings += not place
-                    self._hear_update(update, standing=not place)
+                    is_first = place == 0  # the first update has the present values
+                    if is_first:
+                        self.openings += 1
+                    self._hear_update(update, standing=is_first)
                     if self.stopping.is_set():
                         return
             finally:

@@ -206,14 +206,16 @@ def _load_typestore(folder: Path | None) -> Any:  # noqa: ANN401
     typesys = import_optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     texts = {FRAME: CAN_FRAME}
-    for file in sorted(folder.glob("*/*.msg")) if folder else ():
-        texts[f"{file.parent.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
-    if folder and len(texts) == 1:
-        raise InputError(
-            "source",
-            f"{folder} contains no PACKAGE/NAME.msg",
-            "name a folder of message definitions",
-        )
+    if folder is not None:
+        files = sorted(folder.glob("*/*.msg"))
+        if not files:
+            raise InputError(
+                "source",
+                f"{folder} contains no PACKAGE/NAME.msg",
+                "name a folder of message definitions",
+            )
+        for file in files:
+            texts[f"{file.parent.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
     try:
         for kind, text in texts.items():
             store.register(typesys.get_types_from_msg(text, kind))

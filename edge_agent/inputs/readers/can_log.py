@@ -178,8 +178,9 @@ def _find_messages(log: Log, messages: list[CanMessage], buses: dict[str, int]) 
     likely = sorted(counts, key=lambda bus: (-counts[bus], bus))
     found: dict[str, Key] = {}
     for message in messages:
-        for bus in [buses[message.name]] if message.name in buses else likely:
-            if (key := (bus, message.identifier, message.extended)) in log:
-                found[message.name] = key
-                break
+        candidates = [buses[message.name]] if message.name in buses else likely
+        keys = [(bus, message.identifier, message.extended) for bus in candidates]
+        present = [key for key in keys if key in log]
+        if present:
+            found[message.name] = present[0]
     return found
