@@ -4,7 +4,7 @@ written into the profile (assignment of signals to channels) and into the vehicl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from edge_agent.inputs.doctor.clocks import FILTER_BEARS_S, late_devices
@@ -73,9 +73,7 @@ def apply_findings(
             name for name in OF_DEVICE.get(finding.channel, (finding.channel,)) if name in channels
         ]
         if finding.kind in EXCHANGED and names:
-            for one, other in EXCHANGED[finding.kind]:
-                if one in channels and other in channels:
-                    channels[one], channels[other] = channels[other], channels[one]
+            _exchange_channels(channels, EXCHANGED[finding.kind])
         elif finding.channel == "t" and finding.kind in ("ms", "us", "ns"):
             update["time_unit"] = finding.kind
         elif (finding.channel, finding.kind) == ("omega", "radius") and not at_rim:
@@ -92,6 +90,13 @@ def apply_findings(
     if profile.wheel_radius not in (None, vehicle.wheel_radius) and not at_rim:
         update["wheel_radius"] = vehicle.wheel_radius
     return profile.model_copy(update=update | {"channels": channels}), vehicle, left
+
+
+def _exchange_channels(channels: dict[str, Channel], pairs: Iterable[tuple[str, str]]) -> None:
+    """Exchange the rules of the channels of each pair, in place, if the profile has both."""
+    for one, other in pairs:
+        if one in channels and other in channels:
+            channels[one], channels[other] = channels[other], channels[one]
 
 
 def _correct_channel(channel: Channel, finding: Finding) -> Channel:

@@ -15,7 +15,7 @@ wheelbase, v_g speed over ground (see `drive`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -190,82 +190,83 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     right = sides.right
     # A speed is large all the time and shows a lag only when it changes. So compare derivatives.
     if level:
-        lag, lag_error = lag_of(
+        lag_s, lag_error_s = lag_of(
             np.gradient(smooth_twice(left, 1.0)), np.gradient(smooth_twice(right, 1.0)), moving
         )
     else:
-        lag, lag_error = lag_of(left, right, moving)
-    if np.isfinite(lag_error) and abs(lag) > 1.0 / RATE_HZ:
-        left = shift_series(left, -lag)
+        lag_s, lag_error_s = lag_of(left, right, moving)
+    if np.isfinite(lag_error_s) and abs(lag_s) > 1.0 / RATE_HZ:
+        left = shift_series(left, -lag_s)
     good = np.isfinite(left) & np.isfinite(right) & (moving > 0) & (grips > 0)
     for other in (*sides.beside, *(one for one in (sides.per, sides.bend) if one is not None)):
         good &= np.isfinite(other)
     if good.sum() < FEWEST_S * RATE_HZ:
         return NOTHING
-    x = right[good]
+    fit = _fit_level(left[good], right[good]) if level else _fit_changes(sides, left, good)
+    return replace(fit, lag_s=lag_s, lag_error_s=lag_error_s)
+
+
+def _fit_level(y: FloatArray, x: FloatArray) -> Fit:
+    """Fit y = gain · x without an offset to all n samples, (n,) each. The lag is not set."""
+    excited_s = len(x) / RATE_HZ
+    gain = _median_ratio(x, y)
+    spread = float(np.std(y - gain * x)) / max(abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12)
+    return Fit(
+        gain=gain,
+        offset=0.0,
+        correlation=max(correlate_series(x, y), 1.0 - spread),
+        error=spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003,
+        excited_s=excited_s,
+        lag_s=0.0,
+        lag_error_s=np.inf,
+        left=y,
+        right=x,
+        parts=_gains_of_parts(x, y, np.ones(len(x), bool)),
+    )
+
+
+def _fit_changes(sides: Relation, left: FloatArray, good: BoolArray) -> Fit:
+    """Fit left = gain · right + offset + Σ k · term to the samples of the mask `good` in which the
+    signals change enough. `left` is the left side after removal of the lag, which is not set.
+    """
+    x = sides.right[good]
     y = left[good]
-    if level:
-        excited = np.ones(len(x), bool)
-        excited_s = len(x) / RATE_HZ
-        gain = _median_ratio(x, y)
-        correlation = correlate_series(x, y)
-        spread = float(np.std(y - gain * x)) / max(
-            abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12
-        )
-        error = spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003
-        parts = _gains_of_parts(x, y, excited)
-        return Fit(
-            gain,
-            0.0,
-            max(correlation, 1.0 - spread),
-            error,
-            excited_s,
-            lag,
-            lag_error,
-            y,
-            x,
-            (),
-            parts,
-        )
     away = np.abs(x - find_median(x))
     excited = away > SLOW_SHARE * np.percentile(away, 95)
     excited_s = excited.sum() / RATE_HZ
     count = max(excited_s / CORRELATED_S, 1.0)
     constant = np.ones(len(x)) if sides.per is None else sides.per[good]
-    besides = [other[good] for other in sides.beside]
     bend = 0.0
-    unsure = 0.0
+    bend_error = 0.0
     if sides.bend is not None:
-        bend, unsure = _bend_of(x, y, constant, sides.bend[good], count)
+        bend, bend_error = _bend_of(x, y, constant, sides.bend[good], count)
         x = x * (1.0 + bend * sides.bend[good])
-    table = np.stack([x, constant, *besides], axis=1)
+    table = np.stack([x, constant, *(other[good] for other in sides.beside)], axis=1)
     solution, errors = _fit_with_priors(table, y, sides.loose, count)
     rest = y - table[:, 1:] @ solution[1:]
     correlation = correlate_series(x, rest)
-    slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
-    gain = (
-        float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope)))
-        if correlation
-        else 0.0
-    )
+    gain = 0.0
+    if correlation:
+        slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
+        gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope)))
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
-    found = tuple(float(k) for k in solution[2:])
+    beside = tuple(float(k) for k in solution[2:])
     if sides.bend is not None:
         per_square = find_median(sides.bend[good] / np.maximum(np.square(constant), 1e-12))
-        found = (gain * bend * per_square * sides.length,)
+        beside = (gain * bend * per_square * sides.length,)
     return Fit(
-        gain,
-        float(solution[1]),
-        correlation,
-        float(np.hypot(error, unsure)),
-        excited_s,
-        lag,
-        lag_error,
-        rest,
-        x,
-        found,
-        _gains_of_parts(x, rest, excited),
-        float(errors[1]),
+        gain=gain,
+        offset=float(solution[1]),
+        correlation=correlation,
+        error=float(np.hypot(error, bend_error)),
+        excited_s=excited_s,
+        lag_s=0.0,
+        lag_error_s=np.inf,
+        left=rest,
+        right=x,
+        beside=beside,
+        parts=_gains_of_parts(x, rest, excited),
+        offset_error=float(errors[1]),
     )
 
 
