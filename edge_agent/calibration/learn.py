@@ -17,7 +17,7 @@ Symbols: v speed, r yaw rate, δ steering angle, L wheelbase, a_x and a_y accele
 quantity that a drive does not excite enough is left out for that drive.
 
 At a single speed, steering gain and understeer have the same effect, so their regression needs a
-prior. The prior is the same for all cars, with mean SOUND and standard deviation USUAL. The
+prior. The prior is the same for all cars, with mean and standard deviation from ERRORS. The
 standard deviations of the regression include the uncertainty that remains.
 
 Wheels slip under force. The driven axle therefore turns faster, and the other one slower. The radii
@@ -26,19 +26,19 @@ air and rolling resistance.
 
 The value of a quantity is the median over the drives. Its standard deviation has two parts. The
 first is the median deviation between drives, divided by the square root of their number. That
-deviation is at least FLOOR, because few drives may agree by chance. The second is BIAS, the error
-common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). FLOOR and BIAS were set
-on 60 simulated cars with large errors, with other seeds than those of the published results.
+deviation is at least `floor`, because few drives may agree by chance. The second is `bias`, the
+error common to all drives (crossfall of 2.5 %, a nonlinear steering ratio, load). Both were set on
+60 simulated cars with large errors, with other seeds than those of the published results.
 
-Finally, the value is combined with the prior of SOUND and USUAL, unless its regression has already
-included this prior. A quantity with little excitation is therefore moved towards its usual value.
+Finally, the value is combined with the prior, unless its regression has already included this
+prior. A quantity with little excitation is therefore moved towards its usual value.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -55,51 +55,6 @@ CALM: Final = 0.7  # [m/s^2] longitudinal acceleration up to which wheels hardly
 PULLED: Final = 0.5  # [m/s^2] minimum acceleration at which torque shows its gain
 STRAIGHT: Final = 1.0  # [m/s^2] largest v·r on a straight
 LEAST_S: Final = 10.0  # [s] minimum duration of the usable moments
-# Minimum of the standard deviation between drives, in the unit of each quantity.
-FLOOR: Final = {
-    "radius": 0.0004,
-    "ax": 0.10,
-    "ay": 0.05,
-    "yaw_rate": 0.0015,
-    "steer_offset": 0.0006,
-    "steer_gain": 0.02,
-    "force_gain": 0.02,
-    "understeer": 0.0005,
-    "wheel_lag": 0.012,
-    "steer_lag": 0.012,
-}
-# Standard deviation of the error that all drives of a car have in common.
-BIAS: Final = {
-    "radius": 0.0001,
-    "ax": 0.02,
-    "ay": 0.25,
-    "yaw_rate": 0.0007,
-    "steer_offset": 0.0004,
-    "steer_gain": 0.02,
-    "force_gain": 0.008,
-    "understeer": 0.0002,
-    "wheel_lag": 0.006,
-    "steer_lag": 0.009,
-}
-# Standard deviation between cars (prior).
-USUAL: Final = {
-    "radius": 0.006,
-    "ax": 0.4,
-    "ay": 0.2,
-    "yaw_rate": 0.004,
-    "steer_offset": 0.005,
-    "steer_gain": 0.04,
-    "force_gain": 0.08,
-    "understeer": 0.001,
-    "wheel_lag": 0.04,
-    "steer_lag": 0.04,
-}
-# Mean over cars (prior); 0 for all other quantities.
-SOUND: Final = {
-    "steer_gain": 1.0,
-    "force_gain": 1.0,
-    "understeer": 0.0005,
-}
 STEERED_M_S: Final = 5.0  # [m/s] minimum speed at which the path shows the steering angle
 LINEAR: Final = 4.0  # [m/s^2] largest v·r at which understeer is proportional to it
 # [rad] minimum standard deviation of the steering angle from the regression. A steering ratio that
@@ -109,10 +64,33 @@ LEAST_ANGLE: Final = 0.003
 TRACED: Final = ("steer_offset", "steer_gain", "understeer")
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 ROBUST: Final = 1.4826
-UNKNOWN_SPLIT: Final = 0.003  # BIAS of the radii if the vehicle file does not name the driven axle
+UNKNOWN_SPLIT: Final = 0.003  # bias of the radii if the vehicle file does not name the driven axle
 DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 (air) · 0.3 (drag coefficient) · 2.2 m^2 (area)
 ROLLING: Final = 0.008  # [1] rolling resistance divided by load
 BRAKED_FRONT: Final = 0.7  # [1] share of the braking force at the front axle
+
+
+class ErrorStatistics(NamedTuple):
+    """Statistics of one quantity of the calibration, in its unit."""
+
+    floor: float  # minimum of the standard deviation between drives
+    bias: float  # standard deviation of the error that all drives of a car have in common
+    usual: float  # standard deviation between cars (prior)
+    mean: float = 0.0  # mean over cars (prior)
+
+
+ERRORS: Final = {
+    "radius": ErrorStatistics(floor=0.0004, bias=0.0001, usual=0.006),
+    "ax": ErrorStatistics(floor=0.10, bias=0.02, usual=0.4),
+    "ay": ErrorStatistics(floor=0.05, bias=0.25, usual=0.2),
+    "yaw_rate": ErrorStatistics(floor=0.0015, bias=0.0007, usual=0.004),
+    "steer_offset": ErrorStatistics(floor=0.0006, bias=0.0004, usual=0.005),
+    "steer_gain": ErrorStatistics(floor=0.02, bias=0.02, usual=0.04, mean=1.0),
+    "force_gain": ErrorStatistics(floor=0.02, bias=0.008, usual=0.08, mean=1.0),
+    "understeer": ErrorStatistics(floor=0.0005, bias=0.0002, usual=0.001, mean=0.0005),
+    "wheel_lag": ErrorStatistics(floor=0.012, bias=0.006, usual=0.04),
+    "steer_lag": ErrorStatistics(floor=0.012, bias=0.009, usual=0.04),
+}
 
 DriveEstimates: TypeAlias = dict[str, float]
 """Estimates of one drive, by the name of the quantity. The key QUANTITY_std has the standard
@@ -150,14 +128,16 @@ def weigh_estimates(drives: Sequence[DriveEstimates], vehicle: Vehicle) -> Calib
             estimates.setdefault(name, []).append(value)
     if not estimates:
         return None
-    bias = BIAS if vehicle.drive_split_front is not None else BIAS | {"radius": UNKNOWN_SPLIT}
+    errors = dict(ERRORS)
+    if vehicle.drive_split_front is None:
+        errors["radius"] = errors["radius"]._replace(bias=UNKNOWN_SPLIT)
     learned = {}
     for name, values in estimates.items():
         if name.endswith("_std"):
             continue
         kind = name.partition("_")[0] if name.startswith("radius") else name
         unknown = min(estimates.get(f"{name}_std", [0.0]))
-        learned[name] = _posterior_of(kind, np.array(values), bias[kind], unknown)
+        learned[name] = _posterior_of(errors[kind], np.array(values), unknown)
     return Calibration.model_validate({"drives": len(drives), **learned})
 
 
@@ -167,35 +147,34 @@ def surer_values(one: Calibration | None, other: Calibration | None) -> Calibrat
     """
     if one is None or other is None:
         return one or other
-    better = {
-        name: mine
-        for name in Calibration.model_fields
-        if isinstance(mine := getattr(one, name), tuple)
-        and ((its := getattr(other, name)) is None or mine[1] < its[1])
-    }
+    better = {}
+    for name in Calibration.model_fields.keys() - {"version", "drives"}:
+        first: tuple[float, float] | None = getattr(one, name)
+        second: tuple[float, float] | None = getattr(other, name)
+        if first is not None and (second is None or first[1] < second[1]):
+            better[name] = first
     return other.model_copy(update={**better, "drives": max(one.drives, other.drives)})
 
 
 def _posterior_of(
-    kind: str, values: FloatArray, bias: float, unknown: float
+    errors: ErrorStatistics, values: FloatArray, unknown: float
 ) -> tuple[float, float]:
-    """Return the posterior (mean, standard deviation) of a quantity of the calibration, called
-    `kind`, from its estimates in several drives, `values` (n,).
+    """Return the posterior (mean, standard deviation) of a quantity of the calibration from its
+    estimates in several drives, `values` (n,), and from the statistics of its errors.
 
-    `bias` is the standard deviation of errors common to all drives. `unknown` is the smallest
-    standard deviation that the steering regression reports for the quantity; 0 for quantities from
-    other methods. That regression already includes the prior. Therefore the median is moved towards
-    the prior mean only if `unknown` is 0.
+    `unknown` is the smallest standard deviation that the steering regression reports for the
+    quantity; 0 for quantities from other methods. That regression already includes the prior.
+    Therefore the median is moved towards the prior mean only if `unknown` is 0.
     """
-    sound = SOUND.get(kind, 0.0)
     centre = float(np.median(values))
     around = ROBUST * float(np.median(np.abs(values - centre)))
-    spread = max(around, FLOOR[kind] * (1.0 if len(values) > 2 else 2.0))
-    std = float(np.hypot(spread / np.sqrt(len(values)), bias))
-    share = USUAL[kind] ** 2 / (USUAL[kind] ** 2 + std**2)
+    spread = max(around, errors.floor * (1.0 if len(values) > 2 else 2.0))
+    std = float(np.hypot(spread / np.sqrt(len(values)), errors.bias))
+    share = errors.usual**2 / (errors.usual**2 + std**2)
     if unknown:
         return round(centre, 6), round(float(np.hypot(np.sqrt(share) * std, unknown)), 6)
-    return round(sound + share * (centre - sound), 6), round(float(np.sqrt(share)) * std, 6)
+    mean = errors.mean + share * (centre - errors.mean)
+    return round(mean, 6), round(float(np.sqrt(share)) * std, 6)
 
 
 def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
@@ -244,8 +223,8 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
     away = angle - table @ fit_robustly(table, angle)
     spread = max(ROBUST * float(np.median(np.abs(away))), LEAST_ANGLE)
     near = np.abs(away) <= 3.0 * spread
-    usual = np.array([USUAL[name] for name in TRACED])
-    centre = np.array([SOUND.get(name, 0.0) for name in TRACED])
+    usual = np.array([ERRORS[name].usual for name in TRACED])
+    centre = np.array([ERRORS[name].mean for name in TRACED])
     weight = 1.0 / (CORRELATED_S * RATE_HZ * spread**2)
     information = weight * (table[near].T @ table[near]) + np.diag(1.0 / usual**2)
     covariance = np.linalg.inv(information)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.calibration.learn import (
-    USUAL,
+    ERRORS,
     learn_calibration,
     one_drive,
     surer_values,
@@ -100,7 +100,7 @@ def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorde
     assert few.steer_gain is not None
     assert many.steer_gain is not None
     assert 1.0 < few.steer_gain[0] < many.steer_gain[0] < 1.2
-    assert few.steer_gain[1] < USUAL["steer_gain"]
+    assert few.steer_gain[1] < ERRORS["steer_gain"].usual
 
 
 def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
