@@ -116,7 +116,11 @@ def _run_command(
     running and would keep the process from ending.
     """
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
-    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.WARNING
+    level = logging.WARNING
+    if args.verbose:
+        level = logging.DEBUG
+    elif args.quiet:
+        level = logging.ERROR
     logging.basicConfig(
         level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )

@@ -40,27 +40,15 @@ def run(args: argparse.Namespace) -> int:
     """Learn a calibration, validate it on held-out drives, and write the vehicle file; return 0."""
     from edge_agent.app.output_path import prepare_path
     from edge_agent.calibration.held_out import learn_validated
-    from edge_agent.inputs.correct import scale_axles
-    from edge_agent.inputs.doctor.findings import diagnose
-    from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
     vehicle = load_vehicle(args.vehicle).model_copy(update={"calibration": None})
     out = prepare_path("out", args.out, args.log)
-    drives = []
     for path in args.log:
         if args.log.count(path) > 1:
             raise InputError("log", f"{path} is given twice", "give each drive once")
-        log = read_log(path)
-        signals = scale_axles(log.signals, vehicle)
-        faults = [] if args.trust else diagnose(log.t, signals, vehicle, log.ground).findings
-        if faults:
-            names = ", ".join(f"{fault.channel} {fault.kind}" for fault in faults)
-            raise InputError(
-                "log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it"
-            )
-        drives.append((log.t, signals))
+    drives = [_read_drive(path, vehicle, trusted=args.trust) for path in args.log]
     alike = vehicle.model_copy(update={"wheel_radius_front": None, "wheel_radius_rear": None})
     found = learn_validated(drives, alike, predict_drive)
     text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
@@ -70,6 +58,26 @@ def run(args: argparse.Namespace) -> int:
     print("\n".join(report_lines(found)))
     print(f"{out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
     return 0
+
+
+def _read_drive(path: Path, vehicle: Vehicle, *, trusted: bool) -> Drive:
+    """Return the times and signals of a log. Raise an InputError if the signal doctor finds a fault
+    in it, unless the user trusts it.
+    """
+    from edge_agent.inputs.correct import scale_axles
+    from edge_agent.inputs.doctor.findings import diagnose
+    from edge_agent.inputs.signal_log import read_log
+    from schemas.errors import InputError
+
+    log = read_log(path)
+    signals = scale_axles(log.signals, vehicle)
+    faults = [] if trusted else diagnose(log.t, signals, vehicle, log.ground).findings
+    if faults:
+        names = ", ".join(f"{fault.channel} {fault.kind}" for fault in faults)
+        raise InputError(
+            "log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it"
+        )
+    return log.t, signals
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 from edge_agent.cli.options import add_json
 
 if TYPE_CHECKING:
+    from edge_agent.inputs.doctor.diagnosis import Diagnosis
     from edge_agent.inputs.signal_log import SignalLog
+    from schemas.vehicle import Vehicle
 
 NOT_PASSED = 1
 FLAG_ROWS = 1000  # number of samples between two checks of the controller flags
@@ -41,64 +43,71 @@ def run(args: argparse.Namespace) -> int:
     """
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.output_path import prepare_path
-    from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
-    from edge_agent.inputs.doctor.fix import apply_findings, list_corrections
-    from edge_agent.inputs.doctor.report import (
-        publishing_advice,
-        report_document,
-        report_lines,
-        report_page,
-    )
+    from edge_agent.inputs.doctor.report import report_page
     from edge_agent.inputs.signal_log import read_log, require_log
     from schemas.vehicle import load_vehicle
 
     require_log(args.log)
-    file = args.vehicle or vehicle_file_of(args.log)
-    vehicle = load_vehicle(file)
+    vehicle_file = args.vehicle or vehicle_file_of(args.log)
+    vehicle = load_vehicle(vehicle_file)
     log = read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
-    doubts = _doubted_flags(log)
-    if args.json:
-        print(
-            json.dumps(
-                {"log": str(args.log), **report_document(diagnosis), "doubted_flags": doubts},
-                allow_nan=False,
-            )
-        )
-    else:
-        flags = [
-            f"{'no weight':<10}{name} {reason}: it is treated as unknown"
-            for name, reason in doubts.items()
-        ]
-        print(
-            "\n".join(
-                [*report_lines(diagnosis), *flags, f"{args.log}: {publishing_advice(diagnosis)}"]
-            )
-        )
+    _print_report(args, diagnosis, _doubted_flags(log))
     if args.out is not None:
-        prepare_path("out", args.out, (args.log, file)).write_text(
+        prepare_path("out", args.out, (args.log, vehicle_file)).write_text(
             report_page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
         )
-    mended = list_corrections(diagnosis)
-    if args.fix is not None and mended:
-        profile, corrected, left = apply_findings(mended, profile_of(args.log), vehicle)
-        prepare_path("fix", args.fix, (args.log, file)).write_text(
-            profile.to_json(), encoding="utf-8"
-        )
-        if corrected != vehicle:
-            prepare_path("vehicle", file).write_text(
-                corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
-            )
-        for finding in left:
-            _print_stderr(
-                f"not corrected: {finding.channel} {finding.kind}: its recording must be decoded "
-                "in another way"
-            )
-        _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
-    elif args.fix is not None:
-        _print_stderr(f"{args.fix}: not written: there is nothing to correct")
+    if args.fix is not None:
+        _write_corrections(args, diagnosis, vehicle, vehicle_file)
     return 0 if diagnosis.is_passed else NOT_PASSED
+
+
+def _print_report(
+    args: argparse.Namespace, diagnosis: Diagnosis, doubted_flags: dict[str, str]
+) -> None:
+    from edge_agent.inputs.doctor.report import publishing_advice, report_document, report_lines
+
+    if args.json:
+        document = {"log": str(args.log), **report_document(diagnosis)}
+        print(json.dumps({**document, "doubted_flags": doubted_flags}, allow_nan=False))
+        return
+    flags = [
+        f"{'no weight':<10}{name} {reason}: it is treated as unknown"
+        for name, reason in doubted_flags.items()
+    ]
+    advice = f"{args.log}: {publishing_advice(diagnosis)}"
+    print("\n".join([*report_lines(diagnosis), *flags, advice]))
+
+
+def _write_corrections(
+    args: argparse.Namespace, diagnosis: Diagnosis, vehicle: Vehicle, vehicle_file: Path
+) -> None:
+    """Write the corrected profile and, if it changes, the vehicle file. Report the faults that
+    cannot be corrected in either of them.
+    """
+    from edge_agent.app.output_path import prepare_path
+    from edge_agent.inputs.bring_in import profile_of
+    from edge_agent.inputs.doctor.fix import apply_findings, list_corrections
+
+    corrections = list_corrections(diagnosis)
+    if not corrections:
+        _print_stderr(f"{args.fix}: not written: there is nothing to correct")
+        return
+    profile, corrected, left = apply_findings(corrections, profile_of(args.log), vehicle)
+    prepare_path("fix", args.fix, (args.log, vehicle_file)).write_text(
+        profile.to_json(), encoding="utf-8"
+    )
+    if corrected != vehicle:
+        prepare_path("vehicle", vehicle_file).write_text(
+            corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
+        )
+    for finding in left:
+        _print_stderr(
+            f"not corrected: {finding.channel} {finding.kind}: its recording must be decoded in "
+            "another way"
+        )
+    _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
 
 
 def _doubted_flags(log: SignalLog) -> dict[str, str]:

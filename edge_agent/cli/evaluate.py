@@ -6,10 +6,14 @@ import argparse
 import importlib.util
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from schemas.runtime.figures import Figure
 
 LEAST_SEEDS: Final = 20  # a campaign with fewer seeds does not count for the bars (targets)
 QUICK_SEEDS: Final = 2
@@ -68,22 +72,15 @@ def run(args: argparse.Namespace) -> int:
         InputError: there are too few seeds, the folder cannot be created, or matplotlib is not
             installed.
     """
-    from edge_agent.lab.evaluation.bars import figures as figures_of
-    from edge_agent.lab.evaluation.campaign import run_campaign as campaign
-    from edge_agent.lab.evaluation.report import report
-    from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import write
-
-    count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
+    count = args.seeds
+    if count is None:
+        count = QUICK_SEEDS if args.quick else LEAST_SEEDS
     if count < 2:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
     if args.paper and args.only:
         raise InputError("paper", f"not with --only {args.only}", "leave one of them out")
-    if (
-        not args.no_plots
-        and args.only in (None, "detection")
-        and importlib.util.find_spec("matplotlib") is None
-    ):
+    draws = args.only in (None, "detection") and not args.no_plots
+    if draws and importlib.util.find_spec("matplotlib") is None:
         raise InputError(
             "plots", "matplotlib is not installed", "install gripmap[analytics], or give --no-plots"
         )
@@ -95,23 +92,26 @@ def run(args: argparse.Namespace) -> int:
         ) from error
     if args.paper:
         return _evaluate_paper(args, count)
-    if args.only == "searches":
-        return _evaluate_searches(args, count)
-    if args.only == "worth":
-        return _evaluate_worth(args, count)
-    if args.only == "detection":
-        return _evaluate_detection(args, count)
     if args.only == "real":
         return _evaluate_real_logs(args)
-    began = time.monotonic()
+    evaluations = {
+        None: _evaluate_estimators,
+        "searches": _evaluate_searches,
+        "worth": _evaluate_worth,
+        "detection": _evaluate_detection,
+    }
+    return evaluations[args.only](args, count)
+
+
+def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.evaluation.bars import figures as figures_of
+    from edge_agent.lab.evaluation.campaign import run_campaign
+    from edge_agent.lab.evaluation.report import report
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import write
+
     seeds = range(FIGURES, FIGURES + count)
-    results = campaign(
-        seeds,
-        quick=args.quick,
-        log_line=lambda line: print(
-            f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True
-        ),
-    )
+    results = run_campaign(seeds, quick=args.quick, log_line=_timed_printer())
     figures = figures_of(results, quick=args.quick)
     name = "edge-agent evaluate" + (" --quick" if args.quick else "")
     write(args.out / "figures.json", name, list(seeds), figures)
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
         draw(results, figures, args.out, seed=seeds[0], form=args.plots)
     print(text.partition("## The papers' figures")[0].rstrip())
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return 0 if _all_hold(figures) else 1
 
 
 def _evaluate_paper(args: argparse.Namespace, count: int) -> int:
@@ -143,14 +143,12 @@ def _evaluate_searches(args: argparse.Namespace, count: int) -> int:
     from schemas.runtime.figures import write
 
     seeds = range(FIGURES, FIGURES + count)
-    figures = compare_searches(
-        seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True)
-    )
+    figures = compare_searches(seeds, quick=args.quick, log_line=_print_progress)
     write(args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures)
     text = comparison_markdown(figures)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return 0 if _all_hold(figures) else 1
 
 
 def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
@@ -159,9 +157,7 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     from schemas.runtime.figures import markdown, write
 
     seeds = range(FIGURES, FIGURES + count)
-    scores = worth.campaign(
-        seeds, quick=args.quick, log_line=lambda line: print(line, file=sys.stderr, flush=True)
-    )
+    scores = worth.campaign(seeds, quick=args.quick, log_line=_print_progress)
     figures = worth.barred_figures(scores)
     part = " --quick" if args.quick else ""
     measured = list(seeds)[: len(scores["fuzzy"]["all"])]
@@ -170,7 +166,7 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     text = f"# Benefit of the fuzzy sets and of the ant colony\n\n{table}\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return 0 if _all_hold(figures) else 1
 
 
 def _evaluate_real_logs(args: argparse.Namespace) -> int:
@@ -183,13 +179,13 @@ def _evaluate_real_logs(args: argparse.Namespace) -> int:
             "is missing",
             "name the folder of logs, each next to its vehicle file: --logs DIR",
         )
-    found = judge_folder(args.logs, lambda line: print(line, file=sys.stderr, flush=True))
+    found = judge_folder(args.logs, _print_progress)
     figures = summarise(found)
     write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
     text = f"# Real cars\n\n{table(found)}\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return 0 if _all_hold(figures) else 1
 
 
 def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
@@ -199,15 +195,8 @@ def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write
 
-    began = time.monotonic()
     seeds = range(FIGURES, FIGURES + count)
-    results = campaign(
-        seeds,
-        lambda line: print(
-            f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True
-        ),
-        quick=args.quick,
-    )
+    results = campaign(seeds, _timed_printer(), quick=args.quick)
     figures = detection_figures(results)
     part = " --quick" if args.quick else ""
     write(
@@ -223,4 +212,18 @@ def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
 
         draw_detection(figures, args.out / f"detection.{args.plots}")
     print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return 0 if _all_hold(figures) else 1
+
+
+def _all_hold(figures: Sequence[Figure]) -> bool:
+    return all(figure.holds for figure in figures if figure.bar is not None)
+
+
+def _print_progress(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _timed_printer() -> Callable[[str], None]:
+    """Return a function that prints a line of progress with the time since now [s]."""
+    began = time.monotonic()
+    return lambda line: _print_progress(f"{time.monotonic() - began:6.1f} s  {line}")

@@ -6,11 +6,20 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_json, print_list
+from schemas.errors import InputError
 from schemas.runtime import commandline
+
+if TYPE_CHECKING:
+    from edge_agent.inputs.merge import Merged
+    from edge_agent.inputs.profile import Profile
+    from edge_agent.inputs.recording import Recording
+    from schemas.vehicle import Vehicle
 
 MOST_NAMES = 30  # maximum number of signal names in an error message
 
@@ -52,15 +61,10 @@ def run(args: argparse.Namespace) -> int:
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import read_source, write_log
-    from edge_agent.inputs.doctor.adopt import align_import
-    from edge_agent.inputs.log_columns import FRONT_STEERING, NEEDED
     from edge_agent.inputs.memory import bounded_memory
-    from edge_agent.inputs.merge import merge_recordings
-    from edge_agent.inputs.names import draft_profile
     from edge_agent.inputs.profile import load_profile, shipped_profiles
     from edge_agent.inputs.readers.dbc import database_of
     from edge_agent.inputs.signal_log import require_no_estimates
-    from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
     if args.list:
@@ -68,6 +72,36 @@ def run(args: argparse.Namespace) -> int:
             {name: load_profile(name)[0].about for name in shipped_profiles()}, as_json=args.json
         )
         return 0
+    _check_paths(args)
+    shifts = _parse_shifts(args.clock)
+    out = prepare_path("out", args.out)
+    profile, folder = load_profile(args.profile) if args.profile else (None, Path())
+    vehicle = load_vehicle(args.vehicle) if args.vehicle else None
+    database = database_of(profile, folder, args.dbc)
+    recordings = [read_source(path, profile, database) for path in args.source]
+    _check_shifts(shifts, recordings)
+    for path, recording in zip(args.source, recordings, strict=True):
+        require_no_estimates(path, recording.signals)
+    if profile is None:
+        profile = _write_draft(recordings, out, args.draft or out.with_suffix(".profile.json"))
+    with bounded_memory(args.source[0]):  # a clock that jumps by years gives too many rows
+        merged, profile = _merge(recordings, profile, vehicle, shifts)
+    write_log(out, merged, profile, [source.name for source in args.source])
+    for note in merged.notes:
+        print(f"note: {note}")
+    lacking = _lacking_channels(merged.columns)
+    if lacking:
+        print(
+            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
+            "profile"
+        )
+    print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
+    has_none = len(lacking) == len(_lacking_channels(()))
+    return commandline.FAILED if has_none else 0
+
+
+def _check_paths(args: argparse.Namespace) -> None:
+    """Raise an InputError if a path is missing, or an output would overwrite another file."""
     if not args.source or args.out is None:
         raise InputError(
             "source", "sources and --out are needed", "name recordings, and the log to write"
@@ -78,73 +112,84 @@ def run(args: argparse.Namespace) -> int:
     used[args.out.resolve()] = "the signal log"
     if args.draft and (taken := used.get(args.draft.resolve())):
         raise InputError("draft", f"{args.draft} is {taken}", "name another file")
-    shifts = _parse_shifts(args.clock)
-    out = prepare_path("out", args.out)
-    profile, folder = load_profile(args.profile) if args.profile else (None, Path())
-    vehicle = load_vehicle(args.vehicle) if args.vehicle else None
-    database = database_of(profile, folder, args.dbc)
-    recordings = [read_source(path, profile, database) for path in args.source]
-    names = [one.name for one in recordings]
-    if unknown := [name for name in shifts if name not in names]:
+
+
+def _check_shifts(shifts: Iterable[str], recordings: Sequence[Recording]) -> None:
+    """Raise an InputError if a time shift belongs to none of the recordings."""
+    names = [recording.name for recording in recordings]
+    for name in shifts:
+        if name not in names:
+            raise InputError(
+                "clock", f"{name} is not one of the recordings", f"use {', '.join(names)}"
+            )
+
+
+def _write_draft(recordings: Sequence[Recording], out: Path, target: Path) -> Profile:
+    """Draft a profile for the recordings from the names of their signals, write it to `target`, and
+    return it. `out` is the signal log to write.
+    """
+    from edge_agent.app.output_path import prepare_path
+    from edge_agent.inputs.names import draft_profile
+
+    units = {
+        name: series.unit
+        for recording in reversed(recordings)
+        for name, series in recording.signals.items()
+    }
+    profile = draft_profile(units, out.stem)
+    if not profile.channels:
+        seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
         raise InputError(
-            "clock", f"{unknown[0]} is not one of the recordings", f"use {', '.join(names)}"
+            "source",
+            f"no signal has a known name; names in the file: {seen}",
+            "write a profile that names them",
         )
-    for path, recording in zip(args.source, recordings, strict=True):
-        require_no_estimates(path, recording.signals)
-    if profile is None:
-        units = {
-            name: series.unit
-            for one in reversed(recordings)
-            for name, series in one.signals.items()
-        }
-        profile = draft_profile(units, args.out.stem)
-        if not profile.channels:
-            seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
-            raise InputError(
-                "source",
-                f"no signal has a known name; names in the file: {seen}",
-                "write a profile that names them",
-            )
-        target = prepare_path("draft", args.draft or out.with_suffix(".profile.json"))
-        if target.exists() and target.read_bytes() != profile.to_json().encode():
-            raise InputError(
-                "draft",
-                f"{target} exists and may have been edited",
-                "use it with --profile, or name another file with --draft",
-            )
-        target.write_text(profile.to_json(), encoding="utf-8")
-        print(
-            f"{target}: drafted from names, {len(profile.channels)} channels; check it before use"
+    prepare_path("draft", target)
+    if target.exists() and target.read_bytes() != profile.to_json().encode():
+        raise InputError(
+            "draft",
+            f"{target} exists and may have been edited",
+            "use it with --profile, or name another file with --draft",
         )
+    target.write_text(profile.to_json(), encoding="utf-8")
+    print(f"{target}: drafted from names, {len(profile.channels)} channels; check it before use")
+    return profile
+
+
+def _merge(
+    recordings: Sequence[Recording],
+    profile: Profile,
+    vehicle: Vehicle | None,
+    shifts: Mapping[str, float],
+) -> tuple[Merged, Profile]:
+    """Return the merged signal log and its profile. With a vehicle, the delays that the signal
+    doctor measures are corrected in both.
+    """
+    from edge_agent.inputs.doctor.adopt import align_import
+    from edge_agent.inputs.merge import merge_recordings
+
+    if vehicle is None:
+        return merge_recordings(recordings, profile, shifts=shifts), profile
     merge_with = partial(
         merge_recordings,
         recordings,
-        wheel_radius=vehicle.wheel_radius if vehicle else None,
-        steering_ratio=vehicle.steering_ratio if vehicle else None,
+        wheel_radius=vehicle.wheel_radius,
+        steering_ratio=vehicle.steering_ratio,
         shifts=shifts,
     )
-    with bounded_memory(args.source[0]):  # a clock that jumps by years gives too many rows
-        merged = merge_with(profile)
-        if vehicle is not None:
-            merged, profile = align_import(merged, profile, vehicle, merge_with)
-    write_log(out, merged, profile, [source.name for source in args.source])
-    for note in merged.notes:
-        print(f"note: {note}")
-    lacking = [name for name in NEEDED if name not in merged.columns]
-    steered = any(name in merged.columns for name in FRONT_STEERING)
-    lacking += [] if steered else [FRONT_STEERING[0]]
-    if lacking:
-        print(
-            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
-            "profile"
-        )
-    print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
-    return commandline.FAILED if len(lacking) > len(NEEDED) else 0
+    return align_import(merge_with(profile), profile, vehicle, merge_with)
+
+
+def _lacking_channels(columns: Collection[str]) -> list[str]:
+    """Return the channels that the estimators need and that are not among `columns`."""
+    from edge_agent.inputs.log_columns import FRONT_STEERING, NEEDED
+
+    lacking = [name for name in NEEDED if name not in columns]
+    is_steered = any(name in columns for name in FRONT_STEERING)
+    return lacking if is_steered else [*lacking, FRONT_STEERING[0]]
 
 
 def _parse_shifts(given: list[str]) -> dict[str, float]:
-    from schemas.errors import InputError
-
     shifts = {}
     for text in given:
         name, _, seconds = text.rpartition("=")

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,15 +18,16 @@ from schemas.runtime import commandline, progress_messages
 from schemas.thresholds import NS
 
 if TYPE_CHECKING:
+    from edge_agent.adaptation.memberships import Memberships
     from edge_agent.app.backfill import Outcome
     from edge_agent.app.live_loop import Progress
     from edge_agent.app.plausible import Plausibility
-    from edge_agent.estimators import Estimates
-    from edge_agent.inputs.block import Block
+    from edge_agent.estimators import EstimatorBank
     from edge_agent.inputs.signal_log import SignalLog
     from edge_agent.observe.observation_builder import RecordBlock
     from edge_agent.observe.pipeline import Pipeline
     from edge_agent.publish.publisher import Publisher
+    from schemas.config import AgentConfig
     from schemas.vehicle import Vehicle
 
 NOW = "now"
@@ -96,55 +97,62 @@ def run(args: argparse.Namespace) -> int:
     records were acknowledged, 1 if the service rejected records or did not answer, 3 if the
     estimates of a log are implausible.
     """
-    from edge_agent.app.backfill import (
-        backfill_on_spark,
-        estimate_drives,
-        tasks_of,
-        vehicle_file_of,
-    )
-    from edge_agent.app.estimates_file import ENDINGS, EstimatesFile
-    from edge_agent.app.estimator_factory import bank_of
-    from edge_agent.app.live_loop import Progress
-    from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.app.publishing import open_publisher
-    from edge_agent.cli.common import checked_name, require_valid_signals, warn_about_faults
-    from edge_agent.inputs.doctor.adopt import prepare_log
-    from edge_agent.inputs.signal_log import read_log, require_log
-    from edge_agent.observe.pipeline import Pipeline
-    from edge_agent.publish.batching import batch_drive
-    from schemas.vehicle import load_vehicle
-
     config = config_of(args)
     estimator = args.estimator or config.estimator
     memberships = memberships_of(args)
     several = len(args.log) > 1 or args.out.is_dir()
     _check_engine(args.engine, args.jobs, several=several)
     if several:
-        if args.publish:
-            raise InputError(
-                "publish",
-                f"{len(args.log)} logs into a folder",
-                "publish one log, to one file, at a time",
-            )
-        tasks = tasks_of(args.log, args.vehicle, args.out)  # raises if a log would be overwritten
-        if args.engine == SPARK:
-            return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
-        return _print_outcomes(
-            estimate_drives(tasks, estimator, args.jobs, memberships), len(tasks)
-        )
-    if args.compare is not None and args.out.suffix not in REPORTS:
+        return _replay_several(args, estimator, memberships)
+    return _replay_one(args, config, estimator, memberships)
+
+
+def _replay_several(
+    args: argparse.Namespace, estimator: str, memberships: Memberships | None
+) -> int:
+    """Write the estimates of several logs into a folder; return the exit code."""
+    from edge_agent.app.backfill import backfill_on_spark, estimate_drives, tasks_of
+
+    if args.publish:
         raise InputError(
-            "compare",
-            f"works only with a report, not with {args.out.name}",
-            f"write {', '.join(REPORTS)}",
+            "publish",
+            f"{len(args.log)} logs into a folder",
+            "publish one log, to one file, at a time",
         )
+    tasks = tasks_of(args.log, args.vehicle, args.out)  # raises if a log would be overwritten
+    if args.engine == SPARK:
+        outcomes = backfill_on_spark(tasks, estimator, memberships)
+    else:
+        outcomes = estimate_drives(tasks, estimator, args.jobs, memberships)
+    return _print_outcomes(outcomes, len(tasks))
+
+
+def _replay_one(
+    args: argparse.Namespace,
+    config: AgentConfig,
+    estimator: str,
+    memberships: Memberships | None,
+) -> int:
+    """Write the estimates or the report of one log, and publish its records if the options ask for
+    this; return the exit code.
+    """
+    from edge_agent.app.backfill import vehicle_file_of
+    from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
+    from edge_agent.app.publishing import open_publisher
+    from edge_agent.cli.common import checked_name, require_valid_signals, warn_about_faults
+    from edge_agent.inputs.doctor.adopt import prepare_log
+    from edge_agent.inputs.signal_log import read_log
+    from edge_agent.observe.pipeline import Pipeline
+    from edge_agent.publish.batching import batch_drive
+    from schemas.vehicle import load_vehicle
+
     path = args.log[0]
-    require_log(path)
-    commandline.refuse_input_path("out", args.out, [path, args.vehicle or vehicle_file_of(path)])
-    if args.out.suffix:
-        commandline.ending_of("out", args.out, [*filter(None, ENDINGS), *REPORTS])
-    vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
-    if args.out.suffix in REPORTS and args.publish:
+    vehicle_file = args.vehicle or vehicle_file_of(path)
+    _check_output(args, vehicle_file)
+    vehicle = load_vehicle(vehicle_file)
+    is_report = args.out.suffix in REPORTS
+    if is_report and args.publish:
         raise InputError(
             "publish", "cannot be combined with a report", "replay twice: once with .parquet"
         )
@@ -152,42 +160,51 @@ def run(args: argparse.Namespace) -> int:
     log = read_log(path)
     start_ns = _start_time(args.start, log)
     log, vehicle, diagnosis, notes = prepare_log(log, vehicle)
-    bank = bank_of(estimator, [vehicle], memberships)
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
         require_valid_signals(diagnosis)
     else:
         notes += warn_about_faults(diagnosis)
-    if args.out.suffix in REPORTS:
+    code = 0
+    if is_report:
         names = [estimator, *_split_names(args.compare)]
         notes += _write_report(args, log, vehicle, names, plausibility)
-        print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
-        return IMPLAUSIBLE if plausibility.problems() else 0
-    name = checked_name(args.name or vehicle.name) if args.publish else ""
-    records: list[RecordBlock] = []
-    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
-    with EstimatesFile(args.out) as file:
-
-        def keep_estimates(block: Block, estimates: Estimates) -> None:
-            plausibility.add(block.t, block.signals, estimates)
-            progress.blocks += 1
-            file.write(block.t, estimates)
-
-        if args.publish:
-            records = _make_records(log, start_ns, Pipeline(bank, 1, config), keep_estimates)
-        else:
-            for block in log.blocks(start_ns):
-                keep_estimates(block, bank.advance(block.t, block.signals))
-    code = 0
-    if args.publish:
+    elif args.publish:
+        name = checked_name(args.name or vehicle.name)
+        pipeline = Pipeline(bank_of(estimator, [vehicle], memberships), 1, config)
+        records, progress = _make_records(args.out, log, start_ns, pipeline, plausibility)
         drive = batch_drive(records, name, estimator, config.batch_rows)
         publisher = open_publisher([name], config, estimator, drive=drive)
         same = f" with --start {_start_text(start_ns)}" if _is_start_now(args.start, log) else ""
         code = _publish_drive(publisher, progress, start_ns, f"repeat the command{same}")
         if same:
             notes.append(f"note: repeated{same}, this drive counts once; otherwise it is another")
+    else:
+        bank = bank_of(estimator, [vehicle], memberships)
+        _write_estimates(args.out, log, start_ns, bank, plausibility)
     print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
-    return code or (IMPLAUSIBLE if plausibility.problems() else 0)
+    if code == 0 and plausibility.problems():
+        return IMPLAUSIBLE
+    return code
+
+
+def _check_output(args: argparse.Namespace, vehicle_file: Path) -> None:
+    """Raise an InputError if the output has an unknown ending, does not suit the options, or would
+    overwrite an input.
+    """
+    from edge_agent.app.estimates_file import ENDINGS
+    from edge_agent.inputs.signal_log import require_log
+
+    if args.compare is not None and args.out.suffix not in REPORTS:
+        raise InputError(
+            "compare",
+            f"works only with a report, not with {args.out.name}",
+            f"write {', '.join(REPORTS)}",
+        )
+    require_log(args.log[0])
+    commandline.refuse_input_path("out", args.out, [args.log[0], vehicle_file])
+    if args.out.suffix:
+        commandline.ending_of("out", args.out, [*filter(None, ENDINGS), *REPORTS])
 
 
 def _split_names(names: str | None) -> list[str]:
@@ -270,22 +287,41 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     return 2 if bad else 0
 
 
-def _make_records(
-    log: SignalLog,
-    start_ns: int,
-    pipeline: Pipeline,
-    keep: Callable[[Block, Estimates], None],
-) -> list[RecordBlock]:
-    """Estimate a log that begins at `start_ns` [ns UTC], and return the resulting records. `keep`
-    is called with each block of samples and its estimates.
+def _write_estimates(
+    out: Path, log: SignalLog, start_ns: int, bank: EstimatorBank, plausibility: Plausibility
+) -> None:
+    """Estimate a log that begins at `start_ns` [ns UTC]. Write the estimates to the file `out`, and
+    add them to `plausibility`.
     """
-    out: list[RecordBlock] = []
-    for block in log.blocks(start_ns):
-        estimates, *records = pipeline.step(block)
-        keep(block, estimates)
-        out += records
-    last = pipeline.finish()
-    return out if last is None else [*out, last]
+    from edge_agent.app.estimates_file import EstimatesFile
+
+    with EstimatesFile(out) as file:
+        for block in log.blocks(start_ns):
+            estimates = bank.advance(block.t, block.signals)
+            plausibility.add(block.t, block.signals, estimates)
+            file.write(block.t, estimates)
+
+
+def _make_records(
+    out: Path, log: SignalLog, start_ns: int, pipeline: Pipeline, plausibility: Plausibility
+) -> tuple[list[RecordBlock], Progress]:
+    """Do the same as `_write_estimates`, and return the resulting records with the progress that
+    the publisher reports.
+    """
+    from edge_agent.app.estimates_file import EstimatesFile
+    from edge_agent.app.live_loop import Progress
+
+    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
+    found: list[RecordBlock] = []
+    with EstimatesFile(out) as file:
+        for block in log.blocks(start_ns):
+            estimates, *records = pipeline.step(block)
+            plausibility.add(block.t, block.signals, estimates)
+            file.write(block.t, estimates)
+            progress.blocks += 1
+            found += records
+        last = pipeline.finish()
+    return (found if last is None else [*found, last]), progress
 
 
 def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, again: str) -> int:

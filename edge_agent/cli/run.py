@@ -104,18 +104,11 @@ def run(args: argparse.Namespace) -> int:
         use_agent_library()
         from edge_agent.app.agent import Agent, AgentSource
         from edge_agent.cli.common import checked_name
-        from edge_agent.inputs.live.sources import KINDS, is_live
+        from edge_agent.inputs.live.sources import is_live
         from schemas.errors import InputError
-        from schemas.runtime import plugins
-        from schemas.vehicle import load_vehicle
 
     config = config_of(args)
-    if args.route is not None and not args.ahead:
-        raise InputError("route", "needs --ahead", "give both, or neither")
-    if args.autoware is not None and not args.ahead:
-        raise InputError("autoware", "needs --ahead", "give both, or neither")
-    if args.autoware_hash is not None and args.autoware is None:
-        raise InputError("autoware-hash", "needs --autoware", "give both, or neither")
+    _check_options(args)
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _run_live(args, sources, config)
@@ -125,25 +118,48 @@ def run(args: argparse.Namespace) -> int:
             f"{', '.join(sources)} cannot be combined",
             "give live sources only, or one log",
         )
-    kind, _, address = sources[0].partition(":")
+    vehicle, name, blocks = _open_source(args, sources[0])
+    options = _agent_options(args, vehicle, checked_name(name), config)
+    return Agent(options, AgentSource(blocks), _make_parts(args, name, config)).drive()
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise an InputError if an option is given without the option that it needs."""
+    from schemas.errors import InputError
+
+    if args.route is not None and not args.ahead:
+        raise InputError("route", "needs --ahead", "give both, or neither")
+    if args.autoware is not None and not args.ahead:
+        raise InputError("autoware", "needs --ahead", "give both, or neither")
+    if args.autoware_hash is not None and args.autoware is None:
+        raise InputError("autoware-hash", "needs --autoware", "give both, or neither")
+
+
+def _open_source(args: argparse.Namespace, source: str) -> tuple[Vehicle, str, Iterator[Block]]:
+    """Open a source that is not live: a plug-in, the simulation, or a log. Return the vehicle, the
+    name to publish under, and the blocks of samples.
+    """
+    from edge_agent.inputs.live.sources import KINDS
+    from schemas.errors import InputError
+    from schemas.runtime import plugins
+    from schemas.vehicle import load_vehicle
+
+    kind, _, address = source.partition(":")
     others = plugins.entry_points_of(plugins.SOURCES)
     if kind in others:
         vehicle = load_vehicle(_vehicle_file(args))
-        name = args.name or vehicle.name
         blocks = plugins.load_entry_point(plugins.SOURCES, kind)(address)
-    elif kind != SIMULATED and not Path(sources[0]).exists():
-        known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
-        raise InputError(
-            "source",
-            f"{sources[0]!r} is not a file, and {kind!r} is not a kind of source",
-            f"kinds are {known}",
-        )
-    else:
-        vehicle, name, blocks = (
-            _simulated_source(args) if kind == SIMULATED else _log_source(args, Path(sources[0]))
-        )
-    options = _agent_options(args, vehicle, checked_name(name), config)
-    return Agent(options, AgentSource(blocks), _make_parts(args, name, config)).drive()
+        return vehicle, args.name or vehicle.name, blocks
+    if kind == SIMULATED:
+        return _simulated_source(args)
+    if Path(source).exists():
+        return _log_source(args, Path(source))
+    known = ", ".join(sorted([SIMULATED, *KINDS, *others]))
+    raise InputError(
+        "source",
+        f"{source!r} is not a file, and {kind!r} is not a kind of source",
+        f"kinds are {known}",
+    )
 
 
 def _agent_options(
@@ -159,10 +175,12 @@ def _agent_options(
 def _make_parts(args: argparse.Namespace, name: str, config: AgentConfig) -> list[AgentPart]:
     from edge_agent.cli.live import LookoutPart, VssPart
 
-    lookout = _make_lookout(args, name, config)
-    output = _make_vss_output(args, name, config)
-    parts: list[AgentPart] = [] if lookout is None else [LookoutPart(lookout)]
-    return parts if output is None else [*parts, VssPart(output)]
+    parts: list[AgentPart] = []
+    if (lookout := _make_lookout(args, name, config)) is not None:
+        parts.append(LookoutPart(lookout))
+    if (output := _make_vss_output(args, name, config)) is not None:
+        parts.append(VssPart(output))
+    return parts
 
 
 def _make_lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:

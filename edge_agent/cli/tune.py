@@ -112,14 +112,12 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: an option is out of range.
     """
-    ants = args.ants if args.ants is not None else QUICK_ANTS if args.quick else ANTS
-    iterations = (
-        args.iterations
-        if args.iterations is not None
-        else QUICK_ITERATIONS
-        if args.quick
-        else ITERATIONS
-    )
+    ants = args.ants
+    if ants is None:
+        ants = QUICK_ANTS if args.quick else ANTS
+    iterations = args.iterations
+    if iterations is None:
+        iterations = QUICK_ITERATIONS if args.quick else ITERATIONS
     for name, value, least in (
         ("--ants", ants, 1),
         ("--iterations", iterations, 1),
@@ -128,10 +126,16 @@ def run(args: argparse.Namespace) -> int:
     ):
         if value < least:
             raise InputError(name, f"{value} is below {least}", f"use {least} or more")
-    duration = QUICK_DURATION_S if args.quick else DURATION_S
     if args.study is not None:
         return _run_study(args, ants, iterations)
+    return _run_comparison(args, ants, iterations)
 
+
+def _run_comparison(args: argparse.Namespace, ants: int, iterations: int) -> int:
+    """Compare the default fuzzy sets with those that the searches find, and write the best ones;
+    return 0.
+    """
+    duration = QUICK_DURATION_S if args.quick else DURATION_S
     chosen = args.objective or ("predictive" if args.log else "interval")
     train, held_out = _tuning_drives(args, chosen, duration)
     print_line(
@@ -144,33 +148,32 @@ def run(args: argparse.Namespace) -> int:
     results = [
         _run_searches(objective, ants, iterations, args.seed + k) for k in range(args.repeats)
     ]
-    sets = {
-        way: [Memberships.from_vector(found[way].best) for found in results] for way in WAYS[1:]
-    }
-    best = {
-        way: max((found[way] for found in results), key=lambda result: result.value).best
-        for way in WAYS[1:]
-    }
-    found = {"default": Memberships()} | {
-        way: Memberships.from_vector(vector) for way, vector in best.items()
-    }
+    results_of = {way: [result[way] for result in results] for way in WAYS[1:]}
+    best = {"default": Memberships()}
+    for way, repeats in results_of.items():
+        best[way] = Memberships.from_vector(max(repeats, key=lambda result: result.value).best)
     scores = {
         way: SplitScores(
-            train=_score_memberships(found[way], train),
-            held_out=_score_memberships(found[way], held_out),
+            train=_score_memberships(best[way], train),
+            held_out=_score_memberships(best[way], held_out),
         )
         for way in WAYS
     }
     print(comparison_table(scores))
     winner = max(WAYS, key=lambda way: _search_worth(scores[way].held_out, chosen))
-    evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
-    command = (
-        f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats "
-        f"{args.repeats} --objective "
-        f"{chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
+    evaluations = {
+        way: sum(result.evaluations for result in repeats) for way, repeats in results_of.items()
+    }
+    command = " ".join(
+        [
+            f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations}",
+            f"--repeats {args.repeats} --objective {chosen}",
+            *(["--quick"] if args.quick else []),
+            *(log.name for log in args.log),
+        ]
     )
     document = _make_document(
-        found[winner],
+        best[winner],
         chosen,
         scores,
         _make_provenance(
@@ -179,7 +182,10 @@ def run(args: argparse.Namespace) -> int:
             Budget(ants=ants, iterations=iterations, evaluations=evaluations),
         ),
     )
-    candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
+    candidates = {
+        way: [Memberships.from_vector(result.best).to_json() for result in repeats]
+        for way, repeats in results_of.items()
+    }
     save_tuned(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
     print(f"wrote {args.out}: the sets found by {winner}")
     return 0
