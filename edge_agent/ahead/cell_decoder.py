@@ -107,18 +107,17 @@ def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, lis
 
 
 def _check_alert(alert: Alert, tile: int, now: int) -> Alert:
-    numbers = np.array([alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery])
-    possible = (
+    has_place = (
         alert.cell >= 0
         and int(grid.tile_of(alert.cell)) == tile
         and 0 <= alert.sector < grid.SECTORS
-        and 0 < alert.time <= now + AHEAD_OF_TIME_S * NS
-        and bool(np.isfinite(numbers).all())
-        and bool(_is_ordered(mugrid.LOWER, numbers[:1], numbers[1:2])[0])
-        and bool(_is_ordered(numbers[1:2], numbers[2:3], mugrid.UPPER)[0])
-        and 0.0 <= alert.p_slippery <= 1.0
     )
-    if not possible:
+    has_time = 0 < alert.time <= now + AHEAD_OF_TIME_S * NS
+    mu_lower, mu, mu_upper = np.array([[alert.mu_lower], [alert.mu], [alert.mu_upper]])
+    has_friction = bool(
+        _is_ordered(mugrid.LOWER, mu_lower, mu) & _is_ordered(mu, mu_upper, mugrid.UPPER)
+    )
+    if not (has_place and has_time and has_friction and 0.0 <= alert.p_slippery <= 1.0):
         raise WireError(
             "alert", "has values out of range", "send values that the message definition allows"
         )

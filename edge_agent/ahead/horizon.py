@@ -88,11 +88,8 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
     # For each metre take the first place with an alert, else the first measured place, else the
     # first place of which the map knows anything.
-    rank = np.where(
-        there,
-        np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)),
-        3,
-    )
+    is_measured = found.basis[inverse] == MEASURED
+    rank = np.select([~there, found.alerted[inverse], is_measured], [3, 0, 1], default=2)
     column = rank.argmin(axis=1)
     row = inverse[np.arange(len(column)), column]
     nothing = rank.min(axis=1) == 3

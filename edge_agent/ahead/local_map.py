@@ -191,65 +191,65 @@ class LocalMap:
         opposite driving direction also counts, unless a vehicle has later measured better friction
         at the place itself.
         """
-        belief, basis, last, at, vehicles = self._look_up(key)
-        alerted = np.zeros(len(key), np.bool_)
-        standing = np.fromiter(self._alerts, np.int64, len(self._alerts))
-        for k in np.flatnonzero(
-            np.isin(key, standing) | np.isin(key ^ OTHER_WAY, standing)
-        ).tolist():
-            place = int(key[k])
-            own = place in self._alerts
-            alert, heard = self._alerts[place if own else place ^ OTHER_WAY]
-            if now - heard > ALERT_HELD_S * NS:
-                continue
-            grip = (
-                basis[k] == MEASURED or mugrid.quantiles(belief[k : k + 1], 0.05)[0] >= SLIPPERY_MU
-            )
-            # An alert of the opposite direction does not count if a vehicle has found grip on this
-            # side afterwards.
-            alerted[k] = own or alert.time > last[k] or not grip
-            # A lower bound contains no value of the friction, so the alert's values replace it.
-            if alerted[k] and (alert.time >= last[k] or basis[k] != MEASURED):
-                shown = (
-                    np.array([value])
-                    for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery)
-                )
-                belief[k], last[k], at[k], vehicles[k] = (
-                    belief_of(*shown)[0],
-                    alert.time,
-                    heard,
-                    alert.vehicles,
-                )
-                basis[k] = MEASURED if own else BORROWED
-        since = np.maximum(now - at, 0) / NS
+        cells = self._find_cells(key)
+        alerted = self._apply_alerts(cells, now)
+        since = np.maximum(now - cells.heard, 0) / NS
         share = -np.expm1(-since / CHANGE_S)[:, None]
-        faded = (1.0 - share) * belief + share * mugrid.PRIOR
-        there = (basis != UNKNOWN) & (since <= HELD_S)
+        faded = (1.0 - share) * cells.belief + share * mugrid.PRIOR
+        there = (cells.basis != UNKNOWN) & (since <= HELD_S)
         lower, mu, upper = (
             np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
         )
         return PlaceBelief(
             key,
-            np.where(basis == BOUND, np.nan, mu),
+            np.where(cells.basis == BOUND, np.nan, mu),
             lower,
             upper,
             np.where(there, faded @ SLIPPERY_BINS, np.nan),
-            np.where(there, np.maximum(now - last, 0) / NS, np.nan),
-            np.where(there, basis, UNKNOWN),
-            np.where(there, vehicles, 0),
+            np.where(there, np.maximum(now - cells.last_time, 0) / NS, np.nan),
+            np.where(there, cells.basis, UNKNOWN),
+            np.where(there, cells.vehicles, 0),
             alerted & there,
         )
+
+    def _apply_alerts(self, cells: ReceivedCells, now: int) -> BoolArray:
+        """Replace the values of n places for which an alert is newer, in place. Return a mask (n,)
+        of the places for which an alert counts.
+        """
+        key = cells.key
+        alerted = np.zeros(len(key), np.bool_)
+        standing = np.fromiter(self._alerts, np.int64, len(self._alerts))
+        has_alert = np.isin(key, standing) | np.isin(key ^ OTHER_WAY, standing)
+        for k in np.flatnonzero(has_alert).tolist():
+            place = int(key[k])
+            is_own = place in self._alerts
+            alert, heard = self._alerts[place if is_own else place ^ OTHER_WAY]
+            if now - heard > ALERT_HELD_S * NS:
+                continue
+            is_measured = cells.basis[k] == MEASURED
+            # An alert of the opposite direction does not count if a vehicle has found grip on this
+            # side afterwards.
+            is_newer = alert.time > cells.last_time[k]
+            alerted[k] = is_own or is_newer or not (is_measured or _has_grip(cells.belief[k]))
+            # A lower bound contains no value of the friction, so the alert's values replace it.
+            if alerted[k] and (alert.time >= cells.last_time[k] or not is_measured):
+                cells.belief[k] = _belief_of_alert(alert)
+                cells.basis[k] = MEASURED if is_own else BORROWED
+                cells.last_time[k] = alert.time
+                cells.heard[k] = heard
+                cells.vehicles[k] = alert.vehicles
+        return alerted
 
     def belief_at(self, key: int, now: int) -> FloatArray | None:
         """Return the current belief about one place (one map cell and heading sector), as
         probabilities (32,) on the friction grid; None if the map has no recent measured value of
         the place.
         """
-        belief, basis, last, at, _ = self._look_up(np.array([key]))
-        if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
+        cells = self._find_cells(np.array([key]))
+        if cells.basis[0] != MEASURED or now - cells.heard[0] > HELD_S * NS:
             return None
-        share = -np.expm1(-max(now - int(last[0]), 0) / NS / CHANGE_S)
-        return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
+        share = -np.expm1(-max(now - int(cells.last_time[0]), 0) / NS / CHANGE_S)
+        return np.asarray((1.0 - share) * cells.belief[0] + share * mugrid.PRIOR)
 
     def keys(self) -> IntArray:
         """Return the keys (cell·4 + sector) of all places in the local map, (n,), sorted."""
@@ -262,23 +262,34 @@ class LocalMap:
             self._all = _select_cells(found, order)
         return self._all
 
-    def _look_up(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return arrays for n places, given by their keys `key` (n,). They are the belief
-        (probabilities of friction, (n, 32)) and, (n,) each: basis (origin of the values), times of
-        the last observation and of receipt [ns], and number of vehicles.
+    def _find_cells(self, key: IntArray) -> ReceivedCells:
+        """Return a copy of the values of n places, given by their keys `key` (n,). A place without
+        values has the prior belief, and 0 in all other columns.
         """
         whole = self._all_cells()
         if not len(whole.key):
-            zero = np.zeros(len(key), np.int64)
-            return np.tile(mugrid.PRIOR, (len(key), 1)), zero, zero.copy(), zero.copy(), zero.copy()
+            zeros = [np.zeros(len(key), np.int64) for _ in range(4)]
+            return ReceivedCells(key, np.tile(mugrid.PRIOR, (len(key), 1)), *zeros)
         row = np.minimum(np.searchsorted(whole.key, key), len(whole.key) - 1)
-        hit = whole.key[row] == key
-        belief = np.where(hit[:, None], whole.belief[row], mugrid.PRIOR)
-        basis, last, heard, vehicles = (
-            np.where(hit, column[row], 0)
-            for column in (whole.basis, whole.last_time, whole.heard, whole.vehicles)
+        is_known = whole.key[row] == key
+        return ReceivedCells(
+            key=key,
+            belief=np.where(is_known[:, None], whole.belief[row], mugrid.PRIOR),
+            basis=np.where(is_known, whole.basis[row], 0),
+            last_time=np.where(is_known, whole.last_time[row], 0),
+            heard=np.where(is_known, whole.heard[row], 0),
+            vehicles=np.where(is_known, whole.vehicles[row], 0),
         )
-        return belief, basis, last, heard, vehicles
+
+
+def _has_grip(belief: FloatArray) -> bool:
+    """Return True if the lower bound of a belief (32,) excludes a slippery road."""
+    return bool(mugrid.quantiles(belief[None], 0.05)[0] >= SLIPPERY_MU)
+
+
+def _belief_of_alert(alert: Alert) -> FloatArray:
+    values = (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery)
+    return np.asarray(belief_of(*(np.array([value]) for value in values))[0])
 
 
 def _select_cells(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:

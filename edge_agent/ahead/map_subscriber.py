@@ -34,6 +34,26 @@ AGAIN_S: Final = (1.0, 3.0, 9.0)
 _TOPIC: Final = keys.TOPICS["ahead"]
 
 
+class _QueryRepeats:
+    """Times after a reconnection at which the queries are sent again, until there is an answer."""
+
+    def __init__(self) -> None:
+        self._times = list[int]()  # [ns UTC]
+        self.is_answered = False
+
+    def begin(self, now: int) -> None:
+        """Schedule the repetitions after a reconnection at the time `now` [ns UTC]."""
+        self._times = [now + round(later * NS) for later in AGAIN_S]
+        self.is_answered = False
+
+    def is_due(self, now: int) -> bool:
+        """Return True, once for each scheduled time, if it has passed without an answer."""
+        if not self._times or now < self._times[0]:
+            return False
+        del self._times[0]
+        return not self.is_answered
+
+
 class MapSubscriber:
     """Receiver of the map ahead of one vehicle. It subscribes to alerts of slippery places, and
     queries map cells.
@@ -61,9 +81,7 @@ class MapSubscriber:
         self._tiles = Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
-        # [ns UTC] times at which to repeat the queries after a reconnection
-        self._again = list[int]()
-        self._answered = False
+        self._repeats = _QueryRepeats()
         self._publisher = session.declare_publisher(
             keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, **quality_of(_TOPIC)
         )
@@ -100,29 +118,26 @@ class MapSubscriber:
         every part of the whole path that was not requested recently.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
-        back = bool(routers - self._routers)
+        is_reconnected = bool(routers - self._routers)
         self._routers = routers
-        fresh, dropped = self._tiles.update_subscriptions(
+        tiles, dropped = self._tiles.update_subscriptions(
             [path.first_metres(within) for path in paths], pose
         )
         for tile in dropped:
             self._subscribers.pop(tile).undeclare()
-        for tile in fresh:
+        for tile in tiles:
             self._subscribers[tile] = self._session.declare_subscriber(
                 keys.alert_key(tile), self._on_alert
             )
         if not routers:
             return
-        if back:
-            self._again = [self._clock() + round(later * NS) for later in AGAIN_S]
-            self._answered = False
-        elif self._again and self._clock() >= self._again[0]:
-            del self._again[0]
-            back = not self._answered
-        if back:
+        if is_reconnected:
+            self._repeats.begin(self._clock())
+        if is_reconnected or self._repeats.is_due(self._clock()):
             self._asked.request_again()
+            tiles = self._tiles.subscribed_tiles
         # Query the active alerts only after subscribing, so that no alert is missed in between.
-        for tile in self._tiles.subscribed_tiles if back else fresh:
+        for tile in tiles:
             self._send_query(keys.alert_key(tile), self._on_standing)
         for path in paths:
             for box in self._asked.missing_boxes(path, pose, within):
@@ -157,7 +172,7 @@ class MapSubscriber:
             if reply.ok is None:
                 self.counts["unanswered"] += 1
                 return
-            self._answered = True
+            self._repeats.is_answered = True
             self._pass_payload(take, str(reply.ok.key_expr), reply.ok.payload.to_bytes())
 
         try:

@@ -62,12 +62,20 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     done: list[list[int]] = []
     while ways and len(done) < MOST_WAYS:
         done.append(_follow_way(graph, ways.pop(0), pose, length, ways))
-    # Remove roads that have almost no places of their own: they join another road, or end where
-    # another road bends.
-    for way in done[::-1] if len(done) > 1 else []:
-        if len(set(way).difference(*(other for other in done if other is not way))) < LEAST_OWN:
-            done.remove(way)
+    _remove_joining_ways(done)
     return [_as_path(way, places, pose, length, beyond=k == 0) for k, way in enumerate(done)]
+
+
+def _remove_joining_ways(ways: list[list[int]]) -> None:
+    """Remove ways that have almost no places of their own, in place, the last ones first: they join
+    another way, or end where another way bends. A single way stays.
+    """
+    if len(ways) == 1:
+        return
+    for way in reversed(ways.copy()):
+        others = [other for other in ways if other is not way]
+        if len(set(way).difference(*others)) < LEAST_OWN:
+            ways.remove(way)
 
 
 class _Neighbours:

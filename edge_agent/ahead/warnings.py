@@ -85,23 +85,19 @@ def update_warnings(
         if before is None:
             if nearest.braking_energy > 0.5 * speed**2:
                 continue
-            first = min(nearest.places)
-            cell = grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)
-            name = f"{cell}{first % grid.SECTORS}-{pose.time // NS:x}"
-            one = _make_warning(name, "raised", nearest, pose, sure)
-            issued.append(one)
-            kept[name] = Active(one, places, pose.time, nearest.start)
-            here.add(name)
-            continue
-        here.add(before.warning.id)
-        name = before.warning.id
-        one = _make_warning(before.warning.id, "updated", nearest, pose, sure)
-        grown = len(places - before.places) >= CHANGED_PLACES
-        if grown or abs(one.mu - before.warning.mu) >= CHANGED_MU:
-            issued.append(one)
-            kept[name] = Active(one, before.places | places, pose.time, nearest.start)
+            warning = _make_warning(_new_name(nearest, pose), "raised", nearest, pose, sure)
+            issued.append(warning)
+            kept[warning.id] = Active(warning, places, pose.time, nearest.start)
         else:
-            kept[name] = replace(before, seen=pose.time, distance_m=nearest.start)
+            warning = _make_warning(before.warning.id, "updated", nearest, pose, sure)
+            has_grown = len(places - before.places) >= CHANGED_PLACES
+            if has_grown or abs(warning.mu - before.warning.mu) >= CHANGED_MU:
+                issued.append(warning)
+                places |= before.places
+                kept[warning.id] = Active(warning, places, pose.time, nearest.start)
+            else:
+                kept[warning.id] = replace(before, seen=pose.time, distance_m=nearest.start)
+        here.add(warning.id)
     for name, last in list(kept.items()):
         if name in here:
             continue
@@ -162,6 +158,15 @@ def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Str
     return groups
 
 
+def _new_name(stretch: _Stretch, pose: Pose) -> str:
+    """Return a name for the warning of a stretch: the quadkey and the sector of its first place,
+    and the time.
+    """
+    first = min(stretch.places)
+    cell = grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)
+    return f"{cell}{first % grid.SECTORS}-{pose.time // NS:x}"
+
+
 def _make_warning(
     name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool
 ) -> GripWarning:
@@ -171,14 +176,12 @@ def _make_warning(
     last = int(stretch.end)
     age = float(np.nanmin(horizon.age_s[first:last]))
     alerted = horizon.alerted[first:last]
-    own = (alerted & (horizon.basis[first:last] == MEASURED)).any()
-    reason = (
-        "an alert is active"
-        if own
-        else "an alert is active for the opposite direction"
-        if alerted.any()
-        else "the map reports low grip"
-    )
+    if (alerted & (horizon.basis[first:last] == MEASURED)).any():
+        reason = "an alert is active"
+    elif alerted.any():
+        reason = "an alert is active for the opposite direction"
+    else:
+        reason = "the map reports low grip"
     return GripWarning(
         id=name,
         state=state,
