@@ -47,6 +47,20 @@ class Progress:
     now_s: float = 0.0
     held: int = 0
 
+    def record_block(self, length_s: float, elapsed_s: float) -> float:
+        """Count a processed block whose signals last `length_s` seconds, `elapsed_s` seconds after
+        the start of the clock. Return the delay of the loop [s], negative if it is ahead of the
+        signals.
+        """
+        self.signals_s += length_s
+        self.blocks += 1
+        lag = elapsed_s - self.signals_s
+        if lag > length_s:
+            self.behind += 1
+        self.lag_s = max(self.lag_s, lag)
+        self.now_s = max(lag, 0.0)
+        return lag
+
 
 class LoopOptions(NamedTuple):
     """Options of the live loop.
@@ -94,12 +108,7 @@ def run_live_loop(
             started = options.clock()
             first = float(block.t.min())
         length = float(block.t.max()) - first - progress.signals_s
-        progress.signals_s += length
-        progress.blocks += 1
-        lag = options.clock() - started - progress.signals_s
-        progress.behind += lag > length
-        progress.lag_s = max(progress.lag_s, lag)
-        progress.now_s = max(lag, 0.0)
+        lag = progress.record_block(length, options.clock() - started)
         if stop.wait(max(0.0, -lag)) or options.clock() - started >= options.duration_s:
             break
         if options.clock() - started >= status_at:

@@ -25,68 +25,37 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     counts = publisher.counts
     status = publisher.status
     return [
-        Metric(
-            "published_records",
-            "counter",
-            "records written to the outbox and sent",
-            _by_kind_name(counts.published),
-            "kind",
+        _kind_counter(
+            "published_records", "records written to the outbox and sent", counts.published
         ),
-        Metric(
-            "acknowledged_records",
-            "counter",
-            "records acknowledged by a service",
-            _by_kind_name(counts.acknowledged),
-            "kind",
+        _kind_counter(
+            "acknowledged_records", "records acknowledged by a service", counts.acknowledged
         ),
-        Metric(
-            "rejected_records",
-            "counter",
-            "records rejected by a service",
-            _by_kind_name(counts.rejected),
-            "kind",
-        ),
-        Metric(
+        _kind_counter("rejected_records", "records rejected by a service", counts.rejected),
+        _counter(
             "dropped_records",
-            "counter",
             "records dropped because the outbox was full",
-            {"": status.dropped_records},
+            status.dropped_records,
         ),
-        Metric(
-            "late_batches",
-            "counter",
-            "batches that came later than the service's lateness",
-            _by_kind_name(counts.late),
-            "kind",
+        _kind_counter(
+            "late_batches", "batches that came later than the service's lateness", counts.late
         ),
-        Metric(
+        _counter(
             "unanswered_records",
-            "counter",
             "records given up because only later batches were acknowledged",
-            {"": status.unanswered_records},
+            status.unanswered_records,
         ),
-        Metric("resent_batches", "counter", "batches sent again", {"": counts.resent_batches}),
-        Metric(
-            "bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}
+        _counter("resent_batches", "batches sent again", counts.resent_batches),
+        _counter("bad_acks", "acknowledgements that could not be read", counts.bad_acks),
+        _counter(
+            "damaged_spools", "times that the outbox was found damaged", status.damage_counts[0]
         ),
-        Metric(
-            "damaged_spools",
-            "counter",
-            "times that the outbox was found damaged",
-            {"": status.damage_counts[0]},
-        ),
-        Metric(
+        _counter(
             "damaged_records",
-            "counter",
             "records lost because the outbox was damaged",
-            {"": status.damage_counts[1]},
+            status.damage_counts[1],
         ),
-        Metric(
-            "sender_failures",
-            "counter",
-            "failed iterations of the sending thread",
-            {"": counts.failures},
-        ),
+        _counter("sender_failures", "failed iterations of the sending thread", counts.failures),
         gauge(
             "stranded_records",
             "records in the outbox under a previous vehicle name",
@@ -141,5 +110,10 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     return found
 
 
-def _by_kind_name(counts: Mapping[Kind, int]) -> dict[str, float]:
-    return {_NAMES[kind]: number for kind, number in counts.items()}
+def _counter(name: str, text: str, count: int) -> Metric:
+    return Metric(name, "counter", text, {"": count})
+
+
+def _kind_counter(name: str, text: str, counts: Mapping[Kind, int]) -> Metric:
+    by_kind = {_NAMES[kind]: number for kind, number in counts.items()}
+    return Metric(name, "counter", text, by_kind, "kind")

@@ -121,14 +121,14 @@ def locate_vehicles(
         after["fix_time"] = np.nan
     shape = t.shape
     located = Located(
-        np.zeros(shape, np.bool_),
-        np.zeros(shape, np.bool_),
-        np.zeros(shape, np.bool_),
-        np.full(shape, NOWHERE),
-        np.full(shape, NOWHERE),
-        np.full(shape, np.nan),
-        np.full(shape, np.nan),
-        np.full(shape, np.nan),
+        closes=np.zeros(shape, np.bool_),
+        inside=np.zeros(shape, np.bool_),
+        outside=np.zeros(shape, np.bool_),
+        cell=np.full(shape, NOWHERE),
+        sector=np.full(shape, NOWHERE),
+        latitude=np.full(shape, np.nan),
+        longitude=np.full(shape, np.nan),
+        yaw=np.full(shape, np.nan),
     )
     _advance_tracks(t, _receiver_samples(signals), after, located)
     return after, located

@@ -251,10 +251,14 @@ class Publisher:
                 self._waiting.append(draft)
 
     def _resend_due(self) -> None:
-        there = self._links.connected_names
-        limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(there))
-        for batch in self._outbox.due_batches(self._clock(), limit, there) if there else ():
-            self.counts.resent_batches += self._links.put_batch(batch) and not batch.fresh
+        connected = self._links.connected_names
+        if not connected:
+            return
+        limit = min(RESEND_LIMIT, RESEND_PER_VEHICLE * len(connected))
+        for batch in self._outbox.due_batches(self._clock(), limit, connected):
+            is_sent = self._links.put_batch(batch)
+            if is_sent and not batch.fresh:
+                self.counts.resent_batches += 1
 
 
 def _log_if_changed(text: str, error: sqlite3.Error, last: str) -> str:

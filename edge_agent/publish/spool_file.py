@@ -202,11 +202,8 @@ def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
             rows,
         )
     sync_directory(path.parent)
-    aside = next(
-        p
-        for n in range(1, 10_000)
-        if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists()
-    )
+    names = (path.with_name(f"{path.name}.{DAMAGED}-{number}") for number in range(1, 10_000))
+    aside = next(candidate for candidate in names if not candidate.exists())
     for ending in ("", "-wal", "-shm"):
         with suppress(FileNotFoundError):
             path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
@@ -266,19 +263,24 @@ def _readable_batches(path: Path) -> list[Row]:
     its checksum is correct, or if an old version wrote it without a checksum.
     """
     log_file = path.with_name(f"{path.name}-wal")
+    log_bytes = log_file.read_bytes() if log_file.exists() else b""
     found: dict[int, Row] = {}
-    for key, values in salvage.recover_rows(
-        path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""
-    ):
-        values += [None] * (len(TYPES) - len(values))
-        if len(values) != len(TYPES) or not all(
-            isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)
-        ):
-            continue
-        name = tuple(values[1:7])
-        payload = values[7]
-        given = values[8]
-        assert isinstance(payload, bytes)
-        if given is None or given == batch_checksum(name, payload):
-            found.setdefault(key, (key, *values[1:]))
+    for key, values in salvage.recover_rows(path.read_bytes(), log_bytes):
+        padded = [*values, *[None] * (len(TYPES) - len(values))]  # an old version has no checksum
+        if _is_intact_batch(padded):
+            found.setdefault(key, (key, *padded[1:]))
     return [found[key] for key in sorted(found)]
+
+
+def _is_intact_batch(values: Sequence[object]) -> bool:
+    """Return True if a row of a damaged file has the types of a batch and, if it has a checksum,
+    the correct one.
+    """
+    if len(values) != len(TYPES):
+        return False
+    if not all(isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)):
+        return False
+    payload = values[7]
+    checksum = values[8]
+    assert isinstance(payload, bytes)
+    return checksum is None or checksum == batch_checksum(tuple(values[1:7]), payload)
