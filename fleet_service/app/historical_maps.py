@@ -93,38 +93,40 @@ class HistoricalMaps:
         most = MOST_ROWS if box is None else LOOKED_ROWS
         if rows_near(self._root, question.at, box, most) > most:
             raise too_much()
-        process, head = self._ask_process(question)
-        ended = False
+        process = self._ask_process(question)
         try:
-            while not ended:
-                tile, size = _HEAD.unpack(head)
-                payload = process.payload(size)
-                ended = tile in (_ERROR, _END)
-                if tile == _ERROR:
-                    raise InputError(*json.loads(payload))
-                if not ended and wanted(tile):
+            for tile, payload in process.replies():
+                if wanted(tile):
                     yield tile, payload
-                head = b"" if ended else process.head()
         finally:
-            if left := self._keep_process(process) if ended else process:
-                left.end()
+            self._release_process(process)
 
     def close(self) -> None:
         """End the process that rebuilds past maps, if it is idle."""
-        if process := self._keep_process(None):
+        if process := self._exchange_idle(None):
             process.end()
 
-    def _ask_process(self, question: PastQuery) -> tuple[_Process, bytes]:
-        """Send a query about a past map to an idle or new process. Return this process, and the
-        head (tile number and length) of its first reply.
+    def _ask_process(self, question: PastQuery) -> _Process:
+        """Send a query about a past map to an idle or new process. Return this process, which has
+        begun to reply.
         """
-        if process := self._keep_process(None):
+        if process := self._exchange_idle(None):
             with suppress(BrokenPipeError, ChildProcessError):  # if the process has just ended
-                return process, process.ask(question)
+                process.ask(question)
+                return process
         process = _Process(self._root)
-        return process, process.ask(question)
+        process.ask(question)
+        return process
 
-    def _keep_process(self, process: _Process | None) -> _Process | None:
+    def _release_process(self, process: _Process) -> None:
+        """Keep a process that has written its whole answer for the next query; end one that has
+        not.
+        """
+        surplus = self._exchange_idle(process) if process.is_idle else process
+        if surplus:
+            surplus.end()
+
+    def _exchange_idle(self, process: _Process | None) -> _Process | None:
         """Store an idle process (or None) for the next query; return the process that was stored
         before.
         """
@@ -144,28 +146,50 @@ class _Process:
         assert self._child.stdout
         self._in = self._child.stdin
         self.out = self._child.stdout
+        self.is_idle = True
+        self._head = b""  # head of the next reply
         self._is_silent = False
 
-    def ask(self, question: PastQuery) -> bytes:
-        """Send a query about a past map to the process; return the head of the first reply. If this
-        fails, the process is ended.
+    def ask(self, question: PastQuery) -> None:
+        """Send a query about a past map to the process, and wait for the head (tile number and
+        length) of the first reply. If this fails, the process is ended.
         """
+        self.is_idle = False
         try:
             self._in.write(encode_question(question))
             self._in.flush()
-            return self.head()
+            self._head = self._read_head()
         except BaseException:
             self.end()
             raise
 
-    def head(self) -> bytes:
+    def replies(self) -> Iterator[tuple[int, bytes]]:
+        """Yield the tile number and the payload of every reply to the query. The process is idle
+        after the last one.
+
+        Raises:
+            InputError: the process cannot answer, or writes nothing for SILENT_S.
+            ChildProcessError: the process died.
+        """
+        while True:
+            tile, size = _HEAD.unpack(self._head)
+            payload = self._read_payload(size)
+            self.is_idle = tile in (_ERROR, _END)
+            if tile == _ERROR:
+                raise InputError(*json.loads(payload))
+            if tile == _END:
+                return
+            yield tile, payload
+            self._head = self._read_head()
+
+    def _read_head(self) -> bytes:
         """Return the head of the next reply. Raise ChildProcessError if the process has ended."""
         head = self._read_bytes(_HEAD.size)
         if len(head) < _HEAD.size:
             raise ChildProcessError(f"the past map could not be rebuilt ({self._child.wait()})")
         return head
 
-    def payload(self, size: int) -> bytes:
+    def _read_payload(self, size: int) -> bytes:
         """Return a reply's payload of `size` bytes. Raise ChildProcessError if the process has
         ended before it was complete.
         """
