@@ -91,7 +91,7 @@ TURNS: Final = 6  # number of renewals per lease time
 HINT: Final = 0.6
 # [s] Period in which a standby downloads new objects, so that little is left to download at a
 # take-over.
-AHEAD_S: Final = 10.0
+PREFETCH_S: Final = 10.0
 UNKNOWN: Final = "unknown"  # holder's name if the lease object is damaged
 LOOK_S: Final = 0.25  # [s] period of the checks while waiting
 
@@ -140,16 +140,17 @@ class Standby(NamedTuple):
     `Lease.wait`.
 
     Attributes:
-        may: returns True if the standby reaches a router and so could serve if it took over now.
-        stands: returns True if the service with the given name has a liveliness token.
-        alive: called at each check of the lease.
-        get_ahead: downloads new objects from the bucket in advance.
+        can_serve: returns True if the standby reaches a router and so could serve if it took over
+            now.
+        has_token: returns True if the service with the given name has a liveliness token.
+        notify_alive: called at each check of the lease.
+        prefetch: downloads new objects from the bucket in advance.
     """
 
-    may: Callable[[], bool]
-    stands: Callable[[str], bool]
-    alive: Callable[[], None]
-    get_ahead: Callable[[], None]
+    can_serve: Callable[[], bool]
+    has_token: Callable[[str], bool]
+    notify_alive: Callable[[], None]
+    prefetch: Callable[[], None]
 
 
 class Lease:
@@ -236,7 +237,7 @@ class Lease:
     def wait(
         self,
         stop: threading.Event,
-        say: Callable[[str], None],
+        log_line: Callable[[str], None],
         epoch: Callable[[], int],
         standby: Standby | None,
     ) -> bool:
@@ -244,7 +245,7 @@ class Lease:
 
         Args:
             stop: event that ends the wait.
-            say: called with a line of text when the reason for waiting changes.
+            log_line: called with a line of text when the reason for waiting changes.
             epoch: function that returns the largest known epoch (number in the names of an owner's
                 files).
             standby: functions of a standby service. None for a service that is no standby and does
@@ -256,28 +257,29 @@ class Lease:
             CopyError: the bucket cannot be reached, and this service is no standby.
         """
         watch = _HolderWatch(self._lease_s)
-        ahead = 0.0
+        prefetched_at = 0.0
         logged = ""
         while not stop.is_set():
             line = ""
             if standby is not None:
-                standby.alive()
+                standby.notify_alive()
             try:
                 found = _read_newest_record(self._bucket)
                 if self._can_take(found, watch, standby):
-                    if (standby is None or standby.may()) and self._create_next(found, epoch, stop):
+                    can_serve = standby is None or standby.can_serve()
+                    if can_serve and self._create_next(found, epoch, stop):
                         return True
                 elif standby is not None and found is not None:
                     line = f"standby: {found.service} is served under lease {found.number}"
-                    if time.monotonic() - ahead > AHEAD_S:
-                        ahead = time.monotonic()
-                        standby.get_ahead()
+                    if time.monotonic() - prefetched_at > PREFETCH_S:
+                        prefetched_at = time.monotonic()
+                        standby.prefetch()
             except CopyError as error:
                 if standby is None:
                     raise
                 line = f"standby: the copy cannot be reached ({error})"
             if line != logged and line:
-                say(line)
+                log_line(line)
                 logged = line
             stop.wait(LOOK_S)
         return False
@@ -354,7 +356,7 @@ class Lease:
         if standby is None and watch.has_renewed(found):
             problem = f"is served by {found.service} on another machine or in another folder"
             raise InputError("archive.copy", problem, "stop it, or start with --standby")
-        watch.update(found, has_token=standby is not None and standby.stands(found.service))
+        watch.update(found, has_token=standby is not None and standby.has_token(found.service))
         was_held_here = found.holder == self._holder
         if found.to in ("", self.service) and (found.released or was_held_here):
             return True

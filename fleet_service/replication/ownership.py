@@ -125,7 +125,7 @@ def acquire_archive(
     config: ServiceConfig,
     root: Path,
     stop: threading.Event,
-    say: Callable[[str], None],
+    log_line: Callable[[str], None],
     signs: Signs | None = None,
 ) -> Ownership | None:
     """Lock an archive and, if it has a copy, wait for the lease (ownership) of the copy. Return the
@@ -135,7 +135,7 @@ def acquire_archive(
         config: settings.
         root: folder of the archive.
         stop: event that ends the wait.
-        say: called with a line of text whenever the reason for waiting changes.
+        log_line: called with a line of text whenever the reason for waiting changes.
         signs: three functions of a standby (waiting) service, from `serving.standby_signs`; None if
             this service is no standby. The first returns True if a router is reachable. The second
             returns True if the service with the given name is alive. The third is called at each
@@ -157,7 +157,7 @@ def acquire_archive(
         return open_exclusive(config, root)
     lock_file = lock_archive(root)
     try:
-        holding = _acquire_under_lease(config, root, stop, say, signs, lock_file)
+        holding = _acquire_under_lease(config, root, stop, log_line, signs, lock_file)
     except BaseException:
         lock_file.close()
         raise
@@ -170,7 +170,7 @@ def _acquire_under_lease(
     config: ServiceConfig,
     root: Path,
     stop: threading.Event,
-    say: Callable[[str], None],
+    log_line: Callable[[str], None],
     signs: Signs | None,
     lock_file: BinaryIO,
 ) -> Ownership | None:
@@ -184,7 +184,7 @@ def _acquire_under_lease(
     mirrors = empty or known
     standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
     try:
-        while lease.wait(stop, say, copy.largest_epoch, standby):
+        while lease.wait(stop, log_line, copy.largest_epoch, standby):
             lease.start_renewal()
             if lease.succeeds and not mirrors:
                 raise InputError(
@@ -193,7 +193,7 @@ def _acquire_under_lease(
                     "give the service an empty folder",
                 )
             copy.bucket.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
-            if _sync_folder(config, root, copy, lease, stop, say):
+            if _sync_folder(config, root, copy, lease, stop, log_line):
                 save_holder(root, url, lease.holder)
                 layout.write_epoch(root, lease.term.epoch)
                 return Ownership(lock_file, copy, lease)
@@ -230,7 +230,7 @@ def _sync_folder(
     copy: BucketReplica,
     lease: Lease,
     stop: threading.Event,
-    say: Callable[[str], None],
+    log_line: Callable[[str], None],
 ) -> bool:
     """Synchronise the archive's folder with its copy in the bucket. Return False if `stop` is set,
     or if another service has the lease (ownership). A standby (waiting) service retries while the
@@ -249,7 +249,7 @@ def _sync_folder(
             if isinstance(error, CopyError) and not config.standby:
                 raise
             if str(error) != logged:
-                say(f"waiting: {error}")
+                log_line(f"waiting: {error}")
                 logged = str(error)
             stop.wait(AGAIN_S)
         else:

@@ -51,7 +51,10 @@ def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
     the bucket. Return the `Lease` of this standby.
     """
     standby = Standby(
-        may=lambda: True, stands=lambda _: False, alive=lambda: None, get_ahead=lambda: None
+        can_serve=lambda: True,
+        has_token=lambda _: False,
+        notify_alive=lambda: None,
+        prefetch=lambda: None,
     )
     lease = lease_on(bucket, name, lease_s)
     assert lease.wait(threading.Event(), print, lambda: 0, standby)
