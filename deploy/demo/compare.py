@@ -303,7 +303,7 @@ def lost_grip(
     vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
     count = max((_vehicle_number(name) for name in vehicles), default=0)
     warned = warned_ones(count, share)
-    rows: dict[tuple[str, int], tuple[bool, int]] = {}
+    passes: dict[tuple[str, int], tuple[bool, int]] = {}  # lost, cell; by vehicle and number
     enter, left = (
         visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time")
     )
@@ -312,16 +312,19 @@ def lost_grip(
     for k in order[on[order] & (enter[order] >= since[order])].tolist():
         name = vehicles[k]
         cell = int(visits["cell"][k].as_py())
-        number, at = last.get(name, (0, -PASS_GAP_NS))
-        number += enter[k] - at > PASS_GAP_NS
+        number, left_ns = last.get(name, (0, -PASS_GAP_NS))
+        if enter[k] - left_ns > PASS_GAP_NS:
+            number += 1
         last[name] = (number, int(left[k]))
         lost = bool(visits["utilisation"][k].as_py() >= LOST)
-        before = rows.get((name, number))
+        before = passes.get((name, number))
         if before is None or (lost and not before[0]):
-            rows[name, number] = (lost, cell)
-    warned_passes = np.array([warned[_vehicle_number(name) - 1] for name, _ in rows], np.bool_)
-    lost_, cell_ = (np.array([row[k] for row in rows.values()]) for k in (0, 1))
-    return LostGrip(warned_passes, lost_.astype(np.bool_), cell_.astype(np.int64))
+            passes[name, number] = (lost, cell)
+    return LostGrip(
+        np.array([warned[_vehicle_number(name) - 1] for name, _ in passes], np.bool_),
+        np.array([lost for lost, _ in passes.values()], np.bool_),
+        np.array([cell for _, cell in passes.values()], np.int64),
+    )
 
 
 def _vehicle_number(vehicle: str) -> int:

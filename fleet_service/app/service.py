@@ -143,11 +143,8 @@ class Service:
         """Return 0 if all admitted data are on disk and nothing failed; 1 otherwise, or if another
         service has taken over.
         """
-        return (
-            1
-            if self.failure is not None or self._followed or self.engine.settlement.unsettled
-            else 0
-        )
+        has_failed = self.failure is not None or self._followed
+        return 1 if has_failed or self.engine.settlement.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         config = self._config
@@ -240,10 +237,8 @@ class Service:
             self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else wait_s))
         now = self._stepped_at = time.monotonic()
         publish_acks(session, self.engine.settlement.end_flush())
-        if (
-            now - self._flushed_at >= self._config.segment_s
-            or self.engine.settlement.until_early_s(now) <= 0.0
-        ):
+        is_flush_due = now - self._flushed_at >= self._config.segment_s
+        if is_flush_due or self.engine.settlement.until_early_s(now) <= 0.0:
             self._flushed_at = now
             publish_acks(session, self.engine.settlement.begin_flush())
             self.engine.intake.update_weather(self._clock.now())
@@ -254,14 +249,18 @@ class Service:
             self._repeated_at = now
             publish_alerts(session, self.engine.alerts.next_to_repeat(REPEATED))
         if self._status_line.is_due(now):
-            self._status_line.write_line(now)
-            if hanging := self._hanging():
-                self._events.info(f"watchdog signal withheld: {hanging}")
-            else:
-                watchdog.notify_alive()
+            self._report_status(now)
         if not self._survived and now - self._began >= SURVIVED_S:
             self._survived = True
             self.engine.mark_survived()
+
+    def _report_status(self, now: float) -> None:
+        """Write the status line, and notify the watchdog unless a part of the service hangs."""
+        self._status_line.write_line(now)
+        if hanging := self._hanging():
+            self._events.info(f"watchdog signal withheld: {hanging}")
+        else:
+            watchdog.notify_alive()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
         """Process and acknowledge the waiting messages within LEAVE_S [s]. Nothing is lost

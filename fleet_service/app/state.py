@@ -7,7 +7,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -18,7 +17,7 @@ from fleet_service.archive.format.layout import DAY_NS, Cut
 from fleet_service.archive.format.load import skip_damaged
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.store.store import distinct_values
-from fleet_service.ingest.dedup import SequenceTrackers
+from fleet_service.ingest.dedup import ArchivedRows, SequenceTrackers
 from fleet_service.ingest.weather import archived_reports
 from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.rebuild import (
@@ -37,6 +36,7 @@ from fleet_service.serve.tile_cache import TileCache
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 from schemas.numeric import IntArray
+from schemas.wire import Kind
 
 # [ns] Time after the last visit after which a cell may be dropped. It is 56 times the mean time
 # between changes (fusion.constants.CHANGE_S), so that the belief has become the prior.
@@ -196,18 +196,21 @@ def load_state(
     matters = Begin(first, begin.cut, until)
     heard = ignore_observations if public is None else public.follow
     rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
-    with ThreadPoolExecutor(1, "streams") as beside:
+
+    def read_later_streams() -> list[tuple[Kind, ArchivedRows]]:
         # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so the later
         # rows, which are few, are read now and added afterwards.
-        noting = beside.submit(
-            (lambda: list(read_streams(root, matters, damaged)))
-            if begin.cut
-            else partial(restore_streams, root, streams, matters, damaged)
-        )
+        if begin.cut:
+            return list(read_streams(root, matters, damaged))
+        restore_streams(root, streams, matters, damaged)
+        return []
+
+    with ThreadPoolExecutor(1, "streams") as thread:
+        later = thread.submit(read_later_streams)
         for updated in rest:
             alerts.update(updated.slots)
             shown.mark_changed(updated.slots)
-        for kind, rows in noting.result() or []:
+        for kind, rows in later.result():
             streams.restore(kind, rows)
     pa.default_memory_pool().release_unused()  # memory from reading the archive
     memory = ServiceState(fusion, shown, alerts, streams, begin.refused, public)

@@ -149,14 +149,7 @@ def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     _add_text(record, "sit:situationRecordCreationTime", format_time(now))
     _add_text(record, "sit:situationRecordObservationTime", format_time(alert.time))
     _add_text(record, "sit:situationRecordVersionTime", format_time(now))
-    sure = (
-        "certain"
-        if alert.p_slippery > CERTAIN
-        else "probable"
-        if alert.p_slippery > PROBABLE
-        else "riskOf"
-    )
-    _add_text(record, "sit:probabilityOfOccurrence", sure)
+    _add_text(record, "sit:probabilityOfOccurrence", _probability_word(alert.p_slippery))
     _add_text(record, "sit:severity", "high" if alert.mu < SLIPPERY_MU / 2 else "medium")
     _add_text(record, "sit:safetyRelatedMessage", "true")
     source = ET.SubElement(record, _qualified_name("sit:source"))
@@ -181,6 +174,15 @@ def _make_record(alert: StretchAlert, name: str, now: int) -> ET.Element:
     )
     _add_text(friction, "com:friction", f"{alert.mu:.2f}")
     return record
+
+
+def _probability_word(p_slippery: float) -> str:
+    """Return the DATEX II word for the probability that the road is slippery."""
+    if p_slippery > CERTAIN:
+        return "certain"
+    if p_slippery > PROBABLE:
+        return "probable"
+    return "riskOf"
 
 
 def _make_location(alert: StretchAlert) -> ET.Element:

@@ -103,13 +103,17 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
             one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)
         }
         declared = bool(before | after)
-        served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
-        if not declared and services.refresh(session):  # a service started during the check
-            declared = True
-            served = bool(payloads)
-        # The service started during the check and will declare its token, or it declares none.
-        elif not declared and served and not payloads:
-            payloads = sorted(query_replies(session, EVERYWHERE, parameters))
+        if declared:
+            served = bool(payloads or whole)
+        else:
+            served = bool(payloads) or is_served(session, asked)
+            if services.refresh(session):  # a service started during the check
+                declared = True
+                served = bool(payloads)
+            elif served and not payloads:
+                # The service started during the check and will declare its token, or it declares
+                # none.
+                payloads = sorted(query_replies(session, EVERYWHERE, parameters))
     answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
     if not declared:  # services without tokens: an older version, or an access list of one
         return answer
@@ -135,7 +139,8 @@ def query_replies(
     """
     text = ";".join(f"{name}={value}" for name, value in parameters.items())
     timeout = PAST_S if "at" in parameters else TIMEOUT_S
-    for reply in session.get(f"{key}?{text}" if text else key, timeout=timeout):
+    selector = f"{key}?{text}" if text else key
+    for reply in session.get(selector, timeout=timeout):
         if reply.ok is None:
             reason = reply.err.payload.to_string() if reply.err else "no reply"
             field, _, rest = reason.partition(": ")
@@ -182,8 +187,13 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     2. If the query names no place, a service replies to a query of the whole map.
     3. A service's liveliness token is visible. Not every reader may see tokens.
     """
-    point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
-    if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
+    point = None
+    if asked.route:
+        point = asked.route[0]
+    elif asked.bbox:
+        point = asked.bbox[:2]
+    longitude, latitude = point or (0.0, 0.0)
+    if is_place_served(session, latitude, longitude):
         return True
     if point is None and any(True for _ in query_replies(session, EVERYWHERE, {})):
         return True

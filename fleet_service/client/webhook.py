@@ -17,6 +17,7 @@ import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Callable
+from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
@@ -82,6 +83,14 @@ def queue_path(url: str) -> Path:
     """Return the default path of the queue file for a receiver's URL."""
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return state / "gripmap" / f"webhook-{hashlib.sha256(url.encode()).hexdigest()[:16]}.sqlite"
+
+
+class Attempt(Enum):
+    """Result of an attempt to send the oldest message of the queue."""
+
+    QUEUE_EMPTY = auto()
+    ANSWERED = auto()  # the receiver accepted the message, or refused it for good
+    FAILED = auto()
 
 
 class Webhook:
@@ -191,37 +200,40 @@ class Webhook:
 
         with asyncio.Runner() as runner:
             client = httpx.AsyncClient(follow_redirects=False, timeout=self._timeout_s)
-            wait = FIRST_WAIT_S
             while True:
                 self._more.wait()
                 self._more.clear()
-                while (failure := self._send_first(runner, client)) is not None:
-                    if not failure:
-                        wait = FIRST_WAIT_S
-                        continue
-                    if self._stop.is_set():
-                        break
-                    self._stop.wait(wait)
-                    wait = min(2 * wait, LONGEST_WAIT_S)
+                self._send_queue(runner, client)
                 if self._stop.is_set():
                     break
             runner.run(client.aclose())
 
-    def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> str | None:
-        """Send the oldest alert message of the queue to the webhook's receiver. Return None if the
-        queue is empty, "" if the receiver accepted the message or refused it for good, else the
-        reason of the failure.
+    def _send_queue(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> None:
+        """Send the alert messages of the queue, oldest first, until the queue is empty. After a
+        failure, wait and try again, unless the webhook is being closed.
         """
+        wait = FIRST_WAIT_S
+        while (attempt := self._send_first(runner, client)) is not Attempt.QUEUE_EMPTY:
+            if attempt is Attempt.ANSWERED:
+                wait = FIRST_WAIT_S
+                continue
+            if self._stop.is_set():
+                return
+            self._stop.wait(wait)
+            wait = min(2 * wait, LONGEST_WAIT_S)
+
+    def _send_first(self, runner: asyncio.Runner, client: httpx.AsyncClient) -> Attempt:
+        """Send the oldest alert message of the queue to the webhook's receiver."""
         try:
             first = self._queue.read_first()
             if first is None:
-                return None
+                return Attempt.QUEUE_EMPTY
             number, text = first
             status = runner.run(self._post_message(client, text))
             failure = _failure_of(status)
             if failure is None:
                 self._record_answer(number, status)
-                return ""
+                return Attempt.ANSWERED
         # Any error may occur, and the thread must continue.
         except Exception as error:  # noqa: BLE001
             failure = f"{type(error).__name__} {error}".strip()
@@ -229,7 +241,7 @@ class Webhook:
         if not self._failure:
             self._say(f"webhook: {self._name} does not accept alerts ({failure}); they wait")
         self._failure = failure
-        return failure
+        return Attempt.FAILED
 
     def _record_answer(self, number: int, status: int) -> None:
         is_delivered = 200 <= status < 300

@@ -240,15 +240,14 @@ class BatchIntake:
                 if owner is not None
             ]
         found = decode_many(kind, [(message.payload, message.encoding) for message in messages])
-        keyed = [owner for owner in found_owners if owner is not None]
+        owners = [owner for owner in found_owners if owner is not None]
         for index, error in found.errors:
-            self._refuse_unusable(kind, keyed[index], messages[index], error)
+            self._refuse_unusable(kind, owners[index], messages[index], error)
+        if found.errors:
+            owners = [owners[index] for index in found.indices]
         time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
-        owners = (
-            keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
-        )
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
-        self._tell_time(owners, time)
+        self._record_times(owners, time)
         for place in np.flatnonzero(broken >= 0).tolist():
             refusal = rules[broken[place]]
             if validation.is_doubted(refusal, int(time[place]), clock):
@@ -259,8 +258,8 @@ class BatchIntake:
         for place in np.flatnonzero(good & self._is_erased(owners, time)).tolist():
             good[place] = False
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
-        new = self._new(kind, found.heads, time, good)
-        return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
+        new = self._select_new(kind, found.heads, time, good)
+        return self._admit_rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
         """Drop streams (batches of one vehicle, start and region) that are too old to matter. Also
@@ -288,19 +287,22 @@ class BatchIntake:
         out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():
-                with suppress(OSError):  # without the month's key, `_new` does not accept the batch
+                # Without the month's key, `_select_new` does not accept the batch.
+                with suppress(OSError):
                     pseudonym = self._pseudonyms.of(str(owners[place].name), int(time[place]))
                     out[place] = int(time[place]) < self._erased.vehicles.get(
                         pseudonym_number(pseudonym), 0
                     )
         return out
 
-    def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
+    def _record_times(self, owners: Sequence[Parsed], time: IntArray) -> None:
         for owner, measured in zip(owners, time.tolist(), strict=True):
             name = str(owner.name)
             self.times[name] = max(self.times.get(name, 0), measured)
 
-    def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
+    def _select_new(
+        self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray
+    ) -> dict[BatchId, int]:
         """Return the batches that are valid (mask `good`) and that were not accepted before, each
         once, with their positions in `heads` (fields of the batches other than records).
         """
@@ -362,11 +364,11 @@ class BatchIntake:
         stream.witness = witness
         return stream
 
-    def _rows(
+    def _admit_rows(
         self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock
     ) -> AcceptedBatches:
         batches = list(new)
-        (rows, heads, sizes) = _select_batches(found, list(new.values()))
+        rows, heads, sizes = _select_batches(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
@@ -417,19 +419,18 @@ class BatchIntake:
         cannot be read, only count the refusal.
         """
         head = head_of(kind, message.payload, message.encoding)
-        named = (
-            head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
-        )
+        region = owner.quadint
         if (
             head is not None
-            and named
+            and region is not None
+            and head.vehicle == owner.name
+            and head.region in (0, region)
             and head.boot >= 0
             and head.seq >= 1
-            and owner.quadint is not None
         ):
             self._acks.record_rejected(
                 head.vehicle,
-                head._replace(region=owner.quadint),
+                head._replace(region=region),
                 validation.BATCH,
                 str(error)[:150],
             )

@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -181,24 +182,28 @@ def archived_reports(
         OSError: the archive cannot be read.
     """
     recent = [ValueRange("acts_from", acts_since // US_STEP)]
-    for _ in range(_TURNS):
-        try:
-            paths = [path for path in weather_files(root) if path.name not in known]
-            parts = [
-                load(path, tables.WEATHER_ARCHIVE, where=recent, whole=True, damaged=damaged)
-                for path in paths
-            ]
-            break
-        except FileNotFoundError:  # another process has joined the file into a daily file
-            continue
-    else:
-        raise OSError(f"the weather of {root} changes faster than it can be read")
-    table = pa.concat_tables(
-        [tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)]
-    )
+    parts = _load_parts(root, known, recent, damaged)
+    table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *parts])
     if received_until is not None:
         table = table.filter(pa.array(to_nanoseconds(table["received_at"]) <= received_until))
     return _read_reports(table)
+
+
+def _load_parts(
+    root: Path, known: Collection[str], where: list[ValueRange], damaged: Damaged
+) -> list[pa.Table]:
+    """Return the rows of the archive's weather files, without the damaged files and those in
+    `known`. Read them all again if another process meanwhile joined some into a daily file.
+    """
+    for _ in range(_TURNS):
+        with suppress(FileNotFoundError):
+            parts = [
+                load(path, tables.WEATHER_ARCHIVE, where=where, whole=True, damaged=damaged)
+                for path in weather_files(root)
+                if path.name not in known
+            ]
+            return [part for part in parts if part is not None]
+    raise OSError(f"the weather of {root} changes faster than it can be read")
 
 
 def weather_files(root: Path) -> list[Path]:

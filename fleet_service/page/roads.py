@@ -82,17 +82,27 @@ def read_roads(path: Path) -> RoadMap:
     return found
 
 
+def _directions_of(oneway: str) -> int:
+    """Return the driving directions of a line as bits: 1 along its points, 2 against them."""
+    if oneway in ("yes", "true", "1", "forward"):
+        return 1
+    if oneway in ("-1", "backward"):
+        return 2
+    return 3
+
+
 def _add_feature(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]) -> None:
     kind = geometry["type"]
     points = geometry["coordinates"]
     name = str(about.get("name") or "")
     if kind == "Point" and name:
         found.places.append((name, float(points[0]), float(points[1])))
-    lines = [points] if kind == "LineString" else points if kind == "MultiLineString" else []
-    oneway = str(about.get("oneway") or "").lower()
-    directions = (
-        1 if oneway in ("yes", "true", "1", "forward") else 2 if oneway in ("-1", "backward") else 3
-    )
+    lines = []
+    if kind == "LineString":
+        lines = [points]
+    elif kind == "MultiLineString":
+        lines = points
+    directions = _directions_of(str(about.get("oneway") or "").lower())
     for line in lines:
         kept = [[round(float(x), 7), round(float(y), 7)] for x, y, *_ in line]
         if len(kept) > 1:

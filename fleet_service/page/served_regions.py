@@ -47,15 +47,18 @@ class ServedRegions:
         Regions with known cells need no record, because queries about these cells show if a service
         answers.
         """
-        here = {token.region for token in services.active}
+        served = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
-        fallen = {
-            token.region
-            for token in services.lost_tokens
-            if token.region.startswith(tuple("0123"))
-            and not any(regions.covers(one, token.region) for one in here)
-            and not any(regions.overlap(one, token.region) for one in known)
-        }
+
+        def is_fallen(region: str) -> bool:
+            if not region.startswith(tuple("0123")):  # the whole map
+                return False
+            is_served = any(regions.covers(one, region) for one in served)
+            has_cells = any(regions.overlap(one, region) for one in known)
+            return not is_served and not has_cells
+
+        lost = {token.region for token in services.lost_tokens}
+        fallen = {region for region in lost if is_fallen(region)}
         self._fallen = {region: self._fallen.get(region, now) for region in fallen}
 
     def is_answered(self, region: int) -> bool:

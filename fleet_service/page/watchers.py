@@ -138,17 +138,16 @@ class Watchers:
                 if grid.touches(watcher.view.box, _tile_box(block.tile)):
                     place = (block.tile, watcher.view.level)
                     if place not in lines:
-                        lines[place] = (
-                            b"data: "
-                            + base64.b64encode(self._encode_block(block, place[1]))
-                            + b"\n"
-                        )
+                        lines[place] = self._event_line(block, watcher.view.level)
                     found.append(lines[place])
             if found:
                 self._put(watcher, b"event: tiles\n" + b"".join(found) + b"\n")
 
-    def _encode_block(self, block: TileBlock, level: int) -> bytes:
-        return block.encoded() if level == CELL_LEVEL else self._world.encoded(block.tile, level)
+    def _event_line(self, block: TileBlock, level: int) -> bytes:
+        """Return the line of an event that contains the block in the form of a zoom level."""
+        is_cells = level == CELL_LEVEL
+        content = block.encoded() if is_cells else self._world.encoded(block.tile, level)
+        return b"data: " + base64.b64encode(content) + b"\n"
 
     def _tell(self, event: bytes) -> None:
         for watcher in list(self._watchers.values()):

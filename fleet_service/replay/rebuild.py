@@ -4,7 +4,7 @@ past moment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
@@ -311,11 +311,10 @@ def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.T
     Raises:
         InputError: there are more than `most` rows.
     """
-    for held in (
-        _split_parts(listing, most)
-        if most is not None
-        else _prefetch_parts(_split_parts(listing, most))
-    ):
+    parts = _split_parts(listing, most)
+    if most is None:
+        parts = _prefetch_parts(parts)
+    for held in parts:
         yield from held.chunks()
         pa.default_memory_pool().release_unused()  # so that the next part can use this memory
         trim_memory()
@@ -365,15 +364,28 @@ def _split_parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
             if mine is not None:
                 held.take(filter_table(mine, within))
                 held.keep()
-            for path in files[day]:
-                if listing.load_groups(path, within, held.take):
-                    held.keep()
-                else:
-                    held.forget()
-                if most is not None and seen + held.rows > most:
-                    raise too_much()
+            _hold_files(held, listing, files[day], within, None if most is None else most - seen)
             seen += held.rows
             yield held
+
+
+def _hold_files(
+    held: _Held,
+    listing: reading.Listing,
+    files: Iterable[Path],
+    within: list[ValueRange],
+    most: int | None,
+) -> None:
+    """Add the rows of the archive's files in the range `within` to `held`. Raise an InputError if
+    it then contains more than `most` rows.
+    """
+    for path in files:
+        if listing.load_groups(path, within, held.take):
+            held.keep()
+        else:
+            held.forget()
+        if most is not None and held.rows > most:
+            raise too_much()
 
 
 class _Held:
@@ -474,5 +486,5 @@ def _rows_of(path: Path, box: Box | None = None) -> int:
         footer = pq.read_metadata(path)
     except (OSError, pa.ArrowInvalid):
         return 0
-    near = Since(box=box).where() or []
+    near = Since(box=box).where() or ()
     return sum(int(footer.row_group(group).num_rows) for group in matching_row_groups(footer, near))

@@ -77,16 +77,17 @@ class FileTransfer:
             if name not in there or (name in local and local[name].size != there[name]):
                 self._journal.remove(name)
         known = self._journal.copy_stamps()
-        whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{MANIFEST}")}
-        wanted = [
-            name
-            for name in there
-            if name not in local
-            and is_copied(name)
-            and (name not in known or self._files.set_aside_path(name).exists())
-            and (not name.startswith(CHECKPOINTS) or name.rpartition("/")[0] in whole)
-        ]
-        list(self._pool.map(self._download_file, wanted))
+        complete = {name.rpartition("/")[0] for name in there if name.endswith(f"/{MANIFEST}")}
+
+        def is_wanted(name: str) -> bool:
+            if name in local or not is_copied(name):
+                return False
+            was_deleted_here = name in known and not self._files.set_aside_path(name).exists()
+            is_incomplete = name.startswith(CHECKPOINTS) and name.rpartition("/")[0] not in complete
+            return not was_deleted_here and not is_incomplete
+
+        wanted = [name for name in there if is_wanted(name)]
+        list(self._pool.map(self._download_file, wanted))  # raises if a download failed
         paths = [self._files.path_of(name) for name in wanted]
         sync_tree(self._files.root, {path.parent for path in paths})
         # Record the files only now. After a power loss, recorded but missing files would count as

@@ -182,7 +182,9 @@ def _acquire_under_lease(
     lease = Lease(holder, bucket, config.name, config.lease_s)
     copy = BucketReplica(root, url, options)
     mirrors = empty or known
-    standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
+    standby = None
+    if signs is not None:
+        standby = Standby(*signs, copy.prefetch if mirrors else lambda: None)
     try:
         while lease.wait(stop, log_line, copy.largest_epoch, standby):
             lease.start_renewal()

@@ -60,14 +60,24 @@ class UploadJournal:
         self._head = json.dumps({"copy": url})
         self._guard = Lock()
         self._stamps: dict[str, Stamp] = {}
-        lines = self._path.read_text(errors="replace").splitlines() if self._path.exists() else []
-        for line in lines[1:] if lines[:1] == [self._head] else []:
+        self._read_entries()
+        self._file = self._write_entries()
+
+    def _read_entries(self) -> None:
+        """Read the entries of an earlier run, unless they belong to another copy. A later line
+        about the same file replaces the earlier one; a line without a stamp removes it.
+        """
+        if not self._path.exists():
+            return
+        head, *lines = self._path.read_text(errors="replace").splitlines() or [""]
+        if head != self._head:
+            return
+        for line in lines:
             with suppress(ValueError, TypeError, KeyError):  # a power loss cut off the line
                 name, *stamp = json.loads(line)
                 self._stamps.pop(name, None)
                 if stamp:
                     self._stamps[name] = Stamp(*map(int, stamp))
-        self._file = self._write_entries()
 
     def _write_entries(self) -> FileIO:
         """Replace the file by one with a line for each entry; return the file, open for further

@@ -42,11 +42,11 @@ def answer_query(
     """
     route = keys_along(query.route) if query.route else None
     tiles = filter(wanted, _select_tiles(cache, query, route, only))
-    for tile, shown in (
-        _shown_in_groups(cache, tiles, now)
-        if route is None and query.basis is None
-        else ((tile, _view_tile(cache, tile, query, route, now)) for tile in tiles)
-    ):
+    if route is None and query.basis is None:
+        shown_tiles = _shown_in_groups(cache, tiles, now)
+    else:
+        shown_tiles = ((tile, _view_tile(cache, tile, query, route, now)) for tile in tiles)
+    for tile, shown in shown_tiles:
         payload = _encode_tile(shown, _select_rows(shown, query), query.format, tile)
         if payload is not None:
             yield tile, payload

@@ -79,13 +79,11 @@ def expression(t: Table) -> Table:
     road = t.temperature - AIR_ABOVE_ROAD_C
     band = ibis.literal(UNKNOWN)
     for name, low, high in BANDS:
-        inside = (
-            (road > low)
-            if np.isinf(high)
-            else (road <= high)
-            if np.isinf(low)
-            else (road > low) & (road <= high)
-        )
+        inside = ibis.literal(True)
+        if np.isfinite(low):
+            inside &= road > low
+        if np.isfinite(high):
+            inside &= road <= high
         band = ibis.ifelse(inside, name, band)
     t = t.mutate(
         band=ibis.ifelse(t.temperature.isnull(), UNKNOWN, band),

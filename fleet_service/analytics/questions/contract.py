@@ -264,8 +264,13 @@ def _judge_link(
         key=lambda k: float(each["mu"][k]),
     )
     enough = share >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
+    verdict = UNKNOWN
+    if least > within:
+        verdict = BROKEN
+    elif most <= within and enough:
+        verdict = KEPT
     return {
-        "verdict": BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN,
+        "verdict": verdict,
         "breach_s": by_mean,
         "least_s": least,
         "most_s": most,

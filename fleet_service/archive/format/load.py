@@ -189,11 +189,9 @@ def _read_row_groups(file: pq.ParquetFile, names: list[str] | None, where: Where
         filter_table(file.read_row_group(group, names), known)
         for group in matching_row_groups(file.metadata, where)
     ]
-    return (
-        pa.concat_tables(parts)
-        if parts
-        else own.empty_table().select(own.names if names is None else names)
-    )
+    if parts:
+        return pa.concat_tables(parts)
+    return own.empty_table().select(own.names if names is None else names)
 
 
 def read_content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:

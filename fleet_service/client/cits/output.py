@@ -55,13 +55,10 @@ class DenmOutput:
         self._lock = threading.Lock()
         self._checked = -float("inf")
         before = _read_state(path)
-        self._book = EventBook(station, None if before is None else before["book"])
-        self._pending: dict[str, bytes] = {}
-        for name, body in ({} if before is None else before["pending"]).items():
-            self._pending[name] = bytes.fromhex(body)
-            self._send(
-                self._make_parcel(name, self._pending[name], decode_denm(self._pending[name]))
-            )
+        self._book = EventBook(station, before["book"])
+        self._pending = {name: bytes.fromhex(body) for name, body in before["pending"].items()}
+        for name, body in list(self._pending.items()):
+            self._send(self._make_parcel(name, body, decode_denm(body)))
 
     @property
     def is_due(self) -> bool:
@@ -108,9 +105,10 @@ class DenmOutput:
         return Parcel(name, body, message_properties(denm, self._originator))
 
 
-def _read_state(path: Path) -> dict[str, Any] | None:
+def _read_state(path: Path) -> dict[str, Any]:
+    """Return the events ("book", None without a file) and the pending messages of a state file."""
     if not path.exists():
-        return None
+        return {"book": None, "pending": {}}
     try:
         found: dict[str, Any] = json.loads(path.read_text())
         if not isinstance(found["pending"], dict) or not isinstance(found["book"], dict):
