@@ -11,6 +11,7 @@ import codecs
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -90,10 +91,8 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
         return convert_vbo(path, stripped, {})
     named = _plain_names(table.column_names)
     column = _time_column(path, named, time)
-    unit = _UNIT.match(named[column])
-    t, start_ns = _parse_seconds(
-        table[named[column]], column, time_unit or (unit["unit"] if unit else None)
-    )
+    title = named[column]
+    t, start_ns = _parse_seconds(table[title], column, time_unit or _unit_in(title) or None)
     back = np.flatnonzero(~((np.diff(t) >= 0.0) & np.isfinite(t[1:])))
     if len(back):
         raise InputError(
@@ -103,13 +102,12 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
         )
     recording = Recording(path.name, {}, start_ns, rows=True, notes=notes)
     left = []
-    for name, whole in named.items():
+    for name, title in named.items():
         if name == column:
             continue
-        if whole in numbers:
-            unit = _UNIT.match(whole)
-            recording.signals[name] = Series(t, numbers[whole], unit["unit"] if unit else "")
-        elif not pa.types.is_null(table[whole].type):
+        if title in numbers:
+            recording.signals[name] = Series(t, numbers[title], _unit_in(title))
+        elif not pa.types.is_null(table[title].type):
             left.append(name)
     if left:
         notes.append(f"{path.name}: left out, not only numbers: {', '.join(left[:MOST_NAMES])}")
@@ -148,16 +146,20 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
             f"{cut[0].expected_columns}",
             "export it with the column names in the first line",
         )
-    if mark != ",":  # the numbers may have decimal commas
-        for index, name in enumerate(table.column_names):
-            if pa.types.is_string(table[name].type):
-                text = pc.replace_substring(table[name], ",", ".")
-                try:
-                    table = table.set_column(index, name, pc.cast(text, pa.float64()))
-                except pa.ArrowInvalid:
-                    continue
+    if mark != ",":
+        table = _convert_decimal_commas(table)
     notes = [f"{path.name}: {len(cut)} incomplete rows left out"] if cut else []
     return table, notes
+
+
+def _convert_decimal_commas(table: pa.Table) -> pa.Table:
+    """Convert the text columns of a table that contain only numbers with decimal commas."""
+    for index, name in enumerate(table.column_names):
+        if pa.types.is_string(table[name].type):
+            text = pc.replace_substring(table[name], ",", ".")
+            with suppress(pa.ArrowInvalid):
+                table = table.set_column(index, name, pc.cast(text, pa.float64()))
+    return table
 
 
 def _guess_encoding(head: bytes) -> str:
@@ -190,16 +192,13 @@ def _read_racechrono(path: Path, lines: list[str]) -> pa.Table:
     units = rows[1]
     sources = rows[2]
     skipped = place + (3 if "unix time" in units or not _is_number(units[0]) else 1)
-    whole: list[str] = []
+    titles: list[str] = []
     for k, name in enumerate(names):
         unit = units[k].strip() if k < len(units) else ""
-        title = (
-            name
-            if all(_plain_title(other) != name for other in whole)
-            else f"{name} {sources[k].strip()}"
-        )
-        whole.append(f"{title} [{unit}]" if unit and unit != "unix time" else title)
-    options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_make_distinct(whole))
+        is_repeated = any(_plain_title(other) == name for other in titles)
+        title = f"{name} {sources[k].strip()}" if is_repeated else name
+        titles.append(f"{title} [{unit}]" if unit and unit != "unix time" else title)
+    options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_make_distinct(titles))
     return pc_csv.read_csv(path, read_options=options)
 
 
@@ -218,6 +217,12 @@ def _plain_names(titles: Sequence[str]) -> dict[str, str]:
         name if count[name] == 1 else title: title
         for name, title in zip(plain, titles, strict=True)
     }
+
+
+def _unit_in(title: str) -> str:
+    """Return the unit that the title of a column states, "" if there is none."""
+    found = _UNIT.match(title)
+    return found["unit"] if found else ""
 
 
 def _plain_title(title: str) -> str:
