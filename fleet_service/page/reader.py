@@ -142,7 +142,10 @@ class Reader:
         with _refusals_logged(sample):
             parsed = keys.parse(str(sample.key_expr))
             names = self._names[parsed.topic.name]
-            (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
+            if sample.kind == zenoh.SampleKind.PUT:
+                names.add(str(parsed.name))
+            else:
+                names.discard(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
         """Query all tiles and alerts that existed before this session. The subscription to changes

@@ -97,7 +97,9 @@ def _parse_interval(text: str, now: int) -> tuple[int, int | None]:
         )
     if begin is not None and end is not None and begin > end:
         raise InputError("datetime", "ends before it begins", "give the earlier time first")
-    return (begin or 0) if is_interval else 0, None if end is None or end >= now else end
+    since = begin if begin is not None and is_interval else 0
+    at = end if end is not None and end < now else None
+    return since, at
 
 
 def _parse_instant(text: str) -> int | None:

@@ -45,18 +45,7 @@ def impute_cells(
     time of an observation of the neighbours [ns].
     """
     live = source.live
-    slots = known[grid.tile_of(live.key[known] // grid.SECTORS) == tile]
-    near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
-    visited = np.repeat(slots, 8)
-    sector = live.key[visited] % grid.SECTORS
-    free = (
-        (near >= 0)
-        & (grid.tile_of(near) == tile)
-        & ~np.isin(source.slots_of(np.maximum(near, 0), sector), slots)
-    )
-    keys = (near * grid.SECTORS + sector)[free]
-    visited = visited[free]
-    share = np.full(len(keys), 1.0 - PRIOR_SHARE)
+    keys, visited, share = _adjacent_gaps(source, tile, known)
     if route is not None:
         ahead = np.isin(keys, route)
         along = _route_gaps(source, route, tile, known)
@@ -88,6 +77,24 @@ def impute_cells(
         last=last,
         imputed=np.ones(len(wanted), bool),
     )
+
+
+def _adjacent_gaps(
+    source: Readable, tile: int, known: IntArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the unvisited cells of a tile next to visited cells in the same sector: keys, slots of
+    the visited neighbours, and weights, (k,) each, as `_route_gaps` does. A key appears once per
+    neighbour.
+    """
+    key = source.live.key
+    slots = known[grid.tile_of(key[known] // grid.SECTORS) == tile]
+    near = grid.neighbours(key[slots] // grid.SECTORS).reshape(-1)
+    visited = np.repeat(slots, 8)
+    sector = key[visited] % grid.SECTORS
+    is_unvisited = ~np.isin(source.slots_of(np.maximum(near, 0), sector), slots)
+    free = (near >= 0) & (grid.tile_of(near) == tile) & is_unvisited
+    keys = (near * grid.SECTORS + sector)[free]
+    return keys, visited[free], np.full(len(keys), 1.0 - PRIOR_SHARE)
 
 
 def _route_gaps(

@@ -73,13 +73,16 @@ class PresenceTracker:
         return active_tokens(session) | self.active
 
     def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record a change of a service's liveliness token (sign that it is alive): the token
-        appeared if `stands` is True, and disappeared if it is False.
+        """Record a change of a service's liveliness token: the token appeared if `stands` is True,
+        and disappeared if it is False.
         """
         with self._guard:
-            (self._here.add if stands else self._here.discard)(token)
-            (self._withdrawn.discard if stands else self._withdrawn.add)(token)
-            if not stands:
+            if stands:
+                self._here.add(token)
+                self._withdrawn.discard(token)
+            else:
+                self._here.discard(token)
+                self._withdrawn.add(token)
                 self._fell.add(token)
 
 

@@ -190,11 +190,9 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
     compact(root)
     begin, end = _days_of_month(month)
     pseudonym = _pseudonym_of(root, vehicle, month)
-    if (
-        newest := _newest_first_time(
-            root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)]
-        )
-    ) >= 0:
+    is_theirs = [ValueRange("vehicle", pseudonym, pseudonym)]
+    newest = _newest_first_time(root, (begin, end), is_theirs)
+    if newest >= 0:
         erasures.record_erasure(root / _KEYS, month, newest, pseudonym)
     rows = 0
     files = [*root.rglob(f"*{BAD}")]
@@ -211,10 +209,14 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
             ]
             iceberg.unregister(root, theirs)
             for path in theirs:
-                if len(removed := _remove_vehicle(root, kind, path, pseudonym)):
-                    rows = rows + len(removed)
-                    cells = cells.union(removed)
-                    files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
+                removed = _remove_vehicle(root, kind, path, pseudonym)
+                if not removed:
+                    continue
+                rows += len(removed)
+                cells.update(removed)
+                files.append(path)
+                if kind is Kind.OBSERVATION:
+                    files.append(rollup.part_of(path))
         for folder in layout.day_folders(root, snapshots.TABLE, begin, end):
             files += [
                 path
