@@ -22,7 +22,7 @@ from typing import BinaryIO, Final, NamedTuple
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion
-from fleet_service.replay.rebuild import Box, Heard, past_fusion, rows_near, too_much
+from fleet_service.replay.rebuild import Box, EpochListener, past_fusion, rows_near, too_much
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.public_cells import PublicCells
 from fleet_service.serve.query import answer_query
@@ -79,10 +79,10 @@ class HistoricalMaps:
         self._idle: _Process | None = None
 
     def ask(
-        self, question: PastQuery, wanted: Callable[[int], bool]
+        self, question: PastQuery, is_requested: Callable[[int], bool]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield the tile number and the payload of every reply to a query. `wanted` returns True
-        for the numbers of the tiles that are part of the answer.
+        """Yield the tile number and the payload of every reply to a query. `is_requested` returns
+        True for the numbers of the tiles that are part of the answer.
 
         Raises:
             InputError: too many rows would have to be read, the archive cannot be read, or the
@@ -96,7 +96,7 @@ class HistoricalMaps:
         process = self._ask_process(question)
         try:
             for tile, payload in process.replies():
-                if wanted(tile):
+                if is_requested(tile):
                     yield tile, payload
         finally:
             self._release_process(process)
@@ -250,22 +250,24 @@ def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.
     """
-    heard: list[PublicCells] = []
+    public_cells: list[PublicCells] = []
 
-    def make_listener(fusion: Fusion) -> Heard:
-        heard.append(PublicCells(fusion, Visitors(fusion), question.public))
-        return heard[0].follow
+    def make_listener(fusion: Fusion) -> EpochListener:
+        public_cells.append(PublicCells(fusion, Visitors(fusion), question.public))
+        return public_cells[0].follow
 
     listening = make_listener if question.public > 1 else None
     try:
-        then = past_fusion(
+        past = past_fusion(
             root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening
         )
     except OSError as error:
         raise InputError(
             "at", f"the archive cannot be read ({error.strerror or error})", "ask again later"
         ) from error
-    cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
+    cache = TileCache(
+        MapState(past), nullcontext(), question.public, public_cells[0] if public_cells else None
+    )
     yield from answer_query(cache, question.query, lambda _: True, question.at, question.only)
 
 
@@ -279,8 +281,8 @@ def encode_question(question: PastQuery) -> bytes:
 
 def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
     """Answer one query about a past map, given as a line of JSON; write the replies to `out`."""
-    heard = json.loads(line)
-    question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
+    fields = json.loads(line)
+    question = PastQuery(**{**fields, "query": MapQuery.model_validate_json(fields["query"])})
     try:
         for tile, payload in replies_to(root, question):
             out.write(_HEAD.pack(tile, len(payload)) + payload)
@@ -291,14 +293,14 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
     out.flush()
 
 
-def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
+def answer_all(root: Path, query_stream: BinaryIO, out: BinaryIO) -> None:
     """Answer queries about past maps until none arrives for IDLE_S [s], or until ANSWERS queries
     have been answered.
     """
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)  # each reading thread needs 20 MB of memory
     for _ in range(ANSWERS):
-        if not select([asked], [], [], IDLE_S)[0] or not (line := asked.readline()):
+        if not select([query_stream], [], [], IDLE_S)[0] or not (line := query_stream.readline()):
             return
         answer_line(root, line, out)
         trim_memory()

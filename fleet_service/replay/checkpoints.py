@@ -143,11 +143,11 @@ def file_digest(path: Path) -> str:
     return state.hexdigest()
 
 
-def _are_whole(folder: Path, wanted: dict[str, str]) -> bool:
-    """Return True if each file of a checkpoint's folder has the wanted digest."""
+def _are_whole(folder: Path, expected_digests: dict[str, str]) -> bool:
+    """Return True if each file of a checkpoint's folder has the expected digest."""
     with ThreadPoolExecutor() as threads:
-        found = threads.map(file_digest, (folder / name for name in wanted))
-        return list(found) == list(wanted.values())
+        actual_digests = threads.map(file_digest, (folder / name for name in expected_digests))
+        return list(actual_digests) == list(expected_digests.values())
 
 
 def _count_tries(path: Path) -> int:

@@ -118,11 +118,11 @@ class Since(NamedTuple):
         return found or None
 
 
-Heard = Callable[[Observations], AbstractContextManager[None]]
+EpochListener = Callable[[Observations], AbstractContextManager[None]]
 
 
 def ignore_observations(_: Observations) -> AbstractContextManager[None]:
-    """Return a context that does nothing: the default for the argument `heard` of `replay`."""
+    """Return a context that does nothing: the default for the argument `listener` of `replay`."""
     return nullcontext()
 
 
@@ -150,14 +150,14 @@ def past_fusion(
     until: int,
     box: Box | None = None,
     most: int | None = None,
-    listener: Callable[[Fusion], Heard] | None = None,
+    make_listener: Callable[[Fusion], EpochListener] | None = None,
 ) -> Fusion:
     """Return the fusion (beliefs about the friction of the cells) at a past moment, near a box
     (west, south, east, north [deg]). It contains everything that the service had received until the
     time `until` [ns].
 
-    To build other data together with the fusion, a caller gives a `listener`. It is called once,
-    with the new fusion, and returns the function that `replay` uses as `heard`.
+    To build other data together with the fusion, a caller gives a `make_listener`. It is called
+    once, with the new fusion, and returns the function that `replay` uses as `listener`.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -165,9 +165,9 @@ def past_fusion(
     """
     day = until // layout.DAY_NS - layout.MAP_DAYS
     fusion = fusion_with_weather(root, lateness_s, until, (day - 1) * layout.DAY_NS)
-    wanted = Since(Begin(day), until=until, box=box, most=most)
-    heard = ignore_observations if listener is None else listener(fusion)
-    for _ in replay(root, fusion, wanted, heard=heard):
+    selection = Since(Begin(day), until=until, box=box, most=most)
+    listener = ignore_observations if make_listener is None else make_listener(fusion)
+    for _ in replay(root, fusion, selection, listener=listener):
         pass  # a past map has no alerts
     return fusion
 
@@ -192,7 +192,7 @@ def replay(
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
     damaged: Damaged = skip_damaged,
-    heard: Heard = ignore_observations,
+    listener: EpochListener = ignore_observations,
 ) -> Iterator[Updated]:
     """Replay archived observations into `fusion` in order of time. Yield once per epoch (minute) of
     the fusion. Each row is fused with the trust in its vehicle (vote weight) that the service
@@ -206,20 +206,20 @@ def replay(
             state) that contains all rows before `since.begin`.
         since: selection of the rows to replay.
         damaged: called with each damaged file.
-        heard: called with the observations of an epoch; they are fused inside the context that it
-            returns. With this, the caller can update other data together with the fusion.
+        listener: called with the observations of an epoch; they are fused inside the context that
+            it returns. With this, the caller can update other data together with the fusion.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
     columns = COLUMNS if where is None else [*COLUMNS, *FILTERED]
     days = (since.begin.day, last)
-    wanted = reading.Wanted(
+    selection = reading.RowSelection(
         columns, where, days, since.begin.after, since.begin.until, since.near()
     )
     # late rows that were fused after the end of their table, with the recorded result
     waiting: list[tuple[Observations, RecordedResult]] = []
     known = vehicle_ids.read_numbers(root / "keys")
-    for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
+    for table in in_order(reading.Listing(root, Kind.OBSERVATION, selection, damaged), since.most):
         rows = segments.rows_of(table)
         if since.known is not None:
             new = ~_are_known(rows, since.known)
@@ -230,9 +230,9 @@ def replay(
         o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
         waiting = [_select_rows(o, before, epoch > end)]
-        yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), heard)
+        yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), listener)
     if waiting:
-        yield from _fuse_epochs(fusion, *waiting[0], heard)
+        yield from _fuse_epochs(fusion, *waiting[0], listener)
 
 
 def _are_known(rows: segments.Rows, known: SequenceTrackers) -> BoolArray:
@@ -283,7 +283,7 @@ def _select_rows(
 
 
 def _fuse_epochs(
-    fusion: Fusion, o: Observations, before: RecordedResult, heard: Heard
+    fusion: Fusion, o: Observations, before: RecordedResult, listener: EpochListener
 ) -> Iterator[Updated]:
     """Add archived observations to the beliefs about friction epoch by epoch (minute by minute), in
     order of the time at which they were first processed.
@@ -295,7 +295,7 @@ def _fuse_epochs(
     for start, stop in pairwise([0, *borders.tolist(), len(order)]):
         if start < stop:
             taken, used = _select_rows(o, before, slice(start, stop))
-            with heard(taken):
+            with listener(taken):
                 updated = fusion.update(taken, used)
             yield updated
 

@@ -60,10 +60,10 @@ def read_streams(root: Path, begin: Begin, damaged: Damaged) -> Iterator[tuple[K
     """
     for kind, first in layout.FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
-        wanted = reading.Wanted(
+        selection = reading.RowSelection(
             columns, days=(begin.day, None), after=begin.after, until=begin.until
         )
-        for table in reading.read_wanted(root, kind, wanted, damaged):
+        for table in reading.read_selected(root, kind, selection, damaged):
             boot, region, seq, first_held = (
                 table[name].to_numpy() for name in (*IDENTITY[1:], "first_held")
             )

@@ -30,11 +30,11 @@ def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
         OSError: a file cannot be read or written.
     """
     try:
-        there, base = fs.FileSystem.from_uri(uri)
-        there.create_dir(base, recursive=True)
+        destination, base = fs.FileSystem.from_uri(uri)
+        destination.create_dir(base, recursive=True)
         sizes = {
             info.path: info.size
-            for info in there.get_file_info(fs.FileSelector(base, recursive=True))
+            for info in destination.get_file_info(fs.FileSelector(base, recursive=True))
         }
     except (pa.ArrowInvalid, OSError) as error:
         raise InputError(
@@ -44,16 +44,16 @@ def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):
         target = f"{base}/{path.relative_to(root).as_posix()}"
         if path in again or sizes.get(target) != path.stat().st_size:
-            _copy_file(path, there, target)
+            _copy_file(path, destination, target)
             count += 1
     return count
 
 
-def _copy_file(path: Path, there: fs.FileSystem, target: str) -> None:
+def _copy_file(path: Path, destination: fs.FileSystem, target: str) -> None:
     folder, _, name = target.rpartition("/")
-    there.create_dir(folder, recursive=True)
+    destination.create_dir(folder, recursive=True)
     draft = f"{folder}/.{name}.tmp"
-    with path.open("rb") as source, there.open_output_stream(draft) as sink:
+    with path.open("rb") as source, destination.open_output_stream(draft) as sink:
         while chunk := source.read(_CHUNK):
             sink.write(chunk)
-    there.move(draft, target)
+    destination.move(draft, target)

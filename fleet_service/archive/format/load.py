@@ -244,24 +244,24 @@ def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays([_convert_column(table, f) for f in schema], schema=schema)
 
 
-def _convert_column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
-    if wanted.name not in table.column_names:
-        if wanted.name in NEEDED:
+def _convert_column(table: pa.Table, field: pa.Field[Any]) -> pa.ChunkedArray[Any]:
+    if field.name not in table.column_names:
+        if field.name in NEEDED:
             raise InputError(
                 "archive",
-                f"a file has no column {wanted.name}",
+                f"a file has no column {field.name}",
                 "read it with the GripMap that wrote it",
             )
         # Files before format 1.2 lack this column.
-        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):
+        if field.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):
             mu, used = (
                 np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised")
             )
             return pa.chunked_array([pa.array(is_value(mu, used))])
-        return pa.chunked_array([pa.nulls(table.num_rows, wanted.type)])
-    column = table.column(wanted.name)
+        return pa.chunked_array([pa.nulls(table.num_rows, field.type)])
+    column = table.column(field.name)
     try:
-        return column if column.type == wanted.type else column.cast(wanted.type)
+        return column if column.type == field.type else column.cast(field.type)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        problem = f"column {wanted.name} is {column.type} and not {wanted.type}"
+        problem = f"column {field.name} is {column.type} and not {field.type}"
         raise InputError("archive", problem, "read it with the GripMap that wrote it") from error

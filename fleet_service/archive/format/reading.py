@@ -36,7 +36,7 @@ SOURCES: Final = b"gripmap.sources"
 _TURNS: Final = 100
 
 
-class Wanted(NamedTuple):
+class RowSelection(NamedTuple):
     """Selection of rows.
 
     Attributes:
@@ -88,16 +88,16 @@ def read_tables(
         InputError: a file has a newer major version.
         OSError: a file cannot be read.
     """
-    yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
+    yield from read_selected(root, kind, RowSelection(columns, where, days), damaged)
 
 
-def read_wanted(
-    root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
+def read_selected(
+    root: Path, kind: Kind, selection: RowSelection, damaged: Damaged = skip_damaged
 ) -> Iterator[pa.Table]:
-    """Yield tables that together contain every selected row once; `wanted` selects rows, columns
+    """Yield tables that together contain every selected row once; `selection` selects rows, columns
     and files. Damaged files are skipped.
     """
-    listing = Listing(root, kind, wanted, damaged)
+    listing = Listing(root, kind, selection, damaged)
     yield from listing.inbox()
     for path in listing.files:
         part = listing.load(path)
@@ -112,23 +112,25 @@ class Listing:
     Args:
         root: folder of the archive.
         kind: observations or states.
-        wanted: selection of rows.
+        selection: selection of rows.
         damaged: called with each damaged file.
     """
 
     def __init__(
-        self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged
+        self, root: Path, kind: Kind, selection: RowSelection, damaged: Damaged = skip_damaged
     ) -> None:
         self.kind = kind
-        self._wanted = wanted
+        self._selection = selection
         self._damaged = damaged
         self._schema = segments.SCHEMAS[kind]
-        self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
+        self._names = (
+            list(selection.columns) if selection.columns is not None else self._schema.names
+        )
         needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
-        self._fresh = _read_inbox(root, kind, wanted._replace(columns=needed), damaged)
-        files = list(layout.compacted_files(root, kind, *wanted.days))
+        self._fresh = _read_inbox(root, kind, selection._replace(columns=needed), damaged)
+        files = list(layout.compacted_files(root, kind, *selection.days))
         self._done = compacted_partitions(files, {path.name for path, _ in self._fresh})
-        self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
+        self.files = [path for path in files_near(files, selection.box) if selection.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
         """Yield tables of the new rows (inbox) that no compacted (sorted) file contains; call this
@@ -146,7 +148,7 @@ class Listing:
         `where` to `take`, one Parquet row group (part of the file) at a time. Return False if the
         file is damaged or missing; the caller must then discard the rows passed to `take`.
         """
-        both = [*(self._wanted.where or ()), *where]
+        both = [*(self._selection.where or ()), *where]
         try:
             return load_groups(path, self._schema, self._names, both, take, self._damaged)
         except FileNotFoundError:
@@ -157,7 +159,7 @@ class Listing:
         `where`. Return None if the file is damaged, or was removed together with the other files of
         its day.
         """
-        both = [*(self._wanted.where or ()), *(where or ())]
+        both = [*(self._selection.where or ()), *(where or ())]
         try:
             return load(path, self._schema, self._names, both or None, damaged=self._damaged)
         except FileNotFoundError:
@@ -176,18 +178,25 @@ def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | N
 
 
 def _read_inbox(
-    root: Path, kind: Kind, wanted: Wanted, damaged: Damaged
+    root: Path, kind: Kind, selection: RowSelection, damaged: Damaged
 ) -> list[tuple[Path, pa.Table]]:
     for _ in range(_TURNS):
         try:
-            paths = [path for path in segments.list_segments(root, kind) if wanted.newer(path)]
-            if wanted.until is not None:
-                paths = [path for path in paths if layout.age_key(path.name)[:2] <= wanted.until]
+            paths = [path for path in segments.list_segments(root, kind) if selection.newer(path)]
+            if selection.until is not None:
+                paths = [path for path in paths if layout.age_key(path.name)[:2] <= selection.until]
             schema = segments.SCHEMAS[kind]
             loaded = [
                 (
                     path,
-                    load(path, schema, wanted.columns, wanted.where, whole=True, damaged=damaged),
+                    load(
+                        path,
+                        schema,
+                        selection.columns,
+                        selection.where,
+                        whole=True,
+                        damaged=damaged,
+                    ),
                 )
                 for path in paths
             ]

@@ -92,9 +92,9 @@ def write_if_outdated(root: Path) -> None:
     path = root / NAME
     page = page_text().encode()
     # Read bytes and not text, because a power loss may have left invalid content.
-    there = path.read_bytes() if path.exists() else b""
-    if there != page and (
-        not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())
+    current = path.read_bytes() if path.exists() else b""
+    if current != page and (
+        not current.strip(b"\0") or current.startswith(_HEAD.splitlines()[0].encode())
     ):
         with open_durably(path) as file:
             file.write(page)

@@ -57,10 +57,10 @@ def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     ]
 
 
-def _may_match(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow has no type
+def _may_match(statistics: Any, limits: ValueRange) -> bool:  # noqa: ANN401 pyarrow has no type
     if statistics is None or not statistics.has_min_max:
         return True
-    least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])
+    least, most = (bound.encode() if isinstance(bound, str) else bound for bound in limits[1:])
     return (most is None or statistics.min_raw <= most) and (
         least is None or statistics.max_raw >= least
     )

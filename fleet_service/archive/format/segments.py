@@ -76,12 +76,12 @@ class Writer:
         self._unsynced: set[Path] = set()
         # Compacted rows are identified by the names of their segments. So names of compacted
         # segments must not be used again either.
-        named = [
+        used_paths = [
             path
             for kind in SCHEMAS
             for path in (*list_segments(root, kind), *layout.compacted_files(root, kind))
         ]
-        used = [layout.age_key(path.name)[0] for path in named]
+        used = [layout.age_key(path.name)[0] for path in used_paths]
         # A restart does not read segments that are older than a checkpoint. The run that saved it
         # may have had a clock that was ahead, and no rows.
         saved = (root / layout.CHECKPOINTS).glob("[0-9]*")

@@ -42,7 +42,7 @@ class Erasure:
     vehicle: str | None = None
 
 
-def write_request(root: Path, wanted: Erasure) -> Path:
+def write_request(root: Path, erasure: Erasure) -> Path:
     """Write a request to erase data; return the path of its file.
 
     Raises:
@@ -52,7 +52,7 @@ def write_request(root: Path, wanted: Erasure) -> Path:
     folder.mkdir(mode=0o700, exist_ok=True)
     path = folder / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
     with open_durably(path, _SECRET) as file:
-        file.write(json.dumps(asdict(wanted)).encode())
+        file.write(json.dumps(asdict(erasure)).encode())
     # If root makes the request, the files must belong to the service's user.
     owner = root.stat()
     for place in (folder, path):

@@ -109,13 +109,13 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
                     for part in parts
                 },
             )
-            rest = _Rest(root, kind, iter(waiting), done, term)
-            while (moved := _compact_round(rest, round_rows)).segments:
+            uncompacted = _Uncompacted(root, kind, iter(waiting), done, term)
+            while (moved := _compact_round(uncompacted, round_rows)).segments:
                 total = CompactionResult(*map(sum, zip(total, moved, strict=True)))
     return total
 
 
-class _Rest(NamedTuple):
+class _Uncompacted(NamedTuple):
     """Segments whose rows are not yet in compacted (sorted) files, oldest first. `done` contains,
     for each segment, the partitions (date and map square) to which an earlier, interrupted run
     already moved its rows. `term` is the lease term, a number in the names of new files.
@@ -128,35 +128,41 @@ class _Rest(NamedTuple):
     term: int
 
 
-def _compact_round(rest: _Rest, most: int) -> CompactionResult:
-    """Move the rows of the next segments into compacted (sorted) files: about `most` rows, but at
-    least one segment.
+def _compact_round(uncompacted: _Uncompacted, row_limit: int) -> CompactionResult:
+    """Move the rows of the next segments into compacted (sorted) files: about `row_limit` rows, but
+    at least one segment.
     """
     sources: list[Path] = []
     tables: list[pa.Table] = []
     newest = VERSION
     while (
-        sum(table.num_rows for table in tables) < most
-        and (path := next(rest.segments, None)) is not None
+        sum(table.num_rows for table in tables) < row_limit
+        and (path := next(uncompacted.segments, None)) is not None
     ):
         found = read_content(path, set_aside)
         if found is not None:
             sources.append(path)
             newest = max(newest, found.version)
             tables.append(
-                reading.drop_compacted(found.table, rest.kind, rest.done.get(path.name, set()))
+                reading.drop_compacted(
+                    found.table, uncompacted.kind, uncompacted.done.get(path.name, set())
+                )
             )
     if not sources:
         return CompactionResult(0, 0, 0)
-    table = join_versions(tables, segments.SCHEMAS[rest.kind])
-    named = json.dumps(consecutive_runs(path.name for path in sources))
-    footer = {KEY: str(newest), reading.SOURCES.decode(): named}
+    table = join_versions(tables, segments.SCHEMAS[uncompacted.kind])
+    source_names = json.dumps(consecutive_runs(path.name for path in sources))
+    footer = {KEY: str(newest), reading.SOURCES.decode(): source_names}
     files = _place_files(
-        rest.root, rest.kind, layout.compacted_name(sources[-1].name, rest.term), table, footer
+        uncompacted.root,
+        uncompacted.kind,
+        layout.compacted_name(sources[-1].name, uncompacted.term),
+        table,
+        footer,
     )
     for path in sources:
         path.unlink()
-    sync_directory(segments.segment_folder(rest.root, rest.kind))
+    sync_directory(segments.segment_folder(uncompacted.root, uncompacted.kind))
     return CompactionResult(table.num_rows, len(sources), files)
 
 
@@ -166,8 +172,10 @@ def join_versions(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
     The result has the known columns, null where a segment does not have the column. Columns that
     only a newer version knows are added at the end, so that a downgrade loses no data.
     """
-    others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
-    schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
+    unknown_columns = [
+        pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables
+    ]
+    schema = pa.schema([*known, *pa.unify_schemas(unknown_columns, promote_options="permissive")])
     return pa.concat_tables([conform_columns(table, schema) for table in tables])
 
 

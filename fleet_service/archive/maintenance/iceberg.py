@@ -198,7 +198,9 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
     """Bring an Iceberg table up to date in one commit: remove the entries of files that are missing
     or have changed on disk, and add new files.
     """
-    there = {_file_url(root, place, path): path for path in layout.compacted_files(root, kind)}
+    archived_files = {
+        _file_url(root, place, path): path for path in layout.compacted_files(root, kind)
+    }
     mine = {
         name: file
         for name, file in _files_by_name(table).items()
@@ -208,13 +210,13 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
     stale = [
         n
         for n, file in mine.items()
-        if n not in there or there[n].stat().st_size != file.file_size_in_bytes
+        if n not in archived_files or archived_files[n].stat().st_size != file.file_size_in_bytes
     ]
-    missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
+    missing = sorted((archived_files.keys() - mine.keys()) | (archived_files.keys() & set(stale)))
     _commit_files(table, [mine[name] for name in stale], missing)
     now = _files_by_name(table.refresh())
     return RegistrationResult(
-        len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there)
+        len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in archived_files)
     )
 
 
