@@ -59,9 +59,9 @@ class FencedBucket:
         Raises:
             CopyError: the bucket cannot be read.
         """
-        there = self.objects.list_sizes()
+        sizes = self.objects.list_sizes()
         fence = fence_of(self.objects)
-        return {name: size for name, size in there.items() if fence.counts_object(name)}
+        return {name: size for name, size in sizes.items() if fence.counts_object(name)}
 
     def raise_fence(self, term: Term, names: Iterable[str]) -> None:
         """Write the fence of a new owner, and delete all objects that are not valid.

@@ -66,18 +66,22 @@ class FileTransfer:
             return False
         return True
 
-    def download_missing(self, there: Mapping[str, int]) -> int:
+    def download_missing(self, remote_sizes: Mapping[str, int]) -> int:
         """Download the files that only the bucket has; return their number. Also remove from the
         journal the entries of files that the bucket lacks, or has with another size.
 
-        `there` contains the names and sizes [bytes] of the valid objects in the bucket.
+        `remote_sizes` contains the names and sizes [bytes] of the valid objects in the bucket.
         """
         local = self._files.list_files()
         for name in self._journal.copy_stamps():
-            if name not in there or (name in local and local[name].size != there[name]):
+            if name not in remote_sizes or (
+                name in local and local[name].size != remote_sizes[name]
+            ):
                 self._journal.remove(name)
         known = self._journal.copy_stamps()
-        complete = {name.rpartition("/")[0] for name in there if name.endswith(f"/{MANIFEST}")}
+        complete = {
+            name.rpartition("/")[0] for name in remote_sizes if name.endswith(f"/{MANIFEST}")
+        }
 
         def is_wanted(name: str) -> bool:
             if name in local or not is_copied(name):
@@ -86,16 +90,16 @@ class FileTransfer:
             is_incomplete = name.startswith(CHECKPOINTS) and name.rpartition("/")[0] not in complete
             return not was_deleted_here and not is_incomplete
 
-        wanted = [name for name in there if is_wanted(name)]
-        list(self._pool.map(self._download_file, wanted))  # raises if a download failed
-        paths = [self._files.path_of(name) for name in wanted]
+        missing = [name for name in remote_sizes if is_wanted(name)]
+        list(self._pool.map(self._download_file, missing))  # raises if a download failed
+        paths = [self._files.path_of(name) for name in missing]
         sync_tree(self._files.root, {path.parent for path in paths})
         # Record the files only now. After a power loss, recorded but missing files would count as
         # deleted.
-        for name, path in zip(wanted, paths, strict=True):
+        for name, path in zip(missing, paths, strict=True):
             self._journal.add(name, stamp_of(path))
             self._files.set_aside_path(name).unlink(missing_ok=True)
-        return len(wanted)
+        return len(missing)
 
     def _download_file(self, name: str) -> None:
         path = self._files.path_of(name)

@@ -122,10 +122,10 @@ class BucketReplica:
         """
         if service is not None:
             self._claim_bucket(service)
-        there = self.bucket.list_valid()
+        remote_sizes = self.bucket.list_valid()
         if succeeds:
-            self._remove_unlisted(there)
-        got = self._transfer.download_missing(there)
+            self._remove_unlisted(remote_sizes)
+        got = self._transfer.download_missing(remote_sizes)
         self._upload_changes(with_log=True)
         if term is not None:
             self.bucket.raise_fence(term, self._files.list_files())
@@ -149,21 +149,21 @@ class BucketReplica:
             CopyError, OSError: the download is incomplete, for example because the owner's
                 compaction has removed files meanwhile.
         """
-        there = self.bucket.list_valid()
-        for name in self._journal.copy_stamps().keys() - there.keys():
+        remote_sizes = self.bucket.list_valid()
+        for name in self._journal.copy_stamps().keys() - remote_sizes.keys():
             self._files.path_of(name).unlink(missing_ok=True)
-        self._transfer.download_missing(there)
+        self._transfer.download_missing(remote_sizes)
 
-    def _remove_unlisted(self, there: Mapping[str, int]) -> None:
+    def _remove_unlisted(self, remote_sizes: Mapping[str, int]) -> None:
         """Remove files of the archive's folder that the bucket does not contain with the same size.
-        `there` has names and sizes of the bucket's valid objects. Then remove the journal entries
-        of all files that the folder does not contain.
+        `remote_sizes` has names and sizes of the bucket's valid objects. Then remove the journal
+        entries of all files that the folder does not contain.
 
         Files of the folder `keys` are always removed, and so downloaded again: two secret keys of
         one month have the same name and size, and only the bucket's belongs to valid rows.
         """
         for name, stamp in self._files.list_files().items():
-            if there.get(name) != stamp.size or name.startswith(KEYS):
+            if remote_sizes.get(name) != stamp.size or name.startswith(KEYS):
                 self._files.path_of(name).unlink()
         for name in self._journal.copy_stamps():
             if not self._files.path_of(name).exists():
@@ -184,10 +184,10 @@ class BucketReplica:
                 for path in segments
                 if self._journal.find_stamp(self._files.name_of(path)) is None
             ]
-            own = self._files.list_files(("keys",))
+            key_files = self._files.list_files(("keys",))
             keys = [
                 self._files.path_of(name)
-                for name, stamp in own.items()
+                for name, stamp in key_files.items()
                 if self._journal.find_stamp(name) != stamp
             ]
             self._upload_in_time([*keys, *missing])
@@ -209,12 +209,12 @@ class BucketReplica:
         for first in range(0, len(paths), _AT_ONCE):
             if time.monotonic() > deadline:
                 raise CopyError(f"{len(paths) - first} segments are not uploaded yet")
-            some = paths[first : first + _AT_ONCE]
+            batch = paths[first : first + _AT_ONCE]
             try:
-                if len(some) == 1:
-                    self._upload_quickly(some[0])
+                if len(batch) == 1:
+                    self._upload_quickly(batch[0])
                 else:
-                    list(self._pool.map(self._upload_quickly, some))
+                    list(self._pool.map(self._upload_quickly, batch))
             # Compaction has moved the rows of a segment into files that are uploaded later.
             except FileNotFoundError:
                 if not self._upload_changes(with_log=True).is_complete:
@@ -261,14 +261,14 @@ class BucketReplica:
 
     def _claim_bucket(self, service: str) -> None:
         mine = json.dumps({"service": service}).encode()
-        there = self._slow.get(OWNER)
-        if there is None:
+        owner = self._slow.get(OWNER)
+        if owner is None:
             self._slow.put_new(OWNER, mine)
-        elif there != mine:
+        elif owner != mine:
             with suppress(ValueError, KeyError, TypeError):
-                there = str(json.loads(there)["service"]).encode()
+                owner = str(json.loads(owner)["service"]).encode()
             problem = (
-                f"{self._url} is the copy of another service, {there.decode(errors='replace')[:60]}"
+                f"{self._url} is the copy of another service, {owner.decode(errors='replace')[:60]}"
             )
             raise InputError(
                 "archive.copy", problem, "give each service its own folder in the bucket"
@@ -284,10 +284,10 @@ def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
             belongs to another service.
         OSError: the folder or the journal cannot be read or written.
     """
-    wanted = config.archive
-    if wanted.second is None:
+    archive = config.archive
+    if archive.second is None:
         return None
-    copy = BucketReplica(root, wanted.second, wanted.options)
+    copy = BucketReplica(root, archive.second, archive.options)
     try:
         copy.sync_without_lease(config.name)
     except BaseException:
