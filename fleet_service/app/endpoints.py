@@ -82,16 +82,16 @@ class Endpoints:
             handover.answer_request(query, session, self._config.regions) or self._engine.holding.to
         )
 
-    def _answer_standing(self, asked: zenoh.Query) -> None:
+    def _answer_standing(self, request: zenoh.Query) -> None:
         """Answer a query for the active ("standing") alerts. Clients send this query when they
         start, because they did not receive the alerts that were published before.
         """
-        expression = asked.key_expr
-        with asked:
+        expression = request.key_expr
+        with request:
             for tile, alerts in self._engine.alerts.encode_tiles(
                 lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
             ):
-                asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
+                request.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
 
     def _enqueue_weather(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:

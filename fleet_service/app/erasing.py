@@ -81,7 +81,7 @@ def _erase_in_copy(copy: BucketReplica) -> str | None:
 
 
 def _run_erasure(
-    engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
+    engine: Engine, config: ServiceConfig, root: Path, erasure: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:
     """Carry out one request to erase data, and return its result; None if the service stops before
     the end.
@@ -90,11 +90,11 @@ def _run_erasure(
         InputError: the archive has no key for the month of the request, or a file is damaged.
         OSError: a file cannot be read or written; the erasure is tried again later.
     """
-    key_of(root, wanted.month)
-    vehicle = wanted.vehicle
+    key_of(root, erasure.month)
+    vehicle = erasure.vehicle
     if vehicle is None:
         destroyed = _reload_service(
-            engine, lambda: destroy_key(root, wanted.month, engine.state.streams.newest), stop
+            engine, lambda: destroy_key(root, erasure.month, engine.state.streams.newest), stop
         )
         return {"rows": 0, "files": []} if destroyed else None
     cut = engine.settlement.run_between_segments(lambda: engine.settlement.newest_segment, stop)
@@ -102,7 +102,7 @@ def _run_erasure(
         return None
     request = json.dumps(
         {
-            **asdict(wanted),
+            **asdict(erasure),
             "config": config.model_dump(mode="json", exclude={"archive"}),
             "cut": cut,
         }
@@ -115,7 +115,7 @@ def _run_erasure(
     answer: dict[str, Any] = json.loads(output)
     return (
         answer
-        if _reload_service(engine, lambda: forget_witness(root, vehicle, wanted.month), stop)
+        if _reload_service(engine, lambda: forget_witness(root, vehicle, erasure.month), stop)
         else None
     )
 

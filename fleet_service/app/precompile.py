@@ -42,10 +42,10 @@ def warm_up() -> None:
         return
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
-        beside = subprocess.run(
+        compilation = subprocess.run(
             [sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False
         )
-        if beside.returncode == 0:
+        if compilation.returncode == 0:
             with suppress(OSError):  # without the marker, the next start runs this process again
                 done.parent.mkdir(parents=True, exist_ok=True)
                 done.touch()

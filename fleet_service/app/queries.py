@@ -14,7 +14,7 @@ import pyarrow as pa
 from fleet_service.app.historical_maps import HistoricalMaps, PastQuery
 from fleet_service.app.state import SharedState
 from fleet_service.serve.encode import batch_of
-from fleet_service.serve.query import AnswerSize, answer_query, size_asked
+from fleet_service.serve.query import AnswerSize, answer_query, bound_answer_size
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
 from schemas.query import MapQuery
@@ -76,11 +76,15 @@ class Queries:
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def answer(
-        self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+        self,
+        query: MapQuery,
+        is_requested: Callable[[int], bool],
+        now: int,
+        only: int | None = None,
     ) -> Iterator[tuple[int, bytes]]:
         """Yield the tile number and the payload of every reply to a query, computed on demand.
-        `wanted` returns True for tiles that match the query's key, and `only` is the tile if the
-        key names exactly one. `now` is the service's time [ns].
+        `is_requested` returns True for tiles that match the query's key, and `only` is the tile if
+        the key names exactly one. `now` is the service's time [ns].
 
         Raises:
             InputError: the route is too long, the time is in the future, or the archive cannot be
@@ -89,21 +93,21 @@ class Queries:
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
-            return answer_query(self._shared.tiles, query, wanted, now, only)
+            return answer_query(self._shared.tiles, query, is_requested, now, only)
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time in the past")
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
-        return self._past.ask(past, wanted)
+        return self._past.ask(past, is_requested)
 
     def measure_answer(
-        self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
+        self, query: MapQuery, is_requested: Callable[[int], bool], only: int | None = None
     ) -> AnswerSize:
         """Return an upper bound of the size of the answer to a query, as number of cells and number
-        of tiles. `wanted` returns True for tiles that match the query's key, and `only` is the tile
-        if the key names exactly one.
+        of tiles. `is_requested` returns True for tiles that match the query's key, and `only` is
+        the tile if the key names exactly one.
         """
-        return size_asked(self._shared.tiles, query, wanted, only)
+        return bound_answer_size(self._shared.tiles, query, is_requested, only)
 
     def close(self) -> None:
         """Stop the process that rebuilds maps of the past."""

@@ -97,8 +97,8 @@ class Service:
         self._replies = MapQueryable(
             Answering(
                 self.engine.queries.measure_answer,
-                lambda wanted, near, only: self.engine.queries.answer(
-                    wanted, near, self._clock.now(), only
+                lambda query, is_requested, only: self.engine.queries.answer(
+                    query, is_requested, self._clock.now(), only
                 ),
             ),
             self.engine.counts,

@@ -81,8 +81,8 @@ class StandingAlerts:
         `before` contains the alerts that were active before the erasure. Those that are missing
         from the active alerts now were removed.
         """
-        still = {(alert.cell, alert.sector) for alert in self.all}
-        ended = [alert for alert in before if (alert.cell, alert.sector) not in still]
+        active = {(alert.cell, alert.sector) for alert in self.all}
+        ended = [alert for alert in before if (alert.cell, alert.sector) not in active]
         self._erased += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def expire(self, now: int) -> list[Alert]:

@@ -194,8 +194,10 @@ def load_state(
     )
     shown.mark_all_changed()
     matters = Begin(first, begin.cut, until)
-    heard = ignore_observations if public is None else public.follow
-    rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
+    listener = ignore_observations if public is None else public.follow
+    updates = replay(
+        root, fusion, Since(matters, streams if begin.cut else None), damaged, listener
+    )
 
     def read_later_streams() -> list[tuple[Kind, ArchivedRows]]:
         # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so the later
@@ -207,7 +209,7 @@ def load_state(
 
     with ThreadPoolExecutor(1, "streams") as thread:
         later = thread.submit(read_later_streams)
-        for updated in rest:
+        for updated in updates:
             alerts.update(updated.slots)
             shown.mark_changed(updated.slots)
         for kind, rows in later.result():

@@ -164,18 +164,20 @@ class Alerts:
            before and behind the slot.
         """
         fusion = self._fusion
-        near = np.unique(stretch_slots(fusion, slots))
-        near = near[near != NONE]
-        near = near[~np.isin(near, np.fromiter(self._standing, np.int64, len(self._standing)))]
-        own = self._own_sources(near, Side.ICE)
-        against = self._own_sources(near, Side.GRIP)
+        candidates = np.unique(stretch_slots(fusion, slots))
+        candidates = candidates[candidates != NONE]
+        candidates = candidates[
+            ~np.isin(candidates, np.fromiter(self._standing, np.int64, len(self._standing)))
+        ]
+        own = self._own_sources(candidates, Side.ICE)
+        against = self._own_sources(candidates, Side.GRIP)
         opposed = against[:, 0] > own[:, 1] - FRESH_NS
         needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
         enough = (own > 0).sum(axis=1) >= needed
-        along = stretch_sources(fusion, near, fusion.live.time[near] - c.SOURCE_NS)
+        along = stretch_sources(fusion, candidates, fusion.live.time[candidates] - c.SOURCE_NS)
         enough |= (along.second > 0) & (against[:, 0] <= along.second - FRESH_NS)
-        accused = (own[:, 0] > 0) & (fusion.slippery(near) > LIKELY)
-        return np.asarray(near[enough & (accused | along.around)])
+        accused = (own[:, 0] > 0) & (fusion.slippery(candidates) > LIKELY)
+        return np.asarray(candidates[enough & (accused | along.around)])
 
     def _own_sources(self, slots: IntArray, side: Side) -> IntArray:
         """Return the report times [ns] of the vehicles that support one `side` (ice or grip) in

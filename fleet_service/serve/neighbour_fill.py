@@ -53,29 +53,30 @@ def impute_cells(
             np.concatenate([a[ahead], b])
             for a, b in zip((keys, visited, share), along, strict=True)
         )
-    wanted, group = np.unique(keys, return_inverse=True)
-    belief = np.zeros((len(wanted), mugrid.BINS))
-    whole = np.zeros(len(wanted))
-    most = np.zeros(len(wanted))
+    unique_keys, group = np.unique(keys, return_inverse=True)
+    belief = np.zeros((len(unique_keys), mugrid.BINS))
+    weight_sum = np.zeros(len(unique_keys))
+    largest_share = np.zeros(len(unique_keys))
     np.add.at(belief, group, share[:, None] * source.beliefs(visited, now))
-    np.add.at(whole, group, share)
-    np.maximum.at(most, group, share)
-    vehicles = np.full(len(wanted), np.iinfo(np.int64).max)
+    np.add.at(weight_sum, group, share)
+    np.maximum.at(largest_share, group, share)
+    vehicles = np.full(len(unique_keys), np.iinfo(np.int64).max)
     first = vehicles.copy()
-    last = np.zeros(len(wanted), np.int64)
+    last = np.zeros(len(unique_keys), np.int64)
     np.minimum.at(vehicles, group, live.vehicles[visited])
     np.minimum.at(first, group, live.first[visited])
     np.maximum.at(last, group, live.time[visited])
     return CellView(
-        cell=wanted // grid.SECTORS,
-        sector=wanted % grid.SECTORS,
-        belief=mugrid.PRIOR + most[:, None] * (belief / whole[:, None] - mugrid.PRIOR),
-        values=np.zeros(len(wanted), np.float32),
+        cell=unique_keys // grid.SECTORS,
+        sector=unique_keys % grid.SECTORS,
+        belief=mugrid.PRIOR
+        + largest_share[:, None] * (belief / weight_sum[:, None] - mugrid.PRIOR),
+        values=np.zeros(len(unique_keys), np.float32),
         vehicles=vehicles,
-        observations=np.zeros(len(wanted), np.int64),
+        observations=np.zeros(len(unique_keys), np.int64),
         first=first,
         last=last,
-        imputed=np.ones(len(wanted), bool),
+        imputed=np.ones(len(unique_keys), bool),
     )
 
 
@@ -117,11 +118,15 @@ def _route_gaps(
     behind = np.minimum.accumulate(np.where(slots >= 0, place, len(route))[::-1])[::-1]
     free = (slots < 0) & (grid.tile_of(route // grid.SECTORS) == tile)
     parts = []
-    for nearest, there in ((before, before >= 0), (behind, behind < len(route))):
-        away = np.abs(nearest - place)
-        take = np.flatnonzero(free & there & (away > 1) & (away <= REACH))
+    for nearest, has_nearest in ((before, before >= 0), (behind, behind < len(route))):
+        distance = np.abs(nearest - place)
+        take = np.flatnonzero(free & has_nearest & (distance > 1) & (distance <= REACH))
         parts.append(
-            (route[take], slots[nearest[take]], (1.0 - PRIOR_SHARE) * KEPT ** (away[take] - 1.0))
+            (
+                route[take],
+                slots[nearest[take]],
+                (1.0 - PRIOR_SHARE) * KEPT ** (distance[take] - 1.0),
+            )
         )
     keys, visited, share = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return keys, visited, share

@@ -24,7 +24,7 @@ from schemas.regions import keys_along
 def answer_query(
     cache: TileCache,
     query: MapQuery,
-    wanted: Callable[[int], bool],
+    is_requested: Callable[[int], bool],
     now: int,
     only: int | None = None,
 ) -> Iterator[tuple[int, bytes]]:
@@ -33,7 +33,7 @@ def answer_query(
     Args:
         cache: the tiles of the map.
         query: parameters of the query.
-        wanted: function that returns True if a tile's key matches the query's key.
+        is_requested: function that returns True if a tile's key matches the query's key.
         now: time [ns] for which beliefs and ages are computed.
         only: the only matching tile, if the query's key names a single tile.
 
@@ -41,7 +41,7 @@ def answer_query(
         InputError: the route is too long.
     """
     route = keys_along(query.route) if query.route else None
-    tiles = filter(wanted, _select_tiles(cache, query, route, only))
+    tiles = filter(is_requested, _select_tiles(cache, query, route, only))
     if route is None and query.basis is None:
         shown_tiles = _shown_in_groups(cache, tiles, now)
     else:
@@ -58,11 +58,11 @@ def _shown_in_groups(
     """Yield each tile with its number. Small tiles are made in groups, when the first of a group is
     needed.
     """
-    left = list(tiles)
-    while left:
-        group = cache.first_group(left)
+    remaining = list(tiles)
+    while remaining:
+        group = cache.first_group(remaining)
         yield from zip(group, cache.shown(group, now), strict=True)
-        left = left[len(group) :]
+        remaining = remaining[len(group) :]
 
 
 class AnswerSize(NamedTuple):
@@ -72,8 +72,8 @@ class AnswerSize(NamedTuple):
     tiles: int
 
 
-def size_asked(
-    cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None
+def bound_answer_size(
+    cache: TileCache, query: MapQuery, is_requested: Callable[[int], bool], only: int | None = None
 ) -> AnswerSize:
     """Return an upper bound of the size of the answer to a query: the number of the tiles that must
     be read, and the number of all their cells.
@@ -81,14 +81,14 @@ def size_asked(
     Args:
         cache: the tiles of the map.
         query: parameters of the query.
-        wanted: function that returns True if a tile's key matches the query's key.
+        is_requested: function that returns True if a tile's key matches the query's key.
         only: the only matching tile, if the query's key names a single tile.
     """
     route = keys_along(query.route) if query.route else None
     tiles = [
         tile
         for tile in _select_tiles(cache, query, route, only)
-        if only is not None or wanted(tile)
+        if only is not None or is_requested(tile)
     ]
     with cache.guard:
         return AnswerSize(sum(cache.state.count(tile) for tile in tiles), len(tiles))

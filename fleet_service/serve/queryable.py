@@ -90,17 +90,17 @@ class _QueuedQuery:
     rank: float
     number: int
     request: zenoh.Query = field(compare=False)
-    wanted: MapQuery = field(compare=False)
+    map_query: MapQuery = field(compare=False)
     tiles: Iterator[tuple[int, bytes]] | None = field(default=None, compare=False)
 
 
 @dataclass
 class _Answered:
-    """Result of one step of an answer to a query: `whole` is True if the answer is complete, and
-    False if more replies follow in a later step.
+    """Result of one step of an answer to a query: `is_complete` is True if the answer is complete,
+    and False if more replies follow in a later step.
     """
 
-    whole: bool = True
+    is_complete: bool = True
 
 
 class _TokenBucket:
@@ -109,7 +109,7 @@ class _TokenBucket:
     """
 
     def __init__(self) -> None:
-        self._left = LIGHT_PER_S
+        self._tokens = LIGHT_PER_S
         self._since = time.monotonic()
         self._guard = threading.Lock()
 
@@ -119,11 +119,11 @@ class _TokenBucket:
         """
         with self._guard:
             now = time.monotonic()
-            self._left = min(LIGHT_PER_S, self._left + (now - self._since) * LIGHT_PER_S)
+            self._tokens = min(LIGHT_PER_S, self._tokens + (now - self._since) * LIGHT_PER_S)
             self._since = now
-            if self._left < cost:
+            if self._tokens < cost:
                 return False
-            self._left -= cost
+            self._tokens -= cost
             return True
 
 
@@ -145,7 +145,7 @@ class MapQueryable:
         self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
         self._busy_since: float | None = None  # time [s] at which the current tile was begun
-        self._some = threading.Condition()
+        self._has_queued = threading.Condition()
 
     @property
     def hangs_s(self) -> float:
@@ -162,60 +162,62 @@ class MapQueryable:
             # `zenoh.Parameters` is iterable, but its type stub does not declare this.
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
             # Names that begin with "_" are Zenoh's own parameters.
-            wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})
-            if wanted.at is None:
-                asked = self._answering.size(wanted, *_key_filter(request))
-                cost = asked.cells * COST[wanted.format]
+            map_query = query.parse(
+                {name: value for name, value in pairs if not name.startswith("_")}
+            )
+            if map_query.at is None:
+                size = self._answering.size(map_query, *_key_filter(request))
+                cost = size.cells * COST[map_query.format]
                 if cost > MOST:
                     fix = (
                         "use a smaller bbox, or format=arrow"
-                        if COST[wanted.format] > 1
+                        if COST[map_query.format] > 1
                         else "use a smaller bbox"
                     )
                     raise InputError("bbox", "the answer would be too large", fix)
-                cost += asked.tiles * TILE_COST
+                cost += size.tiles * TILE_COST
         except InputError as error:
             self._refuse(request, error)
             return
-        if wanted.at is not None:
-            self._ask_past(request, wanted)
+        if map_query.at is not None:
+            self._ask_past(request, map_query)
         elif cost <= LIGHT and self._light.take(cost):
-            self._reply(request, wanted)
+            self._reply(request, map_query)
         else:
-            self._queue(request, wanted, cost)
+            self._queue(request, map_query, cost)
 
-    def _ask_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
+    def _ask_past(self, request: zenoh.Query, map_query: MapQuery) -> None:
         if self._past_waiting.acquire(blocking=False):
             threading.Thread(
-                target=self._wait_for_past, args=(request, wanted), name="past", daemon=True
+                target=self._wait_for_past, args=(request, map_query), name="past", daemon=True
             ).start()
         else:
             self._refuse(request, _past_is_busy())
 
-    def _wait_for_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
+    def _wait_for_past(self, request: zenoh.Query, map_query: MapQuery) -> None:
         """Answer a query about a past map when all earlier queries of this kind have been answered;
         refuse it if it waits longer than PAST_WAIT_S.
         """
         try:
             if self._past.acquire(timeout=PAST_WAIT_S):
-                self._answer_past(request, wanted)
+                self._answer_past(request, map_query)
             else:
                 self._refuse(request, _past_is_busy())
         finally:
             self._past_waiting.release()
 
-    def _queue(self, request: zenoh.Query, wanted: MapQuery, cost: float) -> None:
+    def _queue(self, request: zenoh.Query, map_query: MapQuery, cost: float) -> None:
         self._counts.heavy_queries += 1
-        with self._some:
+        with self._has_queued:
             rank = time.monotonic() + cost / PER_S
             heapq.heappush(
-                self._heavy, _QueuedQuery(rank, self._counts.heavy_queries, request, wanted)
+                self._heavy, _QueuedQuery(rank, self._counts.heavy_queries, request, map_query)
             )
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
                 self._heavy.remove(dropped)
                 heapq.heapify(self._heavy)
-            self._some.notify()
+            self._has_queued.notify()
             if self._worker is None or not self._worker.is_alive():
                 self._worker = threading.Thread(
                     target=self._work, name="heavy answers", daemon=True
@@ -234,14 +236,14 @@ class MapQueryable:
 
     def _work(self) -> None:
         while True:
-            with self._some:
-                self._some.wait_for(lambda: self._heavy)
+            with self._has_queued:
+                self._has_queued.wait_for(lambda: self._heavy)
                 first = heapq.heappop(self._heavy)
             began = self._busy_since = time.monotonic()
             goes_on = self._goes_on(first)
             self._busy_since = None
             if goes_on:
-                with self._some:
+                with self._has_queued:
                     heapq.heappush(self._heavy, first)
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
@@ -250,23 +252,23 @@ class MapQueryable:
         request = heavy.request
         with self._reply_to(request) as answered:
             if heavy.tiles is None:
-                heavy.tiles = iter(self._answering.answer(heavy.wanted, *_key_filter(request)))
+                heavy.tiles = iter(self._answering.answer(heavy.map_query, *_key_filter(request)))
             for tile, payload in heavy.tiles:
-                request.reply(keys.map_key(tile), payload, encoding=heavy.wanted.format.encoding)
-                answered.whole = False
+                request.reply(keys.map_key(tile), payload, encoding=heavy.map_query.format.encoding)
+                answered.is_complete = False
                 break
-        return not answered.whole
+        return not answered.is_complete
 
-    def _answer_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
+    def _answer_past(self, request: zenoh.Query, map_query: MapQuery) -> None:
         try:
-            self._reply(request, wanted)
+            self._reply(request, map_query)
         finally:
             self._past.release()
 
-    def _reply(self, request: zenoh.Query, wanted: MapQuery) -> None:
+    def _reply(self, request: zenoh.Query, map_query: MapQuery) -> None:
         with self._reply_to(request):
-            for tile, payload in self._answering.answer(wanted, *_key_filter(request)):
-                request.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
+            for tile, payload in self._answering.answer(map_query, *_key_filter(request)):
+                request.reply(keys.map_key(tile), payload, encoding=map_query.format.encoding)
 
     @contextmanager
     def _reply_to(self, request: zenoh.Query) -> Iterator[_Answered]:
@@ -277,13 +279,13 @@ class MapQueryable:
         try:
             yield answered
         except InputError as error:
-            answered.whole = True
+            answered.is_complete = True
             self._refuse(request, error)
         except zenoh.ZError:  # the session has been closed, so nobody receives the reply
-            answered.whole = True
+            answered.is_complete = True
         # Catch every error. A query that ends without a reply would mean that there are no data.
         except Exception as error:
-            answered.whole = True
+            answered.is_complete = True
             self._counts.failures["answer"] += 1
             log.exception("a query failed")
             with suppress(zenoh.ZError):
@@ -291,7 +293,7 @@ class MapQueryable:
                     f"query: failed in the service ({type(error).__name__}); ask again later",
                     encoding=TEXT,
                 )
-        if answered.whole:
+        if answered.is_complete:
             request.drop()
 
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:

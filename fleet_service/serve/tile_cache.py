@@ -107,11 +107,11 @@ class TileCache:
         return [found[tile] or made[tile] for tile in tiles]
 
     def _recent(self, tile: int, now: int) -> ShownTile | None:
-        kept = self._kept.get(tile)
-        if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
+        cached = self._kept.get(tile)
+        if cached is None or not 0 <= now - cached.made <= SHOWN_NS:
             return None
-        whole = kept.change >= min(self._acknowledged, self.state.changed_at(tile))
-        return kept if whole else None
+        is_current = cached.change >= min(self._acknowledged, self.state.changed_at(tile))
+        return cached if is_current else None
 
     def first_group(self, tiles: Sequence[int]) -> Sequence[int]:
         """Return the first of the given tiles that should be made in one step: at least one, and
@@ -140,9 +140,11 @@ class TileCache:
         made = []
         for k, tile in enumerate(tiles):
             payload = arrow_stream(batch.slice(first[k], last[k] - first[k]))
-            own = pa.ipc.open_stream(payload).read_next_batch()
-            columns = selected_by(own)
-            made.append(ShownTile(own, columns, payload, *_common_bounds(columns), now, change))
+            batch_of_tile = pa.ipc.open_stream(payload).read_next_batch()
+            columns = selected_by(batch_of_tile)
+            made.append(
+                ShownTile(batch_of_tile, columns, payload, *_common_bounds(columns), now, change)
+            )
             self._keep(tile, made[-1])
         return made
 
@@ -190,8 +192,8 @@ class TileCache:
                 self._drop(next(iter(self._kept)))
 
     def _drop(self, tile: int) -> None:
-        kept = self._kept.pop(tile, None)
-        self._held -= len(kept.payload) if kept else 0
+        dropped = self._kept.pop(tile, None)
+        self._held -= len(dropped.payload) if dropped else 0
 
 
 def used_once(cells: CellView, now: int) -> ShownTile:

@@ -45,14 +45,14 @@ class TileRounds:
         self._counts = counts
         self._clock = clock
         self._due = clock() + every_s
-        self._left: list[int] = []
+        self._unpublished: list[int] = []
 
     @property
     def waiting(self) -> int:
         """Return the number of tiles of the current publication round that are not published
         yet.
         """
-        return len(self._left)
+        return len(self._unpublished)
 
     def begin(self) -> bool:
         """Begin a publication round if one is due, and return True; return False if none is due. If
@@ -62,18 +62,18 @@ class TileRounds:
         if passed <= 0:
             return False
         self._due += passed * self._every_s
-        skipped = passed if self._left else passed - 1
+        skipped = passed if self._unpublished else passed - 1
         if skipped:
             self._counts.tile_rounds_skipped += skipped
-        if not self._left:
-            self._left.extend(self._changed())
+        if not self._unpublished:
+            self._unpublished.extend(self._changed())
         return True
 
     def go_on(self, share_s: float = SHARE_S) -> None:
         """Publish tiles of the current round for `share_s` [s], but at least the next ones."""
         end = self._clock() + share_s
-        while self._left:
-            del self._left[: self._put(self._left)]
+        while self._unpublished:
+            del self._unpublished[: self._put(self._unpublished)]
             if self._clock() >= end:
                 break
 
@@ -81,6 +81,6 @@ class TileRounds:
         """Publish the remaining and newly changed tiles, for at most `most_s` [s], because the
         service stops.
         """
-        known = set(self._left)
-        self._left.extend(tile for tile in self._changed() if tile not in known)
+        known = set(self._unpublished)
+        self._unpublished.extend(tile for tile in self._changed() if tile not in known)
         self.go_on(most_s)

@@ -62,8 +62,8 @@ class Visitors:
         ends at `now` [ns].
         """
         self._grow()
-        ago = max(now // PART_NS - self._part, 0)
-        within = self._bits[slots, : max(PARTS - ago, 0)]
+        parts_ago = max(now // PART_NS - self._part, 0)
+        within = self._bits[slots, : max(PARTS - parts_ago, 0)]
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
@@ -110,10 +110,10 @@ class Visitors:
         """Begin a new part of the time window, with number `part`: vehicles are counted in it from
         now on. Delete the counts of parts that no longer belong to the window.
         """
-        ago = part - self._part
-        if ago > 0:
-            self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]
-            self._bits[:, :ago] = 0
+        new_parts = part - self._part
+        if new_parts > 0:
+            self._bits[:, new_parts:] = self._bits[:, : max(PARTS - new_parts, 0)]
+            self._bits[:, :new_parts] = 0
             self._part = part
 
 

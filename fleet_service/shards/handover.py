@@ -68,7 +68,7 @@ def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[
 
 
 def hand_over(
-    session: zenoh.Session, region: str, to: str, say: Callable[[str], None]
+    session: zenoh.Session, region: str, to: str, log_line: Callable[[str], None]
 ) -> HandoverResult | None:
     """Ask the service of a region to hand over to a standby, and wait until the standby serves the
     region. Return the name of the former service and the duration of the interruption, or None if
@@ -78,21 +78,21 @@ def hand_over(
         session: Zenoh session of a client with a service certificate.
         region: key expression of the region.
         to: name of the standby.
-        say: called with lines about the progress.
+        log_line: called with lines about the progress.
 
     Raises:
         InputError: the region has no service, the standby is not waiting, or it did not take over.
     """
-    with presence.track_tokens(session) as there:
-        service = _find_server(there, region)
+    with presence.track_tokens(session) as services:
+        service = _find_server(services, region)
         if service is None:
             raise InputError("region", f"no service serves {region}", "see `fleet-service watch`")
         if service == to:
             return None
-        say(f"{service} hands over: {_request_handover(session, service, to)}")
+        log_line(f"{service} hands over: {_request_handover(session, service, to)}")
         end = time.monotonic() + MOVED_S
         absent_since = 0.0
-        while (now := _find_server(there, region)) != to:
+        while (now := _find_server(services, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
                 raise InputError(
@@ -104,9 +104,9 @@ def hand_over(
         return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
-def _find_server(there: presence.PresenceTracker, region: str) -> str | None:
+def _find_server(services: presence.PresenceTracker, region: str) -> str | None:
     return next(
-        (token.service for token in there.active if regions.covers(token.region, region)), None
+        (token.service for token in services.active if regions.covers(token.region, region)), None
     )
 
 

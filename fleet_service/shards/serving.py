@@ -79,19 +79,19 @@ def watch_successors(
     tokens `mine` since the `with` block began. In this way a service that cannot reach its bucket
     learns that it was replaced, and stops serving outdated data.
     """
-    with presence.track_tokens(session) as there:
-        before = there.active
-        yield lambda: bool(rival_tokens(mine, there.active - before))
+    with presence.track_tokens(session) as services:
+        before = services.active
+        yield lambda: bool(rival_tokens(mine, services.active - before))
 
 
 def rival_tokens(
-    mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
+    mine: frozenset[ServiceToken], present: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
     """Return, sorted, the liveliness tokens by which other services announce regions that overlap
     the regions of `mine`. Tokens of the `former` services are excluded.
     """
-    others = (one for one in there - mine if one.service not in former)
-    return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
+    candidates = (one for one in present - mine if one.service not in former)
+    return sorted(one for one in candidates if any(overlap(one.region, own.region) for own in mine))
 
 
 def _claim_regions(
@@ -100,24 +100,24 @@ def _claim_regions(
     stop: threading.Event,
     former: Collection[str],
 ) -> list[zenoh.LivelinessToken]:
-    def others_there() -> list[ServiceToken]:
+    def find_rivals() -> list[ServiceToken]:
         return rival_tokens(
             mine, presence.active_tokens(session) | presence.active_tokens(session, CLAIMS), former
         )
 
     for _ in range(_TRIES):
         waited = 0.0
-        while others := others_there():
+        while rivals := find_rivals():
             if waited > GONE_S or stop.wait(LOOK_S):
                 break
             waited += LOOK_S
-        if others:
-            problem = f"{others[0].region} is already served by {others[0].service}"
+        if rivals:
+            problem = f"{rivals[0].region} is already served by {rivals[0].service}"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
-        held = _declare_tokens(session, mine, CLAIMS)
-        if not others_there():
-            return held
-        for token in held:  # another service began at the same time; the first to retry succeeds
+        claims = _declare_tokens(session, mine, CLAIMS)
+        if not find_rivals():
+            return claims
+        for token in claims:  # another service began at the same time; the first to retry succeeds
             token.undeclare()
         stop.wait(secrets.randbelow(1000) * 1e-3)
     raise InputError(
@@ -154,11 +154,11 @@ def standby_signs(
     )
     with (
         session,
-        presence.track_tokens(session) as there,
+        presence.track_tokens(session) as services,
         _hold_tokens(_declare_tokens(session, waits, WAITS)),
     ):
         yield (
             lambda: bool(list(session.info.routers_zid())),
-            lambda name: any(one.service == name for one in there.active),
+            lambda name: any(one.service == name for one in services.active),
             alive,
         )
