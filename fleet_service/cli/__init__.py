@@ -145,18 +145,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         the exit code; 2 after a one-line error that names the field and the fix.
     """
-    given = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
-    chosen = next((argument for argument in given if not argument.startswith("-")), None)
+    words = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
+    chosen = next((argument for argument in words if not argument.startswith("-")), None)
     if argv is None and chosen == "run":
         from schemas.runtime.process import limit_memory
 
         limit_memory(*UNUSED)
-    progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(words))
     # The import of the commands takes a second, so show a status.
     with (
         nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
     ):
-        arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
+        arguments = commandline.parser_of(*LINE, chosen).parse_args(words)
         if arguments.verbose:
             logging.basicConfig(
                 level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr

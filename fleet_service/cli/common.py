@@ -218,14 +218,14 @@ def compact_first(root: Path) -> None:
         print(f"warning: {waiting} segments of the log are not included: {error}", file=sys.stderr)
 
 
-def describe_covered_box(what: str, box: Sequence[float], asked: Sequence[float]) -> str:
+def describe_covered_box(what: str, box: Sequence[float], queried_box: Sequence[float]) -> str:
     """Return a message for a queried box that contains no data. It states the box that the data
     cover, and mentions if latitude and longitude seem to be swapped. Boxes are west, south, east,
     north [deg].
     """
     sides = ",".join(f"{side:.3f}" for side in box)
     words = f"no cell lies in this box; the {what} covers --bbox {sides}"
-    west, south, east, north = asked
+    west, south, east, north = queried_box
     if box[0] < north and box[2] > south and box[1] < east and box[3] > west:
         words += ": longitude comes before latitude"
     return words

@@ -66,19 +66,19 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     if not confirm(arguments, what):
         return ArchiveReport("nothing removed", {"rows": 0, "key": False})
     done = _erase_or_request(root, Erasure(month, vehicle), arguments.config)
-    still = (
+    copy_notice = (
         ""
         if done.kept is None
         else f"; the copy still contains them, and the service tries again ({done.kept})"
     )
     if vehicle is None:
-        return ArchiveReport(what + still, {"rows": 0, "key": True, "copy": done.kept})
+        return ArchiveReport(what + copy_notice, {"rows": 0, "key": True, "copy": done.kept})
     removed = (
         f"{done.rows} rows removed"
         if done.rows
         else f"no rows of {vehicle} in {month}: nothing removed"
     )
-    line = removed + still
+    line = removed + copy_notice
     report: dict[str, object] = {
         "rows": done.rows,
         "key": False,
@@ -91,7 +91,7 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     return ArchiveReport(line, report)
 
 
-def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> ErasureResult:
+def _erase_or_request(root: Path, erasure: Erasure, config: str | None) -> ErasureResult:
     """Erase the requested data in the archive and in its copy. If a service is running on the
     archive, let the service do this.
 
@@ -108,7 +108,7 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
         forget_vehicle,
     )
 
-    question = erasure_requests.write_request(root, wanted) if is_served(root) else None
+    question = erasure_requests.write_request(root, erasure) if is_served(root) else None
     looked = time.monotonic()
     # If the service ends before it answers, this process carries out the erasure.
     while question is not None:
@@ -123,10 +123,10 @@ def _erase_or_request(root: Path, wanted: Erasure, config: str | None) -> Erasur
                 question.unlink(missing_ok=True)
                 question = None
     with _sync_copy(root, config):
-        if wanted.vehicle is None:
-            forget_period(root, wanted.month)
+        if erasure.vehicle is None:
+            forget_period(root, erasure.month)
             return ErasureResult(0, ())
-        return forget_vehicle(root, wanted.vehicle, wanted.month)
+        return forget_vehicle(root, erasure.vehicle, erasure.month)
 
 
 @contextmanager

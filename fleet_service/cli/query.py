@@ -60,11 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
     form = _output_format(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
-    asked = {
+    query_options = {
         name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis")
     }
     parameters = {
-        name: value for name, value in (*asked.items(), ("format", form)) if value is not None
+        name: value
+        for name, value in (*query_options.items(), ("format", form))
+        if value is not None
     }
     answer = map_client.query_map(
         map_client.connection_settings(arguments.connect, arguments.config), parameters
@@ -98,13 +100,13 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
     """
     from fleet_service.client import map_client
 
-    whole = map_client.query_map(
+    whole_map = map_client.query_map(
         map_client.connection_settings(arguments.connect, arguments.config), {}
     ).table
-    if whole is None or not whole.num_rows:
+    if whole_map is None or not whole_map.num_rows:
         return
     west_end, south_end, east_end, north_end = (
-        whole[name].to_numpy() for name in ("west", "south", "east", "north")
+        whole_map[name].to_numpy() for name in ("west", "south", "east", "north")
     )
     box = [
         float(west_end.min()),
@@ -112,8 +114,8 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
         float(east_end.max()),
         float(north_end.max()),
     ]
-    asked = [float(side) for side in arguments.bbox.split(",")]
-    print(describe_covered_box("map", box, asked), file=sys.stderr)
+    queried_box = [float(side) for side in arguments.bbox.split(",")]
+    print(describe_covered_box("map", box, queried_box), file=sys.stderr)
 
 
 def _output_format(out: Path | None, given: str | None) -> str | None:

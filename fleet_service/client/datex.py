@@ -78,7 +78,7 @@ def make_publication(
     standing: list[StretchAlert],
     now: int,
     before: bytes | None = None,
-    is_heard: Callable[[float, float], bool] = lambda *_: True,
+    has_service: Callable[[float, float], bool] = lambda *_: True,
 ) -> bytes:
     """Return the publication at time `now` as an XML document.
 
@@ -87,8 +87,8 @@ def make_publication(
         standing: all road stretches with an active alert.
         now: current time [ns UTC].
         before: the previous publication; None to start a new one.
-        is_heard: function that returns True if a service answers for a place (latitude, longitude).
-            Situations at other places are not ended.
+        has_service: function that returns True if a service answers for a place (latitude,
+            longitude). Situations at other places are not ended.
 
     Raises:
         InputError: `before` is not a publication.
@@ -121,7 +121,7 @@ def make_publication(
             float(child.text or "nan")
             for child in _find_element(record, "sit:locationReference/loc:coordinatesForDisplay")
         )
-        ended = _end_record(record, now) if _has_ended(record) or is_heard(*place) else record
+        ended = _end_record(record, now) if _has_ended(record) or has_service(*place) else record
         if ended is not None:
             root.append(_make_situation(supplier, ended))
     ET.indent(root)

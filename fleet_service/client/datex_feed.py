@@ -36,10 +36,10 @@ class DatexFile:
         InputError: the file exists, but its content is not a publication that this class wrote.
     """
 
-    def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
+    def __init__(self, supplier: Supplier, path: Path, log_line: Callable[[str], None]) -> None:
         self._supplier = supplier
         self._path = path
-        self._say = say
+        self._log_line = log_line
         self.document = path.read_bytes() if path.exists() else None
         self._written = 0.0
         if self.document is not None:
@@ -51,13 +51,13 @@ class DatexFile:
         return time.monotonic() >= self._written + REFRESH_S
 
     def keep_up(
-        self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
+        self, standing: list[StretchAlert], has_service: Callable[[float, float], bool]
     ) -> None:
         """Write the DATEX II publication if its content has changed, or if it is old.
 
         Args:
             standing: every stretch of road with an active alert.
-            is_heard: function that returns True if a service answers for a place (latitude,
+            has_service: function that returns True if a service answers for a place (latitude,
                 longitude).
 
         Raises:
@@ -65,7 +65,7 @@ class DatexFile:
                 version.
         """
         before = self.document
-        new = make_publication(self._supplier, standing, time.time_ns(), before, is_heard)
+        new = make_publication(self._supplier, standing, time.time_ns(), before, has_service)
         changed = before is None or not same_but_for_time(new, before)
         if not changed and not self.is_due:
             return
@@ -74,7 +74,7 @@ class DatexFile:
         with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(new)
         if changed:
-            self._say(f"{len(standing)} slippery stretches in {self._path}")
+            self._log_line(f"{len(standing)} slippery stretches in {self._path}")
 
 
 class StretchOutput(Protocol):
@@ -85,7 +85,7 @@ class StretchOutput(Protocol):
         """Return True if the output must be published again even though no alert has changed."""
 
     def keep_up(
-        self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]
+        self, standing: list[StretchAlert], has_service: Callable[[float, float], bool]
     ) -> None:
         """Publish the stretches of road that have an active alert."""
 
@@ -102,8 +102,8 @@ class DatexFeed:
         self._stretches = Stretches()
         self._lock = threading.Lock()
         self._has_news = True
-        self._heard: dict[int, bool] = {}
-        self._is_heard: Callable[[float, float], bool] = lambda *_: False
+        self._served_tiles: dict[int, bool] = {}
+        self._has_service: Callable[[float, float], bool] = lambda *_: False
 
     def apply_alert(self, alert: wire.Alert) -> None:
         """Record that an alert was raised, cleared, or repeated because it is still active."""
@@ -117,18 +117,18 @@ class DatexFeed:
         place.
         """
         found = standing_alerts(session)
-        self._heard = {}
+        self._served_tiles = {}
 
-        def is_heard(latitude: float, longitude: float) -> bool:
+        def has_service(latitude: float, longitude: float) -> bool:
             tile = int(grid.tile_of(int(grid.cell_of(latitude, longitude))))
-            if tile not in self._heard:
-                self._heard[tile] = is_place_served(session, latitude, longitude)
-            return self._heard[tile]
+            if tile not in self._served_tiles:
+                self._served_tiles[tile] = is_place_served(session, latitude, longitude)
+            return self._served_tiles[tile]
 
-        self._is_heard = is_heard
+        self._has_service = has_service
         with self._lock:
             self._stretches.replace_alerts(
-                found, lambda alert: is_heard(alert.latitude, alert.longitude)
+                found, lambda alert: has_service(alert.latitude, alert.longitude)
             )
             self._has_news = True
 
@@ -144,7 +144,7 @@ class DatexFeed:
             self._has_news = False
             self._stretches.take_changes()
             standing = self._stretches.standing
-        self._file.keep_up(standing, self._is_heard)
+        self._file.keep_up(standing, self._has_service)
 
 
 def publish_alerts(

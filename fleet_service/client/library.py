@@ -35,11 +35,11 @@ def ask_map(
         InputError: the query is refused, or no router or no service answers.
     """
     settings = ZenohSettings(connect=[endpoint]) if isinstance(endpoint, str) else endpoint
-    asked: dict[str, Any] = {"min_vehicles": str(min_vehicles)}
+    parameters: dict[str, Any] = {"min_vehicles": str(min_vehicles)}
     if bbox is not None:
-        asked["bbox"] = ",".join(map(str, bbox))
+        parameters["bbox"] = ",".join(map(str, bbox))
     if route is not None:
-        asked["route"] = "|".join(f"{longitude},{latitude}" for longitude, latitude in route)
+        parameters["route"] = "|".join(f"{longitude},{latitude}" for longitude, latitude in route)
     if at is not None:
-        asked["at"] = at.isoformat()
-    return map_client.served_table(map_client.query_map(settings, asked))
+        parameters["at"] = at.isoformat()
+    return map_client.served_table(map_client.query_map(settings, parameters))

@@ -88,7 +88,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
     Raises:
         InputError: the query is refused, here or by a service, or no router answers.
     """
-    asked = query.parse(parameters)
+    map_query = query.parse(parameters)
     with open_connected(connection) as session, presence.track_tokens(session) as services:
         before = services.active
         payloads = sorted(query_replies(session, EVERYWHERE, parameters))
@@ -99,14 +99,14 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         # if the service has started again.
         withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
-        whole = {
+        fully_served = {
             one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)
         }
         declared = bool(before | after)
         if declared:
-            served = bool(payloads or whole)
+            served = bool(payloads or fully_served)
         else:
-            served = bool(payloads) or is_served(session, asked)
+            served = bool(payloads) or is_served(session, map_query)
             if services.refresh(session):  # a service started during the check
                 declared = True
                 served = bool(payloads)
@@ -114,7 +114,7 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
                 # The service started during the check and will declare its token, or it declares
                 # none.
                 payloads = sorted(query_replies(session, EVERYWHERE, parameters))
-    answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
+    answer = replace(_join_replies(map_query, [payload for _, payload in payloads]), served=served)
     if not declared:  # services without tokens: an older version, or an access list of one
         return answer
     tiles = {
@@ -122,9 +122,13 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
         for key, _ in payloads
         if (tile := keys.parse(key).quadint) is not None
     }
-    whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)}
-    somewhere = asked.bbox is not None or asked.route is not None
-    missing = regions.unserved_expressions(asked, whole) if somewhere else sorted(withdrawn)
+    fully_served |= {
+        one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)
+    }
+    somewhere = map_query.bbox is not None or map_query.route is not None
+    missing = (
+        regions.unserved_expressions(map_query, fully_served) if somewhere else sorted(withdrawn)
+    )
     found = tuple(sorted({token.region for token in after}))
     return replace(answer, missing=tuple(missing), regions=found)
 
@@ -175,7 +179,7 @@ def served_table(answer: Answer) -> pa.Table:
     return answer.table.replace_schema_metadata({"missing": ",".join(answer.missing)})
 
 
-def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
+def is_served(session: zenoh.Session, map_query: query.MapQuery) -> bool:
     """Return True if there is any sign of a service for the queried part of the map. This
     distinguishes an empty map from a missing service.
 
@@ -188,10 +192,10 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     3. A service's liveliness token is visible. Not every reader may see tokens.
     """
     point = None
-    if asked.route:
-        point = asked.route[0]
-    elif asked.bbox:
-        point = asked.bbox[:2]
+    if map_query.route:
+        point = map_query.route[0]
+    elif map_query.bbox:
+        point = map_query.bbox[:2]
     longitude, latitude = point or (0.0, 0.0)
     if is_place_served(session, latitude, longitude):
         return True
@@ -231,10 +235,10 @@ def open_connected(connection: ZenohSettings) -> zenoh.Session:
         raise UnreachableError("connect", f"no router at {where}", fix) from error
 
 
-def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
+def _join_replies(map_query: query.MapQuery, payloads: list[bytes]) -> Answer:
     """Join the replies to a query into one answer; along a route, cells are in driving order."""
-    rank = regions.Rank(asked.route) if asked.route else None
-    if asked.format is Format.ARROW:
+    rank = regions.Rank(map_query.route) if map_query.route else None
+    if map_query.format is Format.ARROW:
         parts = [decode_tile(payload) for payload in payloads]
         table = pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table()
         if rank is not None:
@@ -243,7 +247,7 @@ def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
             )
         return Answer(table, None)
     documents = [json.loads(payload) for payload in payloads]
-    if asked.format is Format.JSON:
+    if map_query.format is Format.JSON:
         return Answer(
             None, {"tiles": documents if rank is None else sorted(documents, key=_tile_rank(rank))}
         )

@@ -108,16 +108,18 @@ class Stretches:
         elif self._standing.pop(place, None) is not None:
             self._ended[alert.cell] = alert
 
-    def replace_alerts(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
+    def replace_alerts(
+        self, standing: Iterable[Alert], has_service: Callable[[Alert], bool]
+    ) -> None:
         """Replace the active alerts with the alerts in `standing`. Alerts that are not in it end
-        only if the function `is_heard` returns True for their place, that is, if a service answers
-        for it.
+        only if the function `has_service` returns True for their place, that is, if a service
+        answers for it.
         """
         present = {(alert.cell, alert.sector): alert for alert in standing}
         self._standing = {
             place: one
             for place, one in self._standing.items()
-            if place in present or not is_heard(one)
+            if place in present or not has_service(one)
         }
         for alert in present.values():
             self.apply_alert(alert)
@@ -242,16 +244,16 @@ def _find_neighbours(cell: IntArray) -> tuple[IntArray, IntArray]:
     column, row = (part.astype(np.int64) for part in grid.deinterleave(cell))
     key = column << 32 | row
     order = np.argsort(key)
-    ones = [np.zeros(0, np.int64)]
-    others = [np.zeros(0, np.int64)]
+    first_cells = [np.zeros(0, np.int64)]
+    second_cells = [np.zeros(0, np.int64)]
     steps = range(-LINK_CELLS, LINK_CELLS + 1)
     for across, along in ((x, y) for x in steps for y in steps if (x, y) > (0, 0)):
-        wanted = (column + across) << 32 | (row + along)
-        place = np.minimum(np.searchsorted(key, wanted, sorter=order), len(key) - 1)
-        found = key[order[place]] == wanted if len(key) else np.zeros(0, bool)
-        ones.append(np.flatnonzero(found))
-        others.append(order[place[found]])
-    return np.concatenate(ones), np.concatenate(others)
+        neighbour_key = (column + across) << 32 | (row + along)
+        place = np.minimum(np.searchsorted(key, neighbour_key, sorter=order), len(key) - 1)
+        found = key[order[place]] == neighbour_key if len(key) else np.zeros(0, bool)
+        first_cells.append(np.flatnonzero(found))
+        second_cells.append(order[place[found]])
+    return np.concatenate(first_cells), np.concatenate(second_cells)
 
 
 def _cells_of(group: list[Alert]) -> set[int]:
@@ -292,9 +294,9 @@ def _span_tree(places: FloatArray) -> list[list[tuple[int, float]]]:
         if 0.0 < nearest[k] < np.inf:
             tree[k].append((int(parent[k]), float(nearest[k])))
             tree[int(parent[k])].append((k, float(nearest[k])))
-        apart = places - places[k]
-        distance = np.hypot(apart[:, 0], apart[:, 1])
-        distance[np.abs(apart).max(axis=1) > LINK_CELLS] = np.inf
+        offset = places - places[k]
+        distance = np.hypot(offset[:, 0], offset[:, 1])
+        distance[np.abs(offset).max(axis=1) > LINK_CELLS] = np.inf
         closer = is_waiting & (distance < nearest)
         nearest[closer] = distance[closer]
         parent[closer] = k

@@ -87,16 +87,16 @@ class _Watch:
         print_line: Callable[[str], None],
         on_alert: Callable[[StretchAlert], None],
     ) -> None:
-        self._asked = query.parse({} if options.bbox is None else {"bbox": options.bbox})
+        self._query = query.parse({} if options.bbox is None else {"bbox": options.bbox})
         self._as_json = options.as_json
         self._print_line = print_line
         self._on_alert = on_alert
         self._stretches = Stretches()
         self._arrived: SimpleQueue[wire.Alert] = SimpleQueue()
-        self._away = set[str]()
+        self._unserved = set[str]()
 
     def _is_near(self, tile: int) -> bool:
-        box = self._asked.bbox
+        box = self._query.bbox
         return box is None or bool(grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)))
 
     def print_tile(self, sample: zenoh.Sample) -> None:
@@ -118,15 +118,15 @@ class _Watch:
         """
         before = services.active
         found = standing_alerts(session)
-        heard = {token.region for token in before & services.active}
+        answering_regions = {token.region for token in before & services.active}
 
-        def is_heard(alert: wire.Alert) -> bool:
+        def has_service(alert: wire.Alert) -> bool:
             region = regions.region_of(int(grid.tile_of(alert.cell)))
-            return any(regions.covers(one, region) for one in heard)
+            return any(regions.covers(one, region) for one in answering_regions)
 
-        near = (alert for alert in found if self._is_near(int(grid.tile_of(alert.cell))))
+        alerts_in_box = (alert for alert in found if self._is_near(int(grid.tile_of(alert.cell))))
         # The queued alerts are applied later, because some are newer than the answer.
-        self._stretches.replace_alerts(near, is_heard)
+        self._stretches.replace_alerts(alerts_in_box, has_service)
 
     def print_alerts(self) -> None:
         """Print the stretches of road whose alert has changed."""
@@ -142,14 +142,21 @@ class _Watch:
 
     def print_services(self, services: presence.PresenceTracker) -> None:
         """Print the regions that have lost or regained their service."""
-        here = {token.region for token in services.active}
-        left = {token.region for token in services.lost_tokens} - here
-        now = set(regions.unserved_expressions(self._asked, here)) if self._asked.bbox else left
-        if now != self._away and (here or services.lost_tokens):
-            for event, found in (("away", now - self._away), ("back", self._away - now)):
+        served_regions = {token.region for token in services.active}
+        lost_regions = {token.region for token in services.lost_tokens} - served_regions
+        unserved_regions = (
+            set(regions.unserved_expressions(self._query, served_regions))
+            if self._query.bbox
+            else lost_regions
+        )
+        if unserved_regions != self._unserved and (served_regions or services.lost_tokens):
+            for event, found in (
+                ("away", unserved_regions - self._unserved),
+                ("back", self._unserved - unserved_regions),
+            ):
                 if found:
                     self._print_line(_regions_line(event, sorted(found), self._as_json))
-            self._away = now
+            self._unserved = unserved_regions
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:

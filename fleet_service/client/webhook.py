@@ -108,11 +108,15 @@ class Webhook:
     """
 
     def __init__(
-        self, url: str, say: Callable[[str], None], queue: AlertQueue, timeout_s: float = TIMEOUT_S
+        self,
+        url: str,
+        log_line: Callable[[str], None],
+        queue: AlertQueue,
+        timeout_s: float = TIMEOUT_S,
     ) -> None:
         check_url(url)
         self._url = url
-        self._say = say
+        self._log_line = log_line
         self._queue = queue
         self._timeout_s = timeout_s
         # Log only scheme and host, because the path may contain a secret.
@@ -121,9 +125,9 @@ class Webhook:
         self._failure = ""
         self._undelivered = 0
         self._is_closed = False
-        self._more = threading.Event()
+        self._wake = threading.Event()
         self._stop = threading.Event()
-        self._more.set()
+        self._wake.set()
         self._thread = threading.Thread(target=self._send_until_closed, name="webhook", daemon=True)
         self._thread.start()
 
@@ -173,27 +177,29 @@ class Webhook:
             return
         if dropped:
             self._count_loss("dropped", dropped, "the queue is full")
-        self._more.set()
+        self._wake.set()
 
     def close(self) -> None:
         """Try once to send the waiting alerts, and stop; undelivered alerts stay in the queue
         file.
         """
         self._stop.set()
-        self._more.set()
+        self._wake.set()
         self._thread.join(2 * self._timeout_s)
         self._undelivered = len(self._queue)
         self._is_closed = True
         if self._undelivered:
-            self._say(f"webhook: {self._undelivered} alerts remain in the queue for the next watch")
+            self._log_line(
+                f"webhook: {self._undelivered} alerts remain in the queue for the next watch"
+            )
         if self.lost_count:
-            self._say(f"webhook: {self.lost_count} alerts were lost")
+            self._log_line(f"webhook: {self.lost_count} alerts were lost")
         if not self._thread.is_alive():
             self._queue.close()
 
     def _count_loss(self, kind: str, number: int, reason: str) -> None:
         self.counts[kind] += number
-        self._say(f"webhook: {number} alerts lost, {reason}")
+        self._log_line(f"webhook: {number} alerts lost, {reason}")
 
     def _send_until_closed(self) -> None:
         import httpx
@@ -201,8 +207,8 @@ class Webhook:
         with asyncio.Runner() as runner:
             client = httpx.AsyncClient(follow_redirects=False, timeout=self._timeout_s)
             while True:
-                self._more.wait()
-                self._more.clear()
+                self._wake.wait()
+                self._wake.clear()
                 self._send_queue(runner, client)
                 if self._stop.is_set():
                     break
@@ -239,7 +245,7 @@ class Webhook:
             failure = f"{type(error).__name__} {error}".strip()
         self.counts["failures"] += 1
         if not self._failure:
-            self._say(f"webhook: {self._name} does not accept alerts ({failure}); they wait")
+            self._log_line(f"webhook: {self._name} does not accept alerts ({failure}); they wait")
         self._failure = failure
         return Attempt.FAILED
 
@@ -251,7 +257,7 @@ class Webhook:
         else:
             self._count_loss("refused", 1, f"{self._name} answered {status}")
         if self._failure:
-            self._say("webhook: the receiver answers again")
+            self._log_line("webhook: the receiver answers again")
             self._failure = ""
 
     async def _post_message(self, client: httpx.AsyncClient, text: str) -> int:

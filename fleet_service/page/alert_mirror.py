@@ -19,16 +19,16 @@ class AlertMirror:
         self._lock = threading.Lock()
         self._stretches = Stretches()
         self._changed = False
-        self.heard_count = 0  # number of received messages about alerts
-        self.heard = 0.0  # arrival time of the last message [s since 1970]
+        self.received_count = 0  # number of received messages about alerts
+        self.last_received = 0.0  # arrival time of the last message [s since 1970]
 
     def take_alert(self, alert: Alert, now: float) -> None:
         """Apply a received alert to the local copy: the alert of a cell was raised, repeated or
         cleared.
         """
         with self._lock:
-            self.heard = now
-            self.heard_count += 1
+            self.last_received = now
+            self.received_count += 1
             self._stretches.apply_alert(alert)
 
     def take_standing(
@@ -38,8 +38,8 @@ class AlertMirror:
         returns True if a service answers for a cell; alerts of cells without a service are kept.
         """
         with self._lock:
-            self.heard = now
-            self.heard_count += 1
+            self.last_received = now
+            self.received_count += 1
             self._stretches.replace_alerts(standing, lambda alert: served(alert.cell))
 
     def take_change(self) -> bool:

@@ -19,7 +19,7 @@ NEAR_M: Final = 30_000.0  # [m] an area gets the name of the nearest place withi
 MOST: Final = 100
 
 
-def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
+def found_in(world: MapMirror, places: Sequence[tuple[str, float, float]]) -> list[dict[str, Any]]:
     """Return the areas of the map that have data, one dictionary each; an area is a group of
     neighbouring tiles. The keys are: `name` of the nearest place (empty if no named place is near),
     `box` of the area [deg], `latitude` and `longitude` of the centre [deg], and the numbers of
@@ -27,7 +27,7 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
 
     Args:
         world: the mirrored map.
-        named: names of places with longitude and latitude [deg].
+        places: names of places with longitude and latitude [deg].
     """
     cell, _ = world.places()
     cell = np.unique(cell)
@@ -45,7 +45,7 @@ def found_in(world: MapMirror, named: Sequence[tuple[str, float, float]]) -> lis
         alerts = sum(_is_inside(box, one["longitude"], one["latitude"]) for one in standing)
         found.append(
             {
-                "name": _nearest_name(latitude, longitude, named),
+                "name": _nearest_name(latitude, longitude, places),
                 "box": box,
                 "latitude": latitude,
                 "longitude": longitude,
@@ -61,12 +61,12 @@ def _is_inside(box: Sequence[float], longitude: float, latitude: float) -> bool:
 
 
 def _nearest_name(
-    latitude: float, longitude: float, named: Sequence[tuple[str, float, float]]
+    latitude: float, longitude: float, places: Sequence[tuple[str, float, float]]
 ) -> str:
     scale = METRES_PER_DEGREE * math.cos(math.radians(latitude))
     far = [
         (math.hypot((x - longitude) * scale, (y - latitude) * METRES_PER_DEGREE), name)
-        for name, x, y in named
+        for name, x, y in places
     ]
     distance, name = min(far, default=(math.inf, ""))
     return name if distance <= NEAR_M else ""

@@ -91,14 +91,14 @@ class TileFile:
         """
         if not 0 <= zoom <= DEEPEST or not 0 <= max(x, y) < 1 << zoom:
             return None
-        asked = (
+        statement = (
             "select tile_data from tiles where zoom_level = ? and tile_column = ? and tile_row = ?"
         )
         with self._lock:
             steps = iter(range(MOST_STEPS))
             self._table.set_progress_handler(lambda: next(steps, None) is None, STEP)
             try:
-                found = self._table.execute(asked, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
+                found = self._table.execute(statement, (zoom, x, (1 << zoom) - 1 - y)).fetchone()
             except sqlite3.Error:  # the file is damaged, or its view needs too many instructions
                 return None
         if found is None or not isinstance(found[0], bytes) or len(found[0]) > MOST_BYTES:

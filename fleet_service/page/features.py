@@ -164,7 +164,7 @@ def api_definition(base: str) -> dict[str, Any]:
             "schema": form,
         }
 
-    asked = (
+    query_parameters = (
         describe_parameter(
             "bbox",
             "query",
@@ -193,7 +193,7 @@ def api_definition(base: str) -> dict[str, Any]:
         ),
     )
     one = describe_parameter("featureId", "path", "CELL-SECTOR", type="string")
-    own = f"/collections/{COLLECTION}"
+    collection_path = f"/collections/{COLLECTION}"
     return {
         "openapi": "3.0.3",
         "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
@@ -202,29 +202,29 @@ def api_definition(base: str) -> dict[str, Any]:
             "/": describe_route("landing page"),
             "/conformance": describe_route("conformance classes"),
             "/collections": describe_route("the collections"),
-            own: describe_route("the collection"),
-            f"{own}/schema": describe_route("the columns"),
-            f"{own}/items": describe_route("features", *asked),
-            f"{own}/items/{{featureId}}": describe_route("one feature", one),
+            collection_path: describe_route("the collection"),
+            f"{collection_path}/schema": describe_route("the columns"),
+            f"{collection_path}/items": describe_route("features", *query_parameters),
+            f"{collection_path}/items/{{featureId}}": describe_route("one feature", one),
         },
     }
 
 
 def page_of(
-    features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str
+    features: Iterable[dict[str, Any]], has_more: bool, address: str, following: str, stamp: str
 ) -> dict[str, Any]:
     """Return features (map cells) as one page of an answer (GeoJSON).
 
     Args:
         features: features with their ids.
-        more: True if more features follow on a next page.
+        has_more: True if more features follow on a next page.
         address: address of this page.
         following: address of the next page.
         stamp: time of the data, ISO 8601.
     """
     found = list(features)
     links = [_make_link(address, "self", GEOJSON, "this document")]
-    if more:
+    if has_more:
         links.append(_make_link(following, "next", GEOJSON, "next page"))
     return {
         "type": "FeatureCollection",

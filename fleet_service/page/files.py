@@ -51,8 +51,12 @@ class Files:
         Args:
             accepted: value of the header `Accept-Language`, the preferred language first.
         """
-        wanted = [one.partition(";")[0].strip().lower() for one in accepted.split(",")]
-        names = [f"texts.{tag}.json" for one in wanted for tag in (one, one.partition("-")[0])]
+        languages = [language.partition(";")[0].strip().lower() for language in accepted.split(",")]
+        names = [
+            f"texts.{tag}.json"
+            for language in languages
+            for tag in (language, language.partition("-")[0])
+        ]
         return next((name for name in names if name in self._files), ENGLISH)
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:

@@ -31,7 +31,7 @@ class ServiceHealth:
         self._addresses = addresses
         self._lock = threading.Lock()
         self._answers: list[dict[str, Any]] = []
-        self._asked = 0.0
+        self._queried_at = 0.0
         self._before: dict[str, tuple[float, float]] = {}
 
     def services(self) -> list[dict[str, Any]]:
@@ -39,9 +39,9 @@ class ServiceHealth:
         and the values of its metrics.
         """
         with self._lock:
-            if time.monotonic() - self._asked >= KEPT_S:
+            if time.monotonic() - self._queried_at >= KEPT_S:
                 self._answers = [self._ask(address) for address in self._addresses]
-                self._asked = time.monotonic()
+                self._queried_at = time.monotonic()
             return self._answers
 
     def _ask(self, address: str) -> dict[str, Any]:

@@ -29,13 +29,13 @@ class MirroredTile:
     Attributes:
         cells: records of the cells.
         version: number of changes of the tile so far.
-        heard: time at which the tile was received [s since 1970].
+        last_received: time at which the tile was received [s since 1970].
         made: blocks (encoded cells of the tile) by zoom level, kept for the next request.
     """
 
     cells: Records = field(default_factory=lambda: _EMPTY)
     version: int = 0
-    heard: float = 0.0
+    last_received: float = 0.0
     made: dict[int, bytes] = field(default_factory=dict)
 
 
@@ -55,7 +55,7 @@ class MapMirror:
         # tiles that changed since the last call of `changes`, in the state at that time
         self._before: dict[int, _Before] = {}
         self.recent = RecentMoments()
-        self._heard = 0.0
+        self._last_received = 0.0
         self.alerts = AlertMirror()
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
@@ -64,20 +64,20 @@ class MapMirror:
         """
         cells = records.of_table(table)
         with self._lock:
-            self._heard = now
-            held = self._tiles.setdefault(tile, MirroredTile())
-            held.heard = now
-            if np.array_equal(held.cells, cells):
+            self._last_received = now
+            mirrored = self._tiles.setdefault(tile, MirroredTile())
+            mirrored.last_received = now
+            if np.array_equal(mirrored.cells, cells):
                 return
-            self._before.setdefault(tile, _Before(held.cells, held.version))
-            held.cells = cells
-            held.version = held.version + 1
-            held.made = {}
+            self._before.setdefault(tile, _Before(mirrored.cells, mirrored.version))
+            mirrored.cells = cells
+            mirrored.version = mirrored.version + 1
+            mirrored.made = {}
 
     @property
-    def heard(self) -> float:
+    def last_received(self) -> float:
         """Return the time at which any service last sent anything [s since 1970]; 0 if none has."""
-        return max(self._heard, self.alerts.heard)
+        return max(self._last_received, self.alerts.last_received)
 
     def remember(self, now: float) -> None:
         """Store the present map among the recent moments, so that the time slider of the page can
@@ -85,18 +85,23 @@ class MapMirror:
         """
         with self._lock:
             self.recent.keep(
-                now, {tile: held.cells for tile, held in self._tiles.items() if len(held.cells)}
+                now,
+                {
+                    tile: mirrored.cells
+                    for tile, mirrored in self._tiles.items()
+                    if len(mirrored.cells)
+                },
             )
 
     def places(self) -> tuple[IntArray, IntArray]:
         """Return cell and heading sector of all records in the local copy, as two arrays (n,)."""
         with self._lock:
-            held = [
+            parts = [
                 (tile, one.cells["place"].astype(np.int64)) for tile, one in self._tiles.items()
             ]
-        if not held:
+        if not parts:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        place = np.concatenate([tile * (1 << 14) * grid.SECTORS + place for tile, place in held])
+        place = np.concatenate([tile * (1 << 14) * grid.SECTORS + place for tile, place in parts])
         return place // grid.SECTORS, place % grid.SECTORS
 
     def changes(self) -> list[TileBlock]:
@@ -108,10 +113,15 @@ class MapMirror:
             self._before = {}
             found = []
             for tile, (cells, version) in before.items():
-                held = self._tiles[tile]
-                delta = records.changed_records(cells, held.cells)
+                mirrored = self._tiles[tile]
+                delta = records.changed_records(cells, mirrored.cells)
                 block = TileBlock(
-                    tile, records.CELL_LEVEL, held.version, version, held.heard, delta
+                    tile,
+                    records.CELL_LEVEL,
+                    mirrored.version,
+                    version,
+                    mirrored.last_received,
+                    delta,
                 )
                 found.append(block)
             return found
@@ -119,19 +129,19 @@ class MapMirror:
     def tiles(self) -> list[int]:
         """Return the numbers of all tiles in the local copy that have cells."""
         with self._lock:
-            return [tile for tile, held in self._tiles.items() if len(held.cells)]
+            return [tile for tile, mirrored in self._tiles.items() if len(mirrored.cells)]
 
     def oldest(self, before: float, most: int) -> list[int]:
         """Return at most `most` tiles that were not received since `before` [s since 1970], oldest
         first.
         """
         with self._lock:
-            late = [
-                (held.heard, tile)
-                for tile, held in self._tiles.items()
-                if held.heard < before and len(held.cells)
+            outdated = [
+                (mirrored.last_received, tile)
+                for tile, mirrored in self._tiles.items()
+                if mirrored.last_received < before and len(mirrored.cells)
             ]
-        return [tile for _, tile in sorted(late)[:most]]
+        return [tile for _, tile in sorted(outdated)[:most]]
 
     def touch(self, tile: int, now: float) -> None:
         """Record that a tile was queried at time `now` [s since 1970]. The content of the tile in
@@ -139,19 +149,21 @@ class MapMirror:
         """
         with self._lock:
             if tile in self._tiles:
-                self._tiles[tile].heard = now
+                self._tiles[tile].last_received = now
 
     def encoded(self, tile: int, level: int) -> bytes:
         """Return the cells of a tile at a zoom level, encoded as one block (bytes for the browser);
         empty bytes if the tile is unknown.
         """
         with self._lock:
-            held = self._tiles.get(tile)
-            if held is None or not held.version:
+            mirrored = self._tiles.get(tile)
+            if mirrored is None or not mirrored.version:
                 return b""
-            if level not in held.made:
-                held.made[level] = block_at(level, tile, held.cells, held.version, held.heard)
-            return held.made[level]
+            if level not in mirrored.made:
+                mirrored.made[level] = block_at(
+                    level, tile, mirrored.cells, mirrored.version, mirrored.last_received
+                )
+            return mirrored.made[level]
 
     def version(self, tile: int) -> int:
         """Return the number of changes of a tile; 0 if the tile is unknown."""

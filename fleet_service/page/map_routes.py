@@ -52,17 +52,17 @@ class MapRoutes:
         `level`, now or at the time `at`. With `borrowed`, the blocks also contain cells without
         visits, whose friction is estimated from neighbouring cells.
         """
-        wanted = request_params.parse_tiles(request)
+        tiles = request_params.parse_tiles(request)
         level = request_params.parse_level(request)
         at = request_params.parse_moment(request)
         if at is not None:
             made = await run_in_threadpool(
-                lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted]
+                lambda: [self._of.moments.encoded(at, tile, level) for tile in tiles]
             )
         elif "borrowed" in request.query_params:
-            made = await run_in_threadpool(lambda: [self._borrowed_cells(tile) for tile in wanted])
+            made = await run_in_threadpool(lambda: [self._borrowed_cells(tile) for tile in tiles])
         else:
-            made = [self._of.world.encoded(tile, level) for tile in wanted]
+            made = [self._of.world.encoded(tile, level) for tile in tiles]
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
     def _borrowed_cells(self, tile: int) -> bytes:

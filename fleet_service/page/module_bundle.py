@@ -30,7 +30,7 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
             or imports are circular.
         KeyError: a module is missing.
     """
-    wanted: defaultdict[str, set[str]] = defaultdict(set)
+    imported_names: defaultdict[str, set[str]] = defaultdict(set)
     needs: dict[str, list[str]] = {}
     waiting = [main]
     while waiting:
@@ -41,11 +41,11 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
         needs[name] = [module for _, module in found]
         waiting += needs[name]
         for names, module in found:
-            wanted[module] |= {one.split(" as ")[0] for one in names.split(", ")}
+            imported_names[module] |= {one.split(" as ")[0] for one in names.split(", ")}
     return "".join(
         _strip_imports(modules[name])
         if name == main
-        else _wrap_module(name, _strip_imports(modules[name]), sorted(wanted[name]))
+        else _wrap_module(name, _strip_imports(modules[name]), sorted(imported_names[name]))
         for name in TopologicalSorter(needs).static_order()
     )
 

@@ -89,10 +89,10 @@ class Moments:
             if moment not in files:
                 found += self._recent_history(moment, cell, sector)
                 continue
-            wanted = (pc.field("cell") == cell) & (pc.field("sector") == sector)
+            row_filter = (pc.field("cell") == cell) & (pc.field("sector") == sector)
             try:
                 table = pq.read_table(
-                    files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None
+                    files[moment], columns=list(_OF_HISTORY), filters=row_filter, partitioning=None
                 )
             except (OSError, pa.ArrowException):  # removed by retention, or damaged
                 continue

@@ -106,13 +106,15 @@ class FeatureRoutes:
 
     def _items(self, request: Request, question: FeatureQuestion) -> Response:
         table = self._cells(question)
-        more = table.num_rows > question.limit
+        has_more = table.num_rows > question.limit
         table = table.slice(0, question.limit)
         address = f"{_base_address(request)}{_OWN}/items"
         last = ""
         if table.num_rows:
             last = features.feature_id(table["cell"][-1].as_py(), table["sector"][-1].as_py())
-        given = {name: value for name, value in request.query_params.items() if name != "after"}
+        parameters = {
+            name: value for name, value in request.query_params.items() if name != "after"
+        }
         stamp = (
             datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC)
             .isoformat()
@@ -120,9 +122,9 @@ class FeatureRoutes:
         )
         answer = features.page_of(
             features.with_identity(extract.geojson_features(geo.with_cells(table))),
-            more,
+            has_more,
             str(request.url),
-            f"{address}?{urlencode(given | {'after': last})}",
+            f"{address}?{urlencode(parameters | {'after': last})}",
             stamp,
         )
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})

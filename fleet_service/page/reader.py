@@ -94,7 +94,7 @@ class Reader:
         """Return True if a fleet service answers for any region."""
         return self._served and self.is_connected
 
-    def is_heard(self, latitude: float, longitude: float) -> bool:
+    def has_service(self, latitude: float, longitude: float) -> bool:
         """Return True if a fleet service answers for the place at this latitude and longitude
         [deg].
         """

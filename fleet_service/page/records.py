@@ -144,18 +144,18 @@ def aggregate_worst(records: Records, level: int) -> Records:
         return records
     place = (records["place"] >> (2 + 2 * (CELL_LEVEL - level))) << 2
     first = np.flatnonzero(np.append(True, place[1:] != place[:-1]))
-    known = records["basis"] == MEASURED
+    is_measured = records["basis"] == MEASURED
     count = np.diff(np.append(first, len(records)))
-    share = 1.0 - np.add.reduceat(known.astype(np.int64), first) / count
-    some = np.repeat(share < 1.0, count)
+    share = 1.0 - np.add.reduceat(is_measured.astype(np.int64), first) / count
+    has_measured = np.repeat(share < 1.0, count)
     # Cells with only a lower bound count if no cell of the square was measured.
-    spoken = known | ~some
+    is_counted = is_measured | ~has_measured
     found = np.zeros(len(first), RECORD)
     found["place"] = place[first]
     for name in ("mu", "lower", "upper"):
-        found[name] = np.minimum.reduceat(np.where(spoken, records[name], NO_NUMBER), first)
+        found[name] = np.minimum.reduceat(np.where(is_counted, records[name], NO_NUMBER), first)
     for name in ("slippery", "vehicles"):
-        found[name] = np.maximum.reduceat(np.where(spoken, records[name], 0), first)
+        found[name] = np.maximum.reduceat(np.where(is_counted, records[name], 0), first)
     found["last"] = np.maximum.reduceat(records["last"], first)
     found["basis"] = np.where(share < 1.0, MEASURED, BOUND)
     found["mu"][share == 1.0] = NO_NUMBER

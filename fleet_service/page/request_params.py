@@ -62,13 +62,13 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
     Raises:
         InputError: a parameter is unknown or not valid.
     """
-    given = request.query_params
-    if unknown := [name for name in given if name not in _OF_FEATURES]:
+    parameters = request.query_params
+    if unknown := [name for name in parameters if name not in _OF_FEATURES]:
         raise InputError(unknown[0][:40], "is not a parameter", f"use {', '.join(_OF_FEATURES)}")
-    box = query.parse({"bbox": given["bbox"]}).bbox if "bbox" in given else None
-    since, at = _parse_interval(given.get("datetime", "../.."), now)
-    limit = _parse_whole("limit", given["limit"], 1, 1 << 31) if "limit" in given else FEW
-    after = parse_feature_id(given["after"]) if "after" in given else -1
+    box = query.parse({"bbox": parameters["bbox"]}).bbox if "bbox" in parameters else None
+    since, at = _parse_interval(parameters.get("datetime", "../.."), now)
+    limit = _parse_whole("limit", parameters["limit"], 1, 1 << 31) if "limit" in parameters else FEW
+    after = parse_feature_id(parameters["after"]) if "after" in parameters else -1
     return FeatureQuestion(box, since, at, min(limit, MOST), after)
 
 

@@ -73,8 +73,8 @@ class PageSettings:
     most: int = MOST
 
 
-def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve the live page until `stop` is set; call `say` with `page: ADDRESS` when the server
+def run(settings: PageSettings, stop: threading.Event, log_line: Callable[[str], None]) -> None:
+    """Serve the live page until `stop` is set; call `log_line` with `page: ADDRESS` when the server
     listens.
 
     Raises:
@@ -85,8 +85,8 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     reader = Reader(settings.connection, world)
 
     def reader_state() -> dict[str, Any]:
-        away = [region for region in reader.regions() if not region["served"]]
-        return {"router": reader.is_connected, "served": reader.is_served, "away": away}
+        unserved = [region for region in reader.regions() if not region["served"]]
+        return {"router": reader.is_connected, "served": reader.is_served, "away": unserved}
 
     watchers = Watchers(world, reader_state, settings.most)
     sources = Sources(
@@ -118,7 +118,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
             daemon=True,
         ).start()
     try:
-        asyncio.run(_serve_app(app, listening, stop, watchers, say))
+        asyncio.run(_serve_app(app, listening, stop, watchers, log_line))
     finally:
         stop.set()
         listener.join(LEAVE_S)
@@ -132,12 +132,12 @@ def update_publication(
     """
     seen = -1
     while not stop.wait(GATHER_S):
-        if not reader.is_served or (world.alerts.heard_count == seen and not file.is_due):
+        if not reader.is_served or (world.alerts.received_count == seen and not file.is_due):
             # Without a service, no situation is ended. The publication time shows how old it is.
             continue
-        seen = world.alerts.heard_count
+        seen = world.alerts.received_count
         try:
-            file.keep_up(world.alerts.stretches(), reader.is_heard)
+            file.keep_up(world.alerts.stretches(), reader.has_service)
         except InputError as error:  # clients still get the last publication
             log.warning("%s", error)
 
@@ -147,7 +147,7 @@ async def _serve_app(
     listening: socket.socket,
     stop: threading.Event,
     watchers: Watchers,
-    say: Callable[[str], None],
+    log_line: Callable[[str], None],
 ) -> None:
     config = uvicorn.Config(
         app,
@@ -167,7 +167,7 @@ async def _serve_app(
     while not server.started and not serving.done():
         await asyncio.sleep(0.01)
     host, port = listening.getsockname()[:2]
-    say(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/")
+    log_line(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/")
     while not stop.is_set() and not serving.done():
         await asyncio.sleep(LOOK_S)
     watchers.close()

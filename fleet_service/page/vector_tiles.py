@@ -190,11 +190,11 @@ class PmtilesFile:
             return None
 
     def _find_tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        wanted = _hilbert_number(zoom, x, y)
+        tile_number = _hilbert_number(zoom, x, y)
         offset = self._root
         size = self._root_size
         for _ in range(4):
-            entry = _find_entry(self._part(offset, size), wanted)
+            entry = _find_entry(self._part(offset, size), tile_number)
             if entry is None:
                 return None
             start, size, run = entry
@@ -217,9 +217,9 @@ class PmtilesFile:
             return file.read(size)
 
 
-def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
+def _find_entry(directory: bytes, tile_number: int) -> tuple[int, int, int] | None:
     """Return offset, size and run length of the last entry of a PMTiles directory whose tile number
-    is at most `wanted`. A run length of 0 means that the entry refers to a further directory.
+    is at most `tile_number`. A run length of 0 means that the entry refers to a further directory.
     """
     numbers = _decode_varints(directory)
     count = next(numbers)
@@ -232,10 +232,12 @@ def _find_entry(directory: bytes, wanted: int) -> tuple[int, int, int] | None:
     sizes = [next(numbers) for _ in range(count)]
     offsets: list[int] = []
     for k in range(count):
-        given = next(numbers)
-        offsets.append(offsets[-1] + sizes[k - 1] if given == 0 and k else given - 1)
-    place = max((k for k in range(count) if ids[k] <= wanted), default=-1)
-    if place < 0 or (runs[place] and wanted >= ids[place] + runs[place]):
+        encoded_offset = next(numbers)
+        offsets.append(
+            offsets[-1] + sizes[k - 1] if encoded_offset == 0 and k else encoded_offset - 1
+        )
+    place = max((k for k in range(count) if ids[k] <= tile_number), default=-1)
+    if place < 0 or (runs[place] and tile_number >= ids[place] + runs[place]):
         return None
     return offsets[place], sizes[place], runs[place]
 

@@ -126,7 +126,7 @@ class Watchers:
             self._put(watcher, None)
 
     def _beat(self) -> dict[str, Any]:
-        return {"now": time.time(), "heard": self._world.heard, **self._state()}
+        return {"now": time.time(), "heard": self._world.last_received, **self._state()}
 
     def push(self, changes: list[TileBlock]) -> None:
         """Send changed blocks to the browsers whose view they touch."""

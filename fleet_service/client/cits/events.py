@@ -85,7 +85,10 @@ class EventBook:
         }
 
     def update(
-        self, standing: Sequence[StretchAlert], now: int, is_heard: Callable[[float, float], bool]
+        self,
+        standing: Sequence[StretchAlert],
+        now: int,
+        has_service: Callable[[float, float], bool],
     ) -> list[Denm]:
         """Return the hazard messages (DENM) that are due now. Events at places for which no service
         answers are not ended, because their state is unknown.
@@ -93,7 +96,7 @@ class EventBook:
         Args:
             standing: every stretch of road with an active alert.
             now: current time [ns UTC].
-            is_heard: function that returns True if a service answers for a place (latitude,
+            has_service: function that returns True if a service answers for a place (latitude,
                 longitude).
         """
         out: list[Denm] = []
@@ -124,7 +127,7 @@ class EventBook:
                 out.append(self._event_message(self._events[alert.id], alert, now))
         present = {alert.id for alert in standing}
         for name, event in list(self._events.items()):
-            if name not in present and not event.ended and is_heard(*event.position):
+            if name not in present and not event.ended and has_service(*event.position):
                 out.append(self._end_event(event, now))
         return out
 

@@ -75,20 +75,20 @@ class DenmOutput:
             self._pending.pop(name, None)
 
     def keep_up(
-        self, standing: Sequence[StretchAlert], is_heard: Callable[[float, float], bool]
+        self, standing: Sequence[StretchAlert], has_service: Callable[[float, float], bool]
     ) -> None:
         """Send the DENM that are due.
 
         Args:
             standing: every stretch of road with an active alert.
-            is_heard: function that returns True if a service answers for a place (latitude,
+            has_service: function that returns True if a service answers for a place (latitude,
                 longitude).
 
         Raises:
             InputError: the file cannot be written; nothing was sent.
         """
         self._checked = time.monotonic()
-        due = self._book.update(standing, self._clock(), is_heard)
+        due = self._book.update(standing, self._clock(), has_service)
         with self._lock:
             fresh = {f"{one.sequence}-{one.referenced}": (encode_denm(one), one) for one in due}
             self._pending |= {name: body for name, (body, _) in fresh.items()}
