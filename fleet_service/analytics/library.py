@@ -41,8 +41,8 @@ def ask_archive(
     """
     root = Path(archive)
     require_archive(root)
-    asked = question_of(question)
-    return asked.ask(
+    predefined_question = question_of(question)
+    return predefined_question.ask(
         QueryEngine(engine, root, _make_extract(*period, bbox)),
         options or Options(report=lambda _: None),
     )

@@ -81,7 +81,7 @@ def require_empty(out: Path) -> None:
         )
 
 
-def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
+def rebuild(request: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
     """Rebuild all zones of an archive; yield the result of each zone, in order.
 
     Raises:
@@ -91,14 +91,14 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
     """
     if engine not in ENGINES:
         raise InputError("engine", f"{engine!r} is unknown", f"use one of {', '.join(ENGINES)}")
-    zones = zones_of(wanted.root)
+    zones = zones_of(request.root)
     if not zones:
         raise InputError(
-            "archive", f"no compacted observations in {wanted.root}", "run fleet-service compact"
+            "archive", f"no compacted observations in {request.root}", "run fleet-service compact"
         )
-    work = partial(rebuild_zone, wanted)
+    work = partial(rebuild_zone, request)
     yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
-    sweep_drafts(wanted.out)
+    sweep_drafts(request.out)
 
 
 def zones_of(root: Path) -> list[int]:
@@ -108,7 +108,7 @@ def zones_of(root: Path) -> list[int]:
     )
 
 
-def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
+def rebuild_zone(request: Rebuild, zone: int) -> RebuildResult:
     """Rebuild one zone of an archive. Repeated or concurrent calls are harmless, because they write
     the same files.
 
@@ -119,19 +119,19 @@ def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
     west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
     box = (west, south, east, north)
     cells = visited_cells(
-        past_fusion(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box
+        past_fusion(request.root, request.lateness_s, request.until, box), request.until, box
     )
     cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
-    named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
-    with own_drafts(wanted.out) as drafts:
-        place = partial(_write_atomically, wanted.out, drafts)
+    zone_folder = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
+    with own_drafts(request.out) as drafts:
+        place = partial(_write_atomically, request.out, drafts)
         if cells.num_rows:
-            path = snapshots.path_of(wanted.out, wanted.until)
-            place(path.parent / named / path.name, snapshot_table(cells, wanted.until), MAP)
+            path = snapshots.path_of(request.out, request.until)
+            place(path.parent / zone_folder / path.name, snapshot_table(cells, request.until), MAP)
         parts = 0
-        for path in layout.compacted_files(wanted.root, Kind.OBSERVATION):
+        for path in layout.compacted_files(request.root, Kind.OBSERVATION):
             if layout.partition_of(path).zone == zone and (part := _compute_part(path)) is not None:
-                place(rollup.part_of(path, wanted.out), part, ROLLUP)
+                place(rollup.part_of(path, request.out), part, ROLLUP)
                 parts += 1
     return RebuildResult(zone, cells.num_rows, parts)
 

@@ -72,9 +72,9 @@ def expression(t: Table) -> Table:
     t = t.mutate(
         before=t.slippery.lag().over(w), since=t.time.lag().over(w), by=t.vehicle.lag().over(w)
     )
-    t = t.mutate(apart=(t.time - t.since).cast("float64"))
+    t = t.mutate(elapsed_s=(t.time - t.since).cast("float64"))
     t = t.filter(
-        t.before.notnull() & (t.by != t.vehicle) & (t.apart >= 1.0) & (t.apart <= LONGEST_S)
+        t.before.notnull() & (t.by != t.vehicle) & (t.elapsed_s >= 1.0) & (t.elapsed_s <= LONGEST_S)
     )
     road = t.temperature - AIR_ABOVE_ROAD_C
     band = ibis.literal(UNKNOWN)
@@ -88,13 +88,13 @@ def expression(t: Table) -> Table:
     t = t.mutate(
         band=ibis.ifelse(t.temperature.isnull(), UNKNOWN, band),
         hours=((t.time / 3600).floor() % 24 / HOURS).floor().cast("int64"),
-        octave=(t.apart.log2() * BINS_PER_OCTAVE).floor().cast("int64"),
+        octave=(t.elapsed_s.log2() * BINS_PER_OCTAVE).floor().cast("int64"),
     )
     return t.group_by("band", "hours", "day", "octave").aggregate(
         pairs=t.count(),
         unlike=(t.slippery != t.before).cast("int64").sum(),
         slippery=(t.slippery + t.before).sum(),
-        seconds=t.apart.sum(),
+        seconds=t.elapsed_s.sum(),
     )
 
 
@@ -206,23 +206,27 @@ def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> t
     counts = counts[counts[:, 0] > 0]
     pairs, unlike, slippery, seconds = counts.T
     share = slippery.sum() / (2.0 * pairs.sum()) if len(counts) else 0.0
-    most = 2.0 * share * (1.0 - share)
-    if unlike.sum() == 0 or most <= 0.0:
+    chance_unlike = 2.0 * share * (1.0 - share)
+    if unlike.sum() == 0 or chance_unlike <= 0.0:
         return np.nan, np.nan
-    apart = seconds / pairs
+    elapsed_s = seconds / pairs
 
     def loss(x: FloatArray) -> float:
         rate = np.exp(x[0])
-        misread = most / (1.0 + np.exp(-x[1]))
-        p = np.clip(misread + (most - misread) * -np.expm1(-rate * apart), 1e-9, 1.0 - 1e-9)
+        misread = chance_unlike / (1.0 + np.exp(-x[1]))
+        p = np.clip(
+            misread + (chance_unlike - misread) * -np.expm1(-rate * elapsed_s), 1e-9, 1.0 - 1e-9
+        )
         return -float(unlike @ np.log(p) + (pairs - unlike) @ np.log1p(-p))
 
-    starts = [np.array([np.log(rate), _logit(misread / most)]) for rate, misread in begins]
+    starts = [np.array([np.log(rate), _logit(misread / chance_unlike)]) for rate, misread in begins]
     best = min(
         (minimize(loss, x, method="Nelder-Mead") for x in starts),
-        key=lambda found: float(found.fun),
+        key=lambda result: float(result.fun),
     )
-    return float(np.exp(np.clip(best.x[0], -30.0, 5.0))), float(most / (1.0 + np.exp(-best.x[1])))
+    return float(np.exp(np.clip(best.x[0], -30.0, 5.0))), float(
+        chance_unlike / (1.0 + np.exp(-best.x[1]))
+    )
 
 
 def _logit(share: float) -> float:

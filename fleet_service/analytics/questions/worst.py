@@ -109,13 +109,15 @@ def _label_components(cell: IntArray, sector: IntArray) -> IntArray:
     """
     key = cell * grid.SECTORS + sector
     order = np.argsort(key)
-    beside = grid.neighbours(cell) * grid.SECTORS + sector[:, None]
-    place = np.searchsorted(key[order], beside)
-    there = order[np.minimum(place, len(key) - 1)] if len(key) else place
-    touches = key[there] == beside if len(key) else np.zeros_like(beside, bool)
-    here = np.broadcast_to(np.arange(len(key))[:, None], beside.shape)
+    neighbour_key = grid.neighbours(cell) * grid.SECTORS + sector[:, None]
+    place = np.searchsorted(key[order], neighbour_key)
+    neighbour_row = order[np.minimum(place, len(key) - 1)] if len(key) else place
+    touches = (
+        key[neighbour_row] == neighbour_key if len(key) else np.zeros_like(neighbour_key, bool)
+    )
+    own_row = np.broadcast_to(np.arange(len(key))[:, None], neighbour_key.shape)
     edges = coo_array(
-        (np.ones(int(touches.sum()), bool), (here[touches], there[touches])),
+        (np.ones(int(touches.sum()), bool), (own_row[touches], neighbour_row[touches])),
         shape=(len(key), len(key)),
     )
     return np.asarray(connected_components(edges, directed=False)[1], np.int64)

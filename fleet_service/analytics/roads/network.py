@@ -178,12 +178,12 @@ def _driven_directions(
     identity: str, name: str, kind: str, oneway: str, points: FloatArray
 ) -> list[DirectedLink]:
     """Return a link for each direction in which a line may be driven."""
-    apart = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
-    points = points[apart[: len(points)]]
+    is_distinct = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
+    points = points[is_distinct[: len(points)]]
     if len(points) < 2:
         return []
-    there = DirectedLink(identity, FORWARD, name, kind, points[:, 0], points[:, 1])
-    back = DirectedLink(identity, BACKWARD, name, kind, points[::-1, 0], points[::-1, 1])
+    forward = DirectedLink(identity, FORWARD, name, kind, points[:, 0], points[:, 1])
+    backward = DirectedLink(identity, BACKWARD, name, kind, points[::-1, 0], points[::-1, 1])
     if oneway.lower() in _ONLY_FORWARD:
-        return [there]
-    return [back] if oneway.lower() in _ONLY_BACKWARD else [there, back]
+        return [forward]
+    return [backward] if oneway.lower() in _ONLY_BACKWARD else [forward, backward]
