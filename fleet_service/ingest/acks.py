@@ -99,8 +99,8 @@ def _split_stream(
     at most ITEMS_PER_STREAM items.
     """
     for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
-        some = slice(at, at + ITEMS_PER_STREAM)
-        yield StreamAck(*stream, durable[some], rejected[some], late[some])
+        piece = slice(at, at + ITEMS_PER_STREAM)
+        yield StreamAck(*stream, durable[piece], rejected[piece], late[piece])
 
 
 def consecutive_ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:

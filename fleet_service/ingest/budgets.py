@@ -41,17 +41,17 @@ class Bucket:
         self._rate = per_hour / HOUR
         self._left: dict[int, tuple[float, float]] = {}
 
-    def take(self, vehicle: int, wanted: int, now: float) -> int:
-        """Take up to `wanted` units of a vehicle's remaining allowance at time `now` [s]; return
+    def take(self, vehicle: int, requested: int, now: float) -> int:
+        """Take up to `requested` units of a vehicle's remaining allowance at time `now` [s]; return
         the number of units taken.
         """
-        left, since = self._left.get(vehicle, (self._at_once, now))
-        left = min(self._at_once, left + max(now - since, 0.0) * self._rate)
-        given = min(wanted, int(left))
+        remaining, since = self._left.get(vehicle, (self._at_once, now))
+        remaining = min(self._at_once, remaining + max(now - since, 0.0) * self._rate)
+        granted = min(requested, int(remaining))
         if len(self._left) >= VEHICLES:
             self._left.clear()
-        self._left[vehicle] = (left - given, now)
-        return given
+        self._left[vehicle] = (remaining - granted, now)
+        return granted
 
 
 class NewCells:
@@ -76,11 +76,11 @@ class NewCells:
         counts = np.diff(starts, append=len(who))
         place = np.cumsum(np.diff(where, prepend=where[:1]) != 0)
         place -= np.repeat(place[starts], counts)  # number of the row's cell within its vehicle
-        wanted = place[starts + counts - 1] + 1
+        new_cells = place[starts + counts - 1] + 1
         for name, start, count, cells in np.column_stack(
-            [who[starts], starts, counts, wanted]
+            [who[starts], starts, counts, new_cells]
         ).tolist():
-            given = self._week.take(name, self._budgets.take(name, cells, now), now)
-            if given < cells:
-                out[order[start : start + count]] = place[start : start + count] >= given
+            granted = self._week.take(name, self._budgets.take(name, cells, now), now)
+            if granted < cells:
+                out[order[start : start + count]] = place[start : start + count] >= granted
         return out

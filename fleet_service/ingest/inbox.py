@@ -254,11 +254,11 @@ class BatchIntake:
                 self._counts.clock_doubted += 1
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), refusal)
-        good = broken < 0
-        for place in np.flatnonzero(good & self._is_erased(owners, time)).tolist():
-            good[place] = False
+        is_valid = broken < 0
+        for place in np.flatnonzero(is_valid & self._is_erased(owners, time)).tolist():
+            is_valid[place] = False
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
-        new = self._select_new(kind, found.heads, time, good)
+        new = self._select_new(kind, found.heads, time, is_valid)
         return self._admit_rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _forget(self, clock: Clock) -> None:
@@ -301,20 +301,25 @@ class BatchIntake:
             self.times[name] = max(self.times.get(name, 0), measured)
 
     def _select_new(
-        self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray
+        self, kind: Kind, heads: Heads, time: IntArray, is_valid: BoolArray
     ) -> dict[BatchId, int]:
-        """Return the batches that are valid (mask `good`) and that were not accepted before, each
-        once, with their positions in `heads` (fields of the batches other than records).
+        """Return the batches that are valid (mask `is_valid`) and that were not accepted before,
+        each once, with their positions in `heads` (fields of the batches other than records).
         """
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
         batches = zip(
-            range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True
+            range(len(is_valid)),
+            heads.vehicle,
+            *(column.tolist() for column in numbers),
+            strict=True,
         )
         known = self._known[kind]
         pending = self._pending
         again = 0
-        for place, vehicle, boot, region, day, seq, first_held in compress(batches, good.tolist()):
+        for place, vehicle, boot, region, day, seq, first_held in compress(
+            batches, is_valid.tolist()
+        ):
             name = vehicle, boot, region, day
             stream = known.get(name) or self._look_up(kind, name, int(time[place]))
             if stream is None:
@@ -373,34 +378,36 @@ class BatchIntake:
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
         rows["row"] -= np.repeat((np.cumsum(sizes) - sizes).astype(np.int32), sizes)
-        good = np.ones(len(batches), bool)
+        is_valid = np.ones(len(batches), bool)
         owner = np.repeat(np.arange(len(batches)), sizes)
         # Only refused rows are processed one by one.
         for index in np.flatnonzero(broken >= 0).tolist():
             place = int(owner[index])
-            if good[place]:
-                good[place] = False
+            if is_valid[place]:
+                is_valid[place] = False
                 refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
                 if validation.is_doubted(refusal, int(rows[TIME[kind]][index]), clock):
                     self._counts.clock_doubted += 1
                 else:
                     self._refuse(batches[place][0].vehicle, heads.at(place), refusal)
-        for place in np.flatnonzero(validation.too_long(rows[TIME[kind]], sizes) & good).tolist():
-            good[place] = False
+        for place in np.flatnonzero(
+            validation.too_long(rows[TIME[kind]], sizes) & is_valid
+        ).tolist():
+            is_valid[place] = False
             self._refuse(batches[place][0].vehicle, heads.at(place), validation.TOO_LONG)
         newest = _newest_times(rows[FIRST_TIME[kind]], sizes).tolist()
-        for place, at in compress(enumerate(newest), good.tolist()):
+        for place, at in compress(enumerate(newest), is_valid.tolist()):
             stream, seq = batches[place]
             # If there is no space to record the batch, older batches must come first. The batch is
             # not rejected, so the sender repeats it.
             if not stream.accept(seq, at):
                 self._counts.too_many_gaps += 1
-                good[place] = False
-        if not good.all():
-            rows = {name: column[good[owner]] for name, column in rows.items()}
-            batches = list(compress(batches, good))
-            heads = heads.take(good)
-            sizes = sizes[good]
+                is_valid[place] = False
+        if not is_valid.all():
+            rows = {name: column[is_valid[owner]] for name, column in rows.items()}
+            batches = list(compress(batches, is_valid))
+            heads = heads.take(is_valid)
+            sizes = sizes[is_valid]
         self._pending.update(batches)
         return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 

@@ -120,12 +120,12 @@ def _find_implausible(
                 excess, _excess_distance(anchors[v, after] - t, places[v, after], place[n])
             )
         if 0 < after < held and is_gap[v, after - 1]:
-            there = places[v, after - 1]
-            back = places[v, after]
+            gap_start = places[v, after - 1]
+            gap_end = places[v, after]
             detour = (
-                _distance_m(there, place[n])
-                + _distance_m(place[n], back)
-                - _distance_m(there, back)
+                _distance_m(gap_start, place[n])
+                + _distance_m(place[n], gap_end)
+                - _distance_m(gap_start, gap_end)
             )
             if detour > _DETOUR_M:
                 excess = np.inf
@@ -175,16 +175,16 @@ def _least_needed(anchors: IntArray) -> int:
 
 
 @refcount_free_locked
-def _excess_distance(apart: int, there: Float32Array, here: FloatArray) -> float:
+def _excess_distance(elapsed_ns: int, start: Float32Array, end: FloatArray) -> float:
     """Return the distance between two places (2,) [deg] minus the distance that a vehicle covers at
-    the speed FASTEST in the time `apart` [ns]. The result is in metres, at least 0.
+    the speed FASTEST in the time `elapsed_ns` [ns]. The result is in metres, at least 0.
     """
-    return max(_distance_m(there, here) - FASTEST * apart / NS, 0.0)
+    return max(_distance_m(start, end) - FASTEST * elapsed_ns / NS, 0.0)
 
 
 @refcount_free_locked
-def _distance_m(there: Float32Array, here: FloatArray | Float32Array) -> float:
+def _distance_m(start: Float32Array, end: FloatArray | Float32Array) -> float:
     """Return the distance [m] between two places (2,) [deg], the shorter way around the earth."""
-    north = here[0] - there[0]
-    east = (here[1] - there[1] + 180.0) % 360.0 - 180.0
-    return float(np.hypot(north, east * np.cos(np.radians(here[0])))) * METRES_PER_DEGREE
+    north = end[0] - start[0]
+    east = (end[1] - start[1] + 180.0) % 360.0 - 180.0
+    return float(np.hypot(north, east * np.cos(np.radians(end[0])))) * METRES_PER_DEGREE

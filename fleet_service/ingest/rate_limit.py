@@ -69,11 +69,11 @@ class RateLimiter:
             name = _OTHERS
         share = self._shares.get(name, 1.0)
         burst = self._burst * share
-        left, since = self._buckets.get(name, (burst, now))
-        left = min(burst, left + (now - since) * self._rate * share)
+        tokens, since = self._buckets.get(name, (burst, now))
+        tokens = min(burst, tokens + (now - since) * self._rate * share)
         cost = min(max(size, LEAST_BYTES) * (JSON_COST if encoding.startswith(JSON) else 1), burst)
-        fits = left >= cost
-        self._buckets[name] = (left - cost if fits else left, now)
+        fits = tokens >= cost
+        self._buckets[name] = (tokens - cost if fits else tokens, now)
         if not fits:
             self._counts.limited += 1
         return fits
@@ -89,8 +89,8 @@ class RateLimiter:
         if now - self._swept >= self._burst / self._rate:
             self._swept = now
             self._buckets = {
-                name: (left, since)
-                for name, (left, since) in list(self._buckets.items())
-                if left / self._shares.get(name, 1.0) + (now - since) * self._rate < self._burst
+                name: (tokens, since)
+                for name, (tokens, since) in list(self._buckets.items())
+                if tokens / self._shares.get(name, 1.0) + (now - since) * self._rate < self._burst
             }
         return len(self._buckets) < MOST_NAMES

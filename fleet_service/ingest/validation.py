@@ -284,9 +284,11 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     cell = columns["cell"]
     at = _cell_of(columns)
     wrong_cell = at != cell
-    beside = np.flatnonzero(wrong_cell)
-    if len(beside):
-        wrong_cell[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
+    mismatched = np.flatnonzero(wrong_cell)
+    if len(mismatched):
+        wrong_cell[mismatched] = ~(grid.neighbours(at[mismatched]) == cell[mismatched, None]).any(
+            axis=1
+        )
     with np.errstate(invalid="ignore"):  # an infinite yaw violates its range and is refused there
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu = columns["mu"]
