@@ -67,8 +67,8 @@ class ErrorModel(NamedTuple):
             share s of the grip is used, the value is too low by `low`·(1 - s)·μ.
         tyres: relative error common to all tyres of the fleet.
         half: relative error that every second vehicle has in addition.
-        alike: share of the passes at a place in which the vehicle does the place's most frequent
-            manoeuvre.
+        usual_share: share of the passes at a place in which the vehicle does the place's most
+            frequent manoeuvre.
     """
 
     bias: float = BIAS_RELATIVE
@@ -80,7 +80,7 @@ class ErrorModel(NamedTuple):
     low: float = 0.0
     tyres: float = 0.0
     half: float = 0.0
-    alike: float = 0.7
+    usual_share: float = 0.7
 
 
 CLEAN: Final = ErrorModel()

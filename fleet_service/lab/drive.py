@@ -147,11 +147,11 @@ def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Obser
 
 
 def watch_drive(
-    rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None
+    rng: Generator, v: Visits, count: int, snapshot_minutes: tuple[int, ...] | None = None
 ) -> AlertWatch:
     """Deliver simulated visits to a new `Fusion` (a map's beliefs) for `count` minutes. Return the
     map with the beliefs and alerts that were read after each minute, or only at the minutes in
-    `asked`.
+    `snapshot_minutes`.
     """
     rows = rows_of(v)
     at, which = draw_arrivals(rng, v)
@@ -166,6 +166,6 @@ def watch_drive(
             updated = fusion.update(part)
             watched.alerts.update(updated.slots)
             watched.late += int(updated.late.sum())
-        if asked is None or minute in asked:
+        if snapshot_minutes is None or minute in snapshot_minutes:
             watched.snapshot(minute)
     return watched

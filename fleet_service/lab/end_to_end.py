@@ -108,7 +108,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     visits = pq.read_table(folder / TRUTH)
     fusion = Fusion(LATENESS_S)
     raised = raised_alerts(fusion, observations_in(columns))
-    false, beside = false_ice(raised, visits)
+    false, next_to_ice = false_ice(raised, visits)
     slots, truth = slots_with_truth(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
     slots = slots[several]
@@ -124,7 +124,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
         "observations": float(len(columns["cell"])),
         "alerts": float(len(raised)),
         "false_ice": float(false),
-        "false_ice.beside": float(beside),
+        "false_ice.beside": float(next_to_ice),
     }
     return {f"{world.prefix}.{name}": value for name, value in found.items()}
 
@@ -155,16 +155,16 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu = visits["mu"].to_numpy()
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
-    false = beside = 0
+    false = next_to_ice = 0
     for alert in raised:
         x, y = (int(value[0]) for value in grid.deinterleave(np.array([alert.cell])))
         far = np.maximum(np.abs(east - x), np.abs(north - y))
         slippery = (mu < SURE_GRIP) & (enter <= alert.time)
         if not (slippery & (far == 0)).any():
-            near = bool((slippery & (far == 1)).any())
-            false = false + (not near)
-            beside = beside + near
-    return false, beside
+            is_near = bool((slippery & (far == 1)).any())
+            false = false + (not is_near)
+            next_to_ice = next_to_ice + is_near
+    return false, next_to_ice
 
 
 def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:

@@ -34,11 +34,11 @@ def largest_difference(a: Fusion, b: Fusion) -> float:
     """Return the largest difference between two `Fusion` objects in any of the 32 probabilities of
     any cell's belief; 1 if a cell exists in only one of them.
     """
-    there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
-    if a.size != b.size or (there < 0).any():
+    slots_in_b = b.slots_of(a.cell[: a.size], a.sector[: a.size])
+    if a.size != b.size or (slots_in_b < 0).any():
         return 1.0
     now = int(max(a.live.time[: a.size].max(), b.live.time[: b.size].max()))
-    return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(there, now)).max())
+    return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(slots_in_b, now)).max())
 
 
 def drive_town(rng: Generator) -> Visits:

@@ -51,7 +51,7 @@ MODELS: Final[dict[str, ErrorModel]] = {
     "narrow30": CLEAN._replace(stated=1 / 3.0),
     "wide15": CLEAN._replace(stated=1.5),
     "half_biased": CLEAN._replace(half=-0.15),
-    "same_manoeuvre": CLEAN._replace(alike=1.0),
+    "same_manoeuvre": CLEAN._replace(usual_share=1.0),
 }
 
 

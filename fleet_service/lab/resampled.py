@@ -114,20 +114,25 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
     vehicle. Where that vehicle visited no road of similar friction, a report of any vehicle of the
     drives is used. If the drives have enough vehicles, each is assigned at most once.
     """
-    there = np.unique(ways.vehicle)
-    who = rng.choice(there, vehicles, replace=vehicles > len(there))
+    driven_vehicles = np.unique(ways.vehicle)
+    who = rng.choice(driven_vehicles, vehicles, replace=vehicles > len(driven_vehicles))
     row = np.empty(len(visits), np.int64)
     for excited in (False, True):
-        alike = np.flatnonzero(ways.excited == excited)
-        alike = alike[np.argsort(ways.mu[alike], kind="stable")]
+        by_friction = np.flatnonzero(ways.excited == excited)
+        by_friction = by_friction[np.argsort(ways.mu[by_friction], kind="stable")]
         for vehicle in range(vehicles):
-            wanted = np.flatnonzero((visits.vehicle == vehicle) & (visits.excited == excited))
-            own = _nearest_friction(
-                rng, visits.mu[wanted], ways.mu, alike[ways.vehicle[alike] == who[vehicle]]
+            visit_rows = np.flatnonzero((visits.vehicle == vehicle) & (visits.excited == excited))
+            of_same_vehicle = _nearest_friction(
+                rng,
+                visits.mu[visit_rows],
+                ways.mu,
+                by_friction[ways.vehicle[by_friction] == who[vehicle]],
             )
-            others = _nearest_friction(rng, visits.mu[wanted], ways.mu, alike)
-            far = (own < 0) | (np.abs(np.log(visits.mu[wanted] / ways.mu[own])) > FARTHEST)
-            row[wanted] = np.where(far, others, own)
+            of_any_vehicle = _nearest_friction(rng, visits.mu[visit_rows], ways.mu, by_friction)
+            far = (of_same_vehicle < 0) | (
+                np.abs(np.log(visits.mu[visit_rows] / ways.mu[of_same_vehicle])) > FARTHEST
+            )
+            row[visit_rows] = np.where(far, of_any_vehicle, of_same_vehicle)
     return replace(visits, reports=_scale_reports(ways.reports, row, visits.mu / ways.mu[row]))
 
 

@@ -88,11 +88,11 @@ def fuse_by_rules(
     seconds: FloatArray,
     sent: FloatArray,
     readings: tuple[FloatArray, FloatArray],
-    asked: FloatArray,
+    read_times: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return mean and variance of μ in each cell at the times `asked`, (times, 5, cells, 2), by
-    five simple rules: the rules of RULES except the median, in the same order.
+    """Return mean and variance of μ in each cell at the times `read_times`, (times, 5, cells, 2),
+    by five simple rules: the rules of RULES except the median, in the same order.
 
     Args:
         place: cell of each visit, (n,).
@@ -101,17 +101,17 @@ def fuse_by_rules(
             rules but "federated reset" use it.
         readings: friction measured in each visit alone, and its standard deviation, (n,) each. Only
             "federated reset" uses it.
-        asked: times [s] at which the maps are read, (times,).
+        read_times: times [s] at which the maps are read, (times,).
         cells: number of cells.
     """
     reading, std = readings
     mean = np.full((5, cells), PRIOR_MEAN)
     variance = np.full((5, cells), PRIOR_VAR)
     last = np.zeros(cells)
-    out = np.empty((len(asked), 5, cells, 2))
+    out = np.empty((len(read_times), 5, cells, 2))
     k = 0
-    for t in range(len(asked)):
-        while k < len(place) and seconds[k] < asked[t]:
+    for t in range(len(read_times)):
+        while k < len(place) and seconds[k] < read_times[t]:
             cell = place[k]
             for rule in range(5):
                 variance[rule, cell] = min(
@@ -170,9 +170,9 @@ def score_rules(
     so are cells in which no vehicle used enough grip to measure the friction.
     """
     sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
-    asked = 60.0 * np.array(at, float)
+    read_times = 60.0 * np.array(at, float)
     readings = (v.reports.reading, v.reports.std)
-    found = fuse_by_rules(v.place, v.seconds, sent, readings, asked, CELLS)
+    found = fuse_by_rules(v.place, v.seconds, sent, readings, read_times, CELLS)
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)

@@ -73,9 +73,9 @@ def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntAr
     """
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
     rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
-    there = np.zeros((CELLS, vehicles), bool)
-    there[v.place[rows], v.vehicle[rows]] = True
-    return np.asarray(there.sum(axis=1))
+    has_reported = np.zeros((CELLS, vehicles), bool)
+    has_reported[v.place[rows], v.vehicle[rows]] = True
+    return np.asarray(has_reported.sum(axis=1))
 
 
 def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:

@@ -160,8 +160,12 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
     alerts.expire(now)
     slots = fusion.slots_of(drive.cells, np.zeros(CELLS, np.int64))
     belief = fusion.beliefs(slots, now)
-    heard = np.bincount(drive.visits.place[drive.visits.excited], minlength=CELLS)
-    return of_beliefs(belief, mu, heard), np.isin(slots, list(alerts.slots)), heard
+    excited_visits = np.bincount(drive.visits.place[drive.visits.excited], minlength=CELLS)
+    return (
+        of_beliefs(belief, mu, excited_visits),
+        np.isin(slots, list(alerts.slots)),
+        excited_visits,
+    )
 
 
 def split_by(seconds: FloatArray, step: float) -> list[IntArray]:

@@ -167,7 +167,7 @@ def drive_fleet(
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
     manoeuvre = np.where(
-        rng.random(len(place)) < model.alike,
+        rng.random(len(place)) < model.usual_share,
         town.usual[place],
         rng.integers(0, MANOEUVRES, len(place)),
     )

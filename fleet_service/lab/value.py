@@ -83,15 +83,17 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
     vehicle = np.repeat(rng.integers(0, VEHICLES, passes), LENGTH)
     cell = np.repeat(rng.integers(0, ROADS, passes) * LENGTH, LENGTH) + along
     mu = place.at(seconds, cell)
-    wanted = (
+    demanded_grip = (
         demand
         * np.vectorize(DEMAND.get)(place.excitement[cell])
         * np.exp(DEMAND_SPREAD * rng.normal(size=len(mu)))
     )
-    share = np.minimum(wanted / mu, 1.0)
+    share = np.minimum(demanded_grip / mu, 1.0)
     excited = share >= EXCITED_SHARE
     manoeuvre = np.where(
-        rng.random(len(mu)) < agent.CLEAN.alike, place.usual[cell], rng.integers(0, 4, len(mu))
+        rng.random(len(mu)) < agent.CLEAN.usual_share,
+        place.usual[cell],
+        rng.integers(0, 4, len(mu)),
     )
     common = place.common[cell, manoeuvre]
     reports = agent.draw_reports(
