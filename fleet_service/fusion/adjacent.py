@@ -42,17 +42,17 @@ def heading_on(side: int, sector: int) -> int:
 
 
 @refcount_free_inlined
-def step_to(cell: int, there: int, sector: int, side: int, step: int) -> int:
+def step_to(cell: int, previous: int, sector: int, side: int, step: int) -> int:
     """Return the cell of a neighbour of `cell` on one side. `step` is the number of the neighbour,
     counted from 1, and `sector` is the heading sector.
 
-    Before and behind the cell, neighbour k is k cells away. It is found from `there`, the cell of
-    neighbour `step` - 1 (at first `cell` itself). For the opposite direction of the road, neighbour
-    1 is in `cell` itself, because both directions may share a cell. Neighbours 2 and 3 are in the
-    cells to its left and right.
+    Before and behind the cell, neighbour k is k cells away. It is found from `previous`, the cell
+    of neighbour `step` - 1 (at first `cell` itself). For the opposite direction of the road,
+    neighbour 1 is in `cell` itself, because both directions may share a cell. Neighbours 2 and 3
+    are in the cells to its left and right.
     """
     if side != ACROSS:
-        return next_cell(there, (sector + 2 * side) % grid.SECTORS)
+        return next_cell(previous, (sector + 2 * side) % grid.SECTORS)
     if step == 1:
         return cell
     return next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)

@@ -142,7 +142,7 @@ class MapParts(NamedTuple):
     rule: ReadRule
 
 
-class Asked(NamedTuple):
+class Readout(NamedTuple):
     """Slot (cell and heading sector) whose belief is read, the time of reading [ns], and the row of
     the prior of its region.
     """
@@ -218,24 +218,24 @@ def _read_beliefs(
         prior = _age_belief(live, weather, slots[k], now[k], buffers)
         for i in range(_BINS):
             buffers.own[i] = buffers.scratch[ScratchRow.BELIEF, i]
-        asked = Asked(slots[k], now[k], prior)
+        target = Readout(slots[k], now[k], prior)
         slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.own)
         if c.DECIDED <= slippery <= 1.0 - c.DECIDED:
-            _multiply_messages(parts, asked, buffers, out[k])
+            _multiply_messages(parts, target, buffers, out[k])
         else:
             read_road(rule.kernels, live.cells, slots[k], buffers.own, out[k])
-        if rule.narrow and _is_measured(parts, asked, slots[k], buffers.own):
-            _narrow(parts, asked, buffers, out[k])
+        if rule.narrow and _is_measured(parts, target, slots[k], buffers.own):
+            _narrow(parts, target, buffers, out[k])
 
 
 @refcount_free_inlined
-def _is_measured(parts: MapParts, asked: Asked, row: int, belief: Bins) -> bool:
+def _is_measured(parts: MapParts, target: Readout, row: int, belief: Bins) -> bool:
     """Return True if vehicles gave values in the cell in row `row`, and if its aged `belief` (32,)
     is still firmer than the prior by the factor HEARD_MOST.
     """
     if parts.live.cells[row].values <= 0.0:
         return False
-    prior = parts.weather.prior[asked.prior]
+    prior = parts.weather.prior[target.prior]
     firmest = 0.0
     for i in range(_BINS):
         firmest = max(firmest, belief[i] / prior[i])
@@ -243,26 +243,26 @@ def _is_measured(parts: MapParts, asked: Asked, row: int, belief: Bins) -> bool:
 
 
 @refcount_free_inlined
-def _narrow(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
+def _narrow(parts: MapParts, target: Readout, buffers: Buffers, out: FloatArray) -> None:
     """Combine the belief about a measured cell with those of measured cells near it, and write
     the resulting belief about the road to `out` (32). On entry, `out` is the belief without them;
     its P(slippery) does not change.
     """
     for i in range(_BINS):
         buffers.product[i] = buffers.own[i]
-    heard = False
+    has_messages = False
     for side in (BEFORE, BEHIND, ACROSS):
-        heard = _hear_side(parts, asked, side, buffers) or heard
-    if heard:
+        has_messages = _multiply_side(parts, target, side, buffers) or has_messages
+    if has_messages:
         cells = parts.live.cells
-        read_road(parts.rule.kernels, cells, asked.slot, buffers.product, buffers.road)
+        read_road(parts.rule.kernels, cells, target.slot, buffers.product, buffers.road)
         if _set_slippery(buffers.road, _slippery_probability(out)):
             for i in range(_BINS):
                 out[i] = buffers.road[i]
 
 
 @refcount_free_inlined
-def _hear_side(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> bool:
+def _multiply_side(parts: MapParts, target: Readout, side: int, buffers: Buffers) -> bool:
     """Multiply `buffers.product` (32,) by the messages h of the measured cells on one side of a
     cell. Return False if there are none.
 
@@ -270,37 +270,37 @@ def _hear_side(parts: MapParts, asked: Asked, side: int, buffers: Buffers) -> bo
     direction of the road, it is the first cell that is measured.
     """
     cells = parts.live.cells
-    key = cells[asked.slot].key
+    key = cells[target.slot].key
     cell = key // grid.SECTORS
     sector = key % grid.SECTORS
     across = side == ACROSS
     towards = heading_on(side, sector)
-    heard = False
-    there = cell
+    has_messages = False
+    neighbour = cell
     for step in range(1, (ACROSS_CELLS if across else c.HEARD_CELLS) + 1):
-        there = step_to(cell, there, sector, side, step)
-        row = find_row(parts.table, cells, there * grid.SECTORS + towards)
-        measured = row != NONE and _can_hear(parts, asked, row, buffers)
+        neighbour = step_to(cell, neighbour, sector, side, step)
+        row = find_row(parts.table, cells, neighbour * grid.SECTORS + towards)
+        measured = row != NONE and _can_combine(parts, target, row, buffers)
         if measured:
             road = buffers.scratch[ScratchRow.BELIEF]
             kept = _KEPT[1 if across else step]
-            _multiply_limited(buffers.product, road, parts.weather.prior[asked.prior], kept)
-            heard = True
+            _multiply_limited(buffers.product, road, parts.weather.prior[target.prior], kept)
+            has_messages = True
         if measured == across:
             break
-    return heard
+    return has_messages
 
 
 @refcount_free_inlined
-def _can_hear(parts: MapParts, asked: Asked, row: int, buffers: Buffers) -> bool:
+def _can_combine(parts: MapParts, target: Readout, row: int, buffers: Buffers) -> bool:
     """Return True if the cell in row `row` is measured and no border is known between it and the
     cell that is read. Then its aged belief is in `buffers.scratch`.
     """
     live = parts.live
-    if live.cells[row].values <= 0.0 or is_border(live, asked.slot, row, asked.now):
+    if live.cells[row].values <= 0.0 or is_border(live, target.slot, row, target.now):
         return False
-    _age_belief(live, parts.weather, row, asked.now, buffers)
-    return _is_measured(parts, asked, row, buffers.scratch[ScratchRow.BELIEF])
+    _age_belief(live, parts.weather, row, target.now, buffers)
+    return _is_measured(parts, target, row, buffers.scratch[ScratchRow.BELIEF])
 
 
 @refcount_free_inlined
@@ -314,26 +314,26 @@ def _multiply_limited(product: Bins, road: Bins, prior: Bins, kept: float) -> No
 
 
 @refcount_free_inlined
-def _set_slippery(road: FloatArray, wanted: float) -> bool:
-    """Set P(slippery) of a belief `road` (32,) in place to `wanted`, by factors that are linear in
-    a bin's slippery share. Return False if this is not possible, and then leave it.
+def _set_slippery(road: FloatArray, required: float) -> bool:
+    """Set P(slippery) of a belief `road` (32,) in place to `required`, by factors that are linear
+    in a bin's slippery share. Return False if this is not possible, and then leave it.
     """
-    told = 0.0
+    current = 0.0
     square = 0.0
     for i in range(_BINS):
-        told += SLIPPERY_SHARE[i] * road[i]
+        current += SLIPPERY_SHARE[i] * road[i]
         square += SLIPPERY_SHARE[i] ** 2 * road[i]
-    spread = square - told**2
-    missing = wanted - told
-    if missing * told > spread or -missing * (1.0 - told) > spread or spread <= 0.0:
+    spread = square - current**2
+    missing = required - current
+    if missing * current > spread or -missing * (1.0 - current) > spread or spread <= 0.0:
         return False
     for i in range(_BINS):
-        road[i] *= 1.0 + missing / spread * (SLIPPERY_SHARE[i] - told)
+        road[i] *= 1.0 + missing / spread * (SLIPPERY_SHARE[i] - current)
     return True
 
 
 @refcount_free_inlined
-def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: FloatArray) -> None:
+def _multiply_messages(parts: MapParts, target: Readout, buffers: Buffers, out: FloatArray) -> None:
     """Multiply the belief about a cell by the messages (factors) from slippery neighbours on its
     three sides, and write the resulting belief about the road to `out` (32).
     """
@@ -342,24 +342,24 @@ def _multiply_messages(parts: MapParts, asked: Asked, buffers: Buffers, out: Flo
     for i in range(_BINS):
         buffers.product[i] = buffers.own[i]
         buffers.quiet[i] = buffers.own[i]
-    unknown = _slippery_probability(parts.weather.prior[asked.prior])
+    unknown = _slippery_probability(parts.weather.prior[target.prior])
     weakened = False
     for side in (BEFORE, BEHIND, ACROSS):
-        weight, heard = _choose_message(parts, asked, side, unknown, buffers)
+        weight, strength = _choose_message(parts, target, side, unknown, buffers)
         if weight > 0.0:
-            weakened = weakened or heard < 1.0
+            weakened = weakened or strength < 1.0
             for i in range(_BINS):
                 buffers.product[i] *= buffers.message[i]
-                buffers.quiet[i] *= 1.0 + heard * (buffers.message[i] - 1.0)
-    read_road(kernels, cells, asked.slot, buffers.product, out)
+                buffers.quiet[i] *= 1.0 + strength * (buffers.message[i] - 1.0)
+    read_road(kernels, cells, target.slot, buffers.product, out)
     if weakened:
-        read_road(kernels, cells, asked.slot, buffers.quiet, buffers.road)
+        read_road(kernels, cells, target.slot, buffers.quiet, buffers.road)
         _lower_to_unsure(out, buffers.road)
 
 
 @refcount_free_inlined
 def _choose_message(
-    parts: MapParts, asked: Asked, side: int, unknown: float, buffers: Buffers
+    parts: MapParts, target: Readout, side: int, unknown: float, buffers: Buffers
 ) -> tuple[float, float]:
     """Write the message (factors on a belief) of the most informative neighbour on one side of a
     cell to `buffers.message`. Return the message's weight w, which is 0 if no neighbour on this
@@ -372,21 +372,21 @@ def _choose_message(
     cells = live.cells
     most = 0.0
     best = NONE
-    key = cells[asked.slot].key
+    key = cells[target.slot].key
     sector = key % grid.SECTORS
     towards = heading_on(side, sector)
-    there = key // grid.SECTORS
+    neighbour = key // grid.SECTORS
     for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
-        there = step_to(key // grid.SECTORS, there, sector, side, step)
-        row = find_row(parts.table, cells, there * grid.SECTORS + towards)
+        neighbour = step_to(key // grid.SECTORS, neighbour, sector, side, step)
+        row = find_row(parts.table, cells, neighbour * grid.SECTORS + towards)
         if row == NONE or cells[row].vehicles == 0:
             continue
         ended = _stored_slippery(live, row) < c.NEIGHBOUR_GRIP
-        if ended or is_border(live, asked.slot, row, asked.now):
+        if ended or is_border(live, target.slot, row, target.now):
             if side == ACROSS:
                 continue
             break
-        _age_belief(live, parts.weather, row, asked.now, buffers)
+        _age_belief(live, parts.weather, row, target.now, buffers)
         belief = buffers.scratch[ScratchRow.BELIEF]
         slippery = read_slippery(parts.rule.slippery, cells, row, belief)
         kept_surface = _KEPT[1 if side == ACROSS else step]
@@ -399,8 +399,8 @@ def _choose_message(
     if best == NONE:
         return 0.0, 1.0
     read_road(parts.rule.kernels, cells, best, buffers.message, buffers.road)
-    _write_message(buffers.message, most, buffers.road, parts.weather.prior[asked.prior])
-    return most, _silence_factor(cells, asked.slot, best, parts.rule.silence)
+    _write_message(buffers.message, most, buffers.road, parts.weather.prior[target.prior])
+    return most, _silence_factor(cells, target.slot, best, parts.rule.silence)
 
 
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
@@ -423,10 +423,10 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
         key = live.cells[slots[k]].key
         sector = key % grid.SECTORS
         for side in range(2):
-            there = key // grid.SECTORS
+            neighbour = key // grid.SECTORS
             for step in range(c.NEIGHBOURS):
-                there = next_cell(there, (sector + 2 * side) % grid.SECTORS)
-                row = find_row(table, live.cells, there * grid.SECTORS + sector)
+                neighbour = next_cell(neighbour, (sector + 2 * side) % grid.SECTORS)
+                row = find_row(table, live.cells, neighbour * grid.SECTORS + sector)
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
                 if _stored_slippery(live, row) < c.NEIGHBOUR_GRIP:
@@ -435,8 +435,8 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
         cell = key // grid.SECTORS
         towards = heading_on(ACROSS, sector)
         for step in range(ACROSS_CELLS):
-            there = step_to(cell, cell, sector, ACROSS, step + 1)
-            row = find_row(table, live.cells, there * grid.SECTORS + towards)
+            neighbour = step_to(cell, cell, sector, ACROSS, step + 1)
+            row = find_row(table, live.cells, neighbour * grid.SECTORS + towards)
             if row == NONE or live.cells[row].vehicles == 0:
                 continue
             if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
@@ -451,11 +451,11 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
     The messages were weakened only because visits gave no friction value. Such visits do not show
     grip, so they may not make slippery road improbable.
     """
-    told = _slippery_probability(road)
+    current = _slippery_probability(road)
     least = _slippery_probability(quiet)
-    if told <= c.UNSURE or least >= told:
+    if current <= c.UNSURE or least >= current:
         return
-    kept = max((c.UNSURE - least) / (told - least), 0.0)
+    kept = max((c.UNSURE - least) / (current - least), 0.0)
     for i in range(_BINS):
         road[i] = kept * road[i] + (1.0 - kept) * quiet[i]
 

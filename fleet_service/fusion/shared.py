@@ -187,9 +187,9 @@ def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
     too low, and `above` (..., 32) [μ] for readings that are too high. K maps measured friction to
     that of the road.
     """
-    away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
-    std = np.where(away < 0.0, below[..., None], above[..., None])
-    kernel = np.exp(-0.5 * np.square(away / std))
+    difference = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
+    std = np.where(difference < 0.0, below[..., None], above[..., None])
+    kernel = np.exp(-0.5 * np.square(difference / std))
     return np.asarray(kernel / kernel.sum(axis=-1, keepdims=True))
 
 
@@ -217,8 +217,8 @@ def shape_class(slope: float) -> int:
     """Return the index of the number in SHAPES that is nearest to `slope`, the error of a friction
     value per unit of unused grip. Kernels are stored only for the slopes in SHAPES.
     """
-    away = [abs(shape - slope) for shape in SHAPES]
-    return away.index(min(away))
+    differences = [abs(shape - slope) for shape in SHAPES]
+    return differences.index(min(differences))
 
 
 @refcount_free_inlined

@@ -40,21 +40,21 @@ def is_border(rows: Rows, row: int, other: int, now: int) -> bool:
 
 @refcount_free_inlined
 def _grip_beside_ice(rows: Rows, grip: int, ice: int, now: int) -> bool:
-    here = rows.cells[grip].reporters
-    there = rows.cells[ice].reporters
-    if here == NONE or there == NONE:
+    grip_row = rows.cells[grip].reporters
+    ice_row = rows.cells[ice].reporters
+    if grip_row == NONE or ice_row == NONE:
         return False
     since = (now - c.SOURCE_NS) // NS
     first = now // NS
     second = first
     for k in range(SOURCES):
-        time = int(rows.reporters[there].source_time[Side.ICE, k])
-        if rows.reporters[there].source[Side.ICE, k] != NONE and time >= since:
+        time = int(rows.reporters[ice_row].source_time[Side.ICE, k])
+        if rows.reporters[ice_row].source[Side.ICE, k] != NONE and time >= since:
             second = min(second, max(first, time))
             first = min(first, time)
     vehicles = 0
     for k in range(SOURCES):
-        time = int(rows.reporters[here].source_time[Side.GRIP, k])
-        if rows.reporters[here].source[Side.GRIP, k] != NONE and time > second:
+        time = int(rows.reporters[grip_row].source_time[Side.GRIP, k])
+        if rows.reporters[grip_row].source[Side.GRIP, k] != NONE and time > second:
             vehicles += 1
     return vehicles >= 2

@@ -149,7 +149,7 @@ def judge_flag(
     vehicle = int(entries[entry].vehicle)
     now = entries[entry].time // NS
     newest = 0
-    away = 0.0
+    deviation = 0.0
     for k in range(c.REPORTERS):
         other = int(here.reporter[k])
         time = int(here.time[k])
@@ -158,11 +158,11 @@ def judge_flag(
         if now - time > c.PEER_S or time <= newest:
             continue
         newest = time
-        away = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
+        deviation = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
     this = peers[vehicle]
-    if away >= 1.0:
+    if deviation >= 1.0:
         this.flags_confirmed += np.float32(1.0)
-    elif away <= -1.0:
+    elif deviation <= -1.0:
         this.flags_contradicted += np.float32(1.0)
     if this.flags_confirmed + this.flags_contradicted > c.PEERS:
         this.flags_confirmed *= np.float32(0.5)
@@ -279,17 +279,17 @@ def _update_weights(
     prior = _ENROLLED_AGREEMENT if enrolled else _AGREEMENT
     for v in range(len(out)):
         this = peers[v]
-        heard = 0.0
+        weight_sum = 0.0
         agreed = 0.0
         for k in range(c.PEERS):
             if this.other[k] != NONE:
                 theirs = float(before[this.other[k]])
                 met = float(this.met[k])
                 weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
-                heard += weight
+                weight_sum += weight
                 agreed += weight * float(this.agreed[k]) / max(met, 1.0)
-        mean = (prior * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + heard)
-        known[v], trust = heard >= c.ESTABLISHED_PEERS, _scale_trust(mean)
+        mean = (prior * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + weight_sum)
+        known[v], trust = weight_sum >= c.ESTABLISHED_PEERS, _scale_trust(mean)
         if known[v]:
             trusted += trust >= c.SOURCE_TRUST
         out[v] = _known_weight(mean) if known[v] or enrolled else trust

@@ -342,16 +342,16 @@ def note_silent_use(p: Bins, used: int, strength: float) -> None:
     """
     if strength <= 0.0:
         return
-    told = _VALUE_PROBABILITY[used]
-    whole = 0.0
-    kept = 0.0
+    value_rates = _VALUE_PROBABILITY[used]
+    mass_before = 0.0
+    mass_after = 0.0
     for i in range(_GRIP_BIN, mugrid.BINS):
-        whole += p[i]
-        kept += p[i] * (1.0 - strength * told[i])
-    if kept == whole:
+        mass_before += p[i]
+        mass_after += p[i] * (1.0 - strength * value_rates[i])
+    if mass_after == mass_before:
         return
     for i in range(_GRIP_BIN, mugrid.BINS):
-        p[i] *= (1.0 - strength * told[i]) * whole / kept
+        p[i] *= (1.0 - strength * value_rates[i]) * mass_before / mass_after
 
 
 @refcount_free_inlined
@@ -405,11 +405,11 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
         road = mugrid.CENTRES[i]
         doubt = min(max(_WITNESS_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.SHARED_MOST) * road
         for j in range(i, -1, -1):
-            away = road - mugrid.CENTRES[j]
-            if away > 3.0 * doubt:
+            excess = road - mugrid.CENTRES[j]
+            if excess > 3.0 * doubt:
                 break
             nats = evidence[j] / mugrid.STEPS_PER_NAT + (
-                0.5 * (away / doubt) ** 2 if away > 0.0 else 0.0
+                0.5 * (excess / doubt) ** 2 if excess > 0.0 else 0.0
             )
             least = min(least, nats)
     return float(least)

@@ -96,38 +96,38 @@ def find_row(table: IntArray, rows: RecordArray, key: int) -> int:
     return _row_at(table[locate_key(table, rows, key)])
 
 
-def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
-    """Return, for each key in `wanted` (n,), the row of `rows` with this key, found by the hash
+def rows_of(table: IntArray, rows: RecordArray, keys: IntArray) -> IntArray:
+    """Return, for each of the `keys` (n,), the row of `rows` with this key, found by the hash
     table `table`; NONE if the key is unknown.
     """
-    out = np.empty(len(wanted), np.int64)
-    _find_rows(table, rows, wanted, out)
+    out = np.empty(len(keys), np.int64)
+    _find_rows(table, rows, keys, out)
     return out
 
 
 @refcount_free_locked
-def _find_rows(table: IntArray, rows: RecordArray, wanted: IntArray, out: IntArray) -> None:
-    for step in range(len(wanted) + 2 * AHEAD):
-        if step < len(wanted):
-            out[step] = _first_place(_hash_key(wanted[step]), len(table))
+def _find_rows(table: IntArray, rows: RecordArray, keys: IntArray, out: IntArray) -> None:
+    for step in range(len(keys) + 2 * AHEAD):
+        if step < len(keys):
+            out[step] = _first_place(_hash_key(keys[step]), len(table))
             prefetch(table, out[step], 0)
-        if 0 <= step - AHEAD < len(wanted):
+        if 0 <= step - AHEAD < len(keys):
             prefetch(rows, _row_at(table[out[step - AHEAD]]), 0)
         if step >= 2 * AHEAD:
-            out[step - 2 * AHEAD] = find_row(table, rows, wanted[step - 2 * AHEAD])
+            out[step - 2 * AHEAD] = find_row(table, rows, keys[step - 2 * AHEAD])
 
 
 @refcount_free_locked
-def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int, out: IntArray) -> int:
-    """Write the slot of each of the keys `wanted` (n,), cell · 4 + sector, to `out` (n,). An
+def slots_for(table: IntArray, live: Rows, keys: IntArray, used: int, out: IntArray) -> int:
+    """Write the slot of each of the `keys` (n,), cell · 4 + sector, to `out` (n,). An
     unknown key gets the next free slot; the table must have room for it. `used` is the number of
     slots in use before the call; return the number afterwards.
     """
-    for i in range(len(wanted)):
-        place = locate_key(table, live.cells, wanted[i])
+    for i in range(len(keys)):
+        place = locate_key(table, live.cells, keys[i])
         if table[place] == NONE:
-            table[place] = _place_content(_hash_key(wanted[i]), used)
-            begin_slot(live, used, wanted[i])
+            table[place] = _place_content(_hash_key(keys[i]), used)
+            begin_slot(live, used, keys[i])
             used += 1
         out[i] = _row_at(table[place])
     return used
@@ -135,17 +135,17 @@ def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int, out: Int
 
 @refcount_free_locked
 def assign_rows(
-    table: IntArray, rows: RecordArray, wanted: IntArray, used: int, out: IntArray
+    table: IntArray, rows: RecordArray, keys: IntArray, used: int, out: IntArray
 ) -> int:
-    """Write the row of each of the keys `wanted` (n,) to `out` (n,). An unknown key is written to
+    """Write the row of each of the `keys` (n,) to `out` (n,). An unknown key is written to
     the next free row. `used` is the number of rows in use before the call; return the number
     afterwards.
     """
-    for i in range(len(wanted)):
-        place = locate_key(table, rows, wanted[i])
+    for i in range(len(keys)):
+        place = locate_key(table, rows, keys[i])
         if table[place] == NONE:
-            table[place] = _place_content(_hash_key(wanted[i]), used)
-            rows[used].key = wanted[i]
+            table[place] = _place_content(_hash_key(keys[i]), used)
+            rows[used].key = keys[i]
             used += 1
         out[i] = _row_at(table[place])
     return used
