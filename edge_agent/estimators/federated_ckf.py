@@ -107,13 +107,13 @@ def make_bank(
 
 @compiled
 # An argument is unused, because all filters have this signature.
-def _begin_filter(memory: JointMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
+def _begin_filter(memory: JointMemory, unused: EmptyRecord) -> None:  # noqa: ARG001
     begin_motion(memory)
     memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5
 
 
 @compiled
-def _step_filter(memory: JointMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
+def _step_filter(memory: JointMemory, unused: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     motion = memory.motion
     memory.yaw_rate = motion.mean[PlanarState.YAW_RATE]
     step_motion(memory, memory.mean, dt)
@@ -216,7 +216,7 @@ def _update_sub_filter(
 @compiled
 def _write_estimates(
     memory: JointMemory,
-    nothing: EmptyRecord,  # noqa: ARG001 all filters have this signature
+    unused: EmptyRecord,  # noqa: ARG001 all filters have this signature
     output: FloatArray,
 ) -> float:
     write_states(output, memory.motion.mean, memory.motion.root, PlanarState.YAW_RATE)

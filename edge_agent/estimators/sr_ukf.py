@@ -133,7 +133,7 @@ def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Es
 
 @compiled
 # An argument is unused, because all filters have this signature.
-def _begin_filter(memory: UnscentedMemory, nothing: EmptyRecord) -> None:  # noqa: ARG001
+def _begin_filter(memory: UnscentedMemory, unused: EmptyRecord) -> None:  # noqa: ARG001
     mean = memory.mean
     root = memory.root
     X = WheelFrictionState
@@ -186,7 +186,7 @@ def _tyre_accelerations(
 
 
 @compiled
-def _step_filter(memory: UnscentedMemory, nothing: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
+def _step_filter(memory: UnscentedMemory, unused: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
     row = memory.row
     track = memory.track
     mean = memory.mean
@@ -287,7 +287,7 @@ def _update_filter(
 @compiled
 def _write_estimates(
     memory: UnscentedMemory,
-    nothing: EmptyRecord,  # noqa: ARG001 all filters have this signature
+    unused: EmptyRecord,  # noqa: ARG001 all filters have this signature
     output: FloatArray,
 ) -> float:
     mean = memory.mean

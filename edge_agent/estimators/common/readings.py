@@ -45,11 +45,11 @@ def read_plausible(sample: FloatArray, now: FloatArray) -> int:
     missing = 0
     for channel in range(INPUTS):
         value = sample[channel]
-        there = value == value
-        believed = abs(value) <= LIMITS[channel]
-        now[channel] = value if believed else math.nan
-        odd |= flags.OUTLIER if there and not believed else 0
-        missing |= 0 if believed else MISSING[channel]
+        is_present = value == value
+        is_plausible = abs(value) <= LIMITS[channel]
+        now[channel] = value if is_plausible else math.nan
+        odd |= flags.OUTLIER if is_present and not is_plausible else 0
+        missing |= 0 if is_plausible else MISSING[channel]
     return odd | missing
 
 

@@ -183,9 +183,9 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, RIGHT, memory.friction_right)
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
-        alike = nominal_agreement(memory.trust, design.constants)
+        agreement = nominal_agreement(memory.trust, design.constants)
         find_interval(
-            design, memory.weight[:NODES], memory.patch, scratch.blended, alike, memory.friction
+            design, memory.weight[:NODES], memory.patch, scratch.blended, agreement, memory.friction
         )
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
@@ -199,8 +199,8 @@ def _find_side(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
 ) -> None:
     project_weights(memory.weight, design.sides.share[side], scratch.projected)
-    alike = nominal_agreement(memory.trust, design.constants)
-    find_interval(design, scratch.projected, memory.patch, scratch.blended, alike, friction)
+    agreement = nominal_agreement(memory.trust, design.constants)
+    find_interval(design, scratch.projected, memory.patch, scratch.blended, agreement, friction)
 
 
 @compiled

@@ -166,14 +166,14 @@ def _apply_heun_step(
         aside = u + step * slope_y
         rate = r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
-        felt_x, felt_y, again = planar_response(
+        felt_x, felt_y, next_turn = planar_response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         if not by_torque:
             vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
             vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
-        rate = r + 0.5 * step * (turn + again)
-        felt_x, felt_y, again = planar_response(
+        rate = r + 0.5 * step * (turn + next_turn)
+        felt_x, felt_y, next_turn = planar_response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
         column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = (
@@ -183,7 +183,7 @@ def _apply_heun_step(
             felt_y,
             rate,
         )
-        column_z[p] = again if by_torque else z
+        column_z[p] = next_turn if by_torque else z
 
 
 @inlined

@@ -49,20 +49,20 @@ AS_PRINTED: Final = FederatedSetting()
 """Setting of the paper (equation 57)."""
 
 
-def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
+def estimate(motion: GivenMotion, setting: FederatedSetting) -> FrictionRun:
     """Run the friction filter of paper 000 as printed over a drive. Return the friction of the four
     wheels at each sample, (T, 4), in a `FrictionRun`.
     """
-    forces = WheelForces.for_drive(given, proportional=setting.proportional, single=False)
-    given_x = given.wheel_forces()
-    signals = given.signals
+    forces = WheelForces.for_drive(motion, proportional=setting.proportional, single=False)
+    given_x = motion.wheel_forces()
+    signals = motion.signals
     noise = (np.diag(setting.first), np.diag(setting.second))
-    mu = np.empty((len(given.t), STATES))
+    mu = np.empty((len(motion.t), STATES))
     mean = np.full(STATES, setting.mu)
     covariance: FloatArray = setting.start * np.eye(STATES)
     shares = np.array([0.5, 0.5])
     mu[0] = mean
-    for k in range(1, len(given.t)):
+    for k in range(1, len(motion.t)):
         inverse = np.zeros((STATES, STATES))
         information = np.zeros(STATES)
         sizes = np.empty(2)
@@ -72,7 +72,7 @@ def estimate(given: GivenMotion, setting: FederatedSetting) -> FrictionRun:
             force = forces.tyre_forces(k, points)
             force[..., 0] = given_x[k]
             outcomes = forces.body_accelerations(k, force)
-            outcomes[:, 2] = signals[k - 1, S.YAW_RATE] + given.step * outcomes[:, 2]
+            outcomes[:, 2] = signals[k - 1, S.YAW_RATE] + motion.step * outcomes[:, 2]
             reading = signals[k, [S.AX, S.AY, S.YAW_RATE]]
             local, spread = _update_sub_filter(
                 mean, predicted, points, outcomes[:, sub:], reading[sub:], noise[sub]
@@ -109,9 +109,9 @@ def _update_sub_filter(
     equations (42) to (48) of paper 000.
     """
     predicted = outcomes.mean(axis=0)
-    apart = outcomes - predicted
+    deviations = outcomes - predicted
     off = points - mean
     count = len(points)
-    expected = apart.T @ apart / count + noise
-    gain = np.linalg.solve(expected, apart.T @ off / count).T
+    expected = deviations.T @ deviations / count + noise
+    gain = np.linalg.solve(expected, deviations.T @ off / count).T
     return mean + gain @ (reading - predicted), covariance - gain @ expected @ gain.T

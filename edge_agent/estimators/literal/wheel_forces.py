@@ -45,12 +45,12 @@ class WheelForces:
     proportional: bool
 
     @classmethod
-    def for_drive(cls, given: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
+    def for_drive(cls, motion: GivenMotion, *, proportional: bool, single: bool) -> WheelForces:
         """Return slips, loads and steering angles of the wheels in a drive, in single precision if
         `single` is True.
         """
         kind: Any = np.float32 if single else np.float64
-        row = given.row
+        row = motion.row
         p = Parameter
         half_front = 0.5 * row[p.TRACK_FRONT]
         half_rear = 0.5 * row[p.TRACK_REAR]
@@ -59,11 +59,11 @@ class WheelForces:
         places = np.array(
             [[front, half_front], [front, -half_front], [rear, half_rear], [rear, -half_rear]]
         )
-        delta = given.signals[:, S.DELTA : S.DELTA + 4]
-        omega = given.signals[:, S.OMEGA : S.OMEGA + 4]
-        rate = given.signals[:, S.YAW_RATE, None]
-        ahead = given.vx[:, None] - places[:, 1] * rate
-        left = given.vy[:, None] + places[:, 0] * rate
+        delta = motion.signals[:, S.DELTA : S.DELTA + 4]
+        omega = motion.signals[:, S.OMEGA : S.OMEGA + 4]
+        rate = motion.signals[:, S.YAW_RATE, None]
+        ahead = motion.vx[:, None] - places[:, 1] * rate
+        left = motion.vy[:, None] + places[:, 0] * rate
         turned = np.stack([np.cos(delta), np.sin(delta)], axis=-1)
         along = turned[..., 0] * ahead + turned[..., 1] * left
         across = turned[..., 0] * left - turned[..., 1] * ahead
@@ -71,10 +71,10 @@ class WheelForces:
         slip_x = (row[p.RADIUS] * omega - along) / speed
         free = np.stack([row[p.SLOPE_X] * slip_x, -row[p.SLOPE_Y] * across / speed], axis=-1)
         mass = np.array([row[p.MASS], row[p.YAW_INERTIA]])
-        air = given.drag * given.vx * np.abs(given.vx) / row[p.MASS]
+        air = motion.drag * motion.vx * np.abs(motion.vx) / row[p.MASS]
         return cls(
             np.asarray(free, kind),
-            np.asarray(given.wheel_loads(), kind),
+            np.asarray(motion.wheel_loads(), kind),
             np.asarray(turned, kind),
             np.asarray(places, kind),
             np.asarray(mass, kind),

@@ -74,12 +74,12 @@ class FrictionRun:
     lost: float
 
 
-def estimate(given: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
+def estimate(motion: GivenMotion, setting: UnscentedSetting) -> FrictionRun:
     """Run the friction filter of paper 003 as printed over a drive; return the friction of the four
     wheels at each sample, and the share of failed factorisations.
     """
-    model = _Model(given, setting)
-    steps = len(given.t)
+    model = _Model(motion, setting)
+    steps = len(motion.t)
     mu = np.empty((steps, STATES))
     mean = np.full(STATES, setting.mu, model.kind)
     root = np.eye(STATES, dtype=model.kind) * np.sqrt(setting.start).astype(model.kind)
@@ -99,18 +99,18 @@ class _Model:
     function that predicts them, in single or double precision.
     """
 
-    def __init__(self, given: GivenMotion, setting: UnscentedSetting) -> None:
+    def __init__(self, motion: GivenMotion, setting: UnscentedSetting) -> None:
         self.setting = setting
         self.kind: Any = np.float32 if setting.single else np.float64
         self.forces = WheelForces.for_drive(
-            given, proportional=setting.proportional, single=setting.single
+            motion, proportional=setting.proportional, single=setting.single
         )
-        signals = given.signals
-        turning = np.diff(signals[:, S.YAW_RATE], prepend=signals[0, S.YAW_RATE]) / given.step
+        signals = motion.signals
+        turning = np.diff(signals[:, S.YAW_RATE], prepend=signals[0, S.YAW_RATE]) / motion.step
         rows = [signals[:, S.AX], signals[:, S.AY], turning]
         noise = list(setting.noise)
         if setting.torque_rows:
-            rows += list(given.wheel_forces().T)
+            rows += list(motion.wheel_forces().T)
             noise += [setting.torque_noise] * 4
         self.readings: FloatArray = np.stack(rows, axis=1).astype(self.kind)
         self.noise_root: FloatArray = np.diag(np.sqrt(noise)).astype(self.kind)
@@ -138,10 +138,10 @@ class _Model:
         of measurements).
         """
         force = self.forces.tyre_forces(k, points)
-        felt = self.forces.body_accelerations(k, force)
+        accelerations = self.forces.body_accelerations(k, force)
         if not self.setting.torque_rows:
-            return felt
-        return np.concatenate([felt, force[..., 0]], axis=1)
+            return accelerations
+        return np.concatenate([accelerations, force[..., 0]], axis=1)
 
 
 def _root_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -206,10 +206,10 @@ def _covariance_step(
     outcomes = model.predicted_measurements(k, points)
     predicted = model.mean_weights @ outcomes
     off = points - mean
-    apart = outcomes - predicted
-    weighted = model.cov_weights[:, None] * apart
-    expected = weighted.T @ apart + model.noise_root**2
-    cross = (model.cov_weights[:, None] * off).T @ apart
+    deviations = outcomes - predicted
+    weighted = model.cov_weights[:, None] * deviations
+    expected = weighted.T @ deviations + model.noise_root**2
+    cross = (model.cov_weights[:, None] * off).T @ deviations
     gain = np.linalg.solve(expected, cross.T).T
     innovation = model.readings[k] - predicted
     after = covariance - gain @ expected @ gain.T

@@ -112,11 +112,11 @@ def _turn_wheel(row: FloatArray, features: BlockFeatures, wheel: int) -> None:
 
 
 @compiled
-def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
-    """Return the mean of the valid samples of a channel in the block, or `otherwise` if the channel
+def mean_or(block: BlockSums, channel: int, default: float) -> float:
+    """Return the mean of the valid samples of a channel in the block, or `default` if the channel
     has no valid sample.
     """
-    return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
+    return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else default
 
 
 @compiled
@@ -172,8 +172,10 @@ def _compute_wheel_forces(
             known = row[Parameter.MASS] * features.change
             unit = 0.5 * (front if wheel < 2 else 1.0 - front) * row[Parameter.MASS]
             force = unit * features.change
-            apart = math.hypot(constants.physical.force_share * force, 0.5 * front_std * known)
-            spread = math.hypot(apart, constants.physical.floor_x * loads[wheel])
+            model_spread = math.hypot(
+                constants.physical.force_share * force, 0.5 * front_std * known
+            )
+            spread = math.hypot(model_spread, constants.physical.floor_x * loads[wheel])
             if math.isnan(ax):
                 unit = 0.0
                 spread = NO_FORCE_SHARE * loads[wheel]
@@ -366,8 +368,8 @@ def wheel_speed_jump(
     expected = usual[wheel] + features.change * features.duration
     share = 1.0 - math.exp(-features.duration / constants.physical.abrupt_time)
     usual[wheel] = now if math.isnan(expected) else expected + share * (now - expected)
-    apart = abs(now - expected)
-    return 0.0 if math.isnan(apart) else apart
+    jump = abs(now - expected)
+    return 0.0 if math.isnan(jump) else jump
 
 
 @compiled
@@ -437,9 +439,11 @@ def unexplained_slip_difference(
             / speed
             * math.sqrt(2.0 / samples)
         )
-        apart = abs(row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left])
-        if not math.isnan(apart):
-            most = max(most, apart - row[Parameter.SLOPE_X] * LIKELY * (noise + unknown))
+        difference = abs(
+            row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left]
+        )
+        if not math.isnan(difference):
+            most = max(most, difference - row[Parameter.SLOPE_X] * LIKELY * (noise + unknown))
     return most
 
 

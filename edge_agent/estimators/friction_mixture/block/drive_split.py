@@ -52,8 +52,8 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
     if ax >= 0.0:
         return front, spread
     brakes = min(-0.5 * ax / ENGINE_BRAKE, 1.0)  # weight of the brakes, 0 to 1
-    apart = brakes * (1.0 - brakes) * (BRAKES_FRONT - front) ** 2
-    variance = brakes * BRAKES_STD**2 + (1.0 - brakes) * spread**2 + apart
+    between_variance = brakes * (1.0 - brakes) * (BRAKES_FRONT - front) ** 2
+    variance = brakes * BRAKES_STD**2 + (1.0 - brakes) * spread**2 + between_variance
     return brakes * BRAKES_FRONT + (1.0 - brakes) * front, math.sqrt(variance)
 
 
@@ -90,17 +90,17 @@ def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeat
     turns = abs(features.yaw_rate) * speed > features.change
     if not (pull > PULLS and speed > SLOW_M_S) or turns:
         return
-    apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
+    slip_difference = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
     rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
     per_force = pull / row[Parameter.SLOPE_X]
     look = min(features.duration / constants.physical.correlation_time, 1.0)
     total = 0.0
     for kind in range(3):
-        asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))
-        spread = constants.physical.wheel_std + UNLIKE * (per_force + abs(asked))
-        off = (apart - asked) / spread
+        expected = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))
+        spread = constants.physical.wheel_std + UNLIKE * (per_force + abs(expected))
+        off = (slip_difference - expected) / spread
         one_axle = DRIVES[kind] in (0.0, 1.0)
-        if one_axle and off * asked > 0.0:
+        if one_axle and off * expected > 0.0:
             off = 0.0
         odds[kind] *= math.exp(
             -look

@@ -92,8 +92,8 @@ def slip_membership(memory: MixtureMemory, features: BlockFeatures) -> float:
     # Below this speed the resolution of the wheel speeds looks like slip.
     if fastest < SLOW_M_S:
         return 0.0
-    apart = (fastest - slowest) / fastest
-    degree = 2.0 * max(apart / APART_SLIDES, spin / SPIN_SLIDES) - 1.0
+    relative_difference = (fastest - slowest) / fastest
+    degree = 2.0 * max(relative_difference / APART_SLIDES, spin / SPIN_SLIDES) - 1.0
     return float(min(max(degree, 0.0), 1.0))
 
 
@@ -105,13 +105,13 @@ def front_slides_more(memory: MixtureMemory, features: BlockFeatures) -> bool:
     front = 0.0
     rear = 0.0
     for wheel in range(4):
-        apart = abs(wheel_speed(memory, features, wheel) - memory.overall_mean[NodeState.VX])
-        if math.isnan(apart):
+        deviation = abs(wheel_speed(memory, features, wheel) - memory.overall_mean[NodeState.VX])
+        if math.isnan(deviation):
             continue
         if wheel < 2:
-            front = max(front, apart)
+            front = max(front, deviation)
         else:
-            rear = max(rear, apart)
+            rear = max(rear, deviation)
     return front > rear
 
 

@@ -194,7 +194,7 @@ def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
     scratch.share, and store them in `memory`.
     """
     groups = (active_nodes(memory) + LANES - 1) // LANES
-    apart = scratch.apart
+    deviation = scratch.deviation
     for i in range(STATES):
         total = 0.0
         for group in range(groups):
@@ -203,14 +203,14 @@ def match_moments(memory: MixtureMemory, scratch: Scratch) -> None:
         memory.overall_mean[i] = sum_lanes(total)
         for group in range(groups):
             own = lanes_at(memory.mean, (group, i))
-            put_lanes(apart, (group, i), own - memory.overall_mean[i])
+            put_lanes(deviation, (group, i), own - memory.overall_mean[i])
     for i in range(STATES):
         for j in range(i + 1):
             total = 0.0
             for group in range(groups):
                 share = lanes_at(scratch.share, group)
                 share = select(share < SMALLEST, 0.0, share)
-                product = lanes_at(apart, (group, i)) * lanes_at(apart, (group, j))
+                product = lanes_at(deviation, (group, i)) * lanes_at(deviation, (group, j))
                 total += share * (lanes_at(memory.covariance, (group, i, j)) + product)
             found = sum_lanes(total)
             memory.overall_covariance[i, j] = found

@@ -159,17 +159,17 @@ def temper_evidence(memory: MixtureMemory, design: MixtureDesign, scratch: Scrat
         evidence_share(design.rules, slid, features.demand, features.new, memory.trust.strain)
     )
     price = 1.0 - demand_weight(features.demand)
-    believed = used_evidence_share(memory.trust, constants)
-    believed += slid * (1.0 - memory.trust.distrust) * (1.0 - believed)
+    used_share = used_evidence_share(memory.trust, constants)
+    used_share += slid * (1.0 - memory.trust.distrust) * (1.0 - used_share)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants.guards.plausible_loss, 0.0)
         loss = max(loss, -constants.guards.plausible_loss)
-        loss = max(believed * (share * loss + beyond), -constants.guards.largest_loss)
-        loss -= believed * guard_penalty(memory.grip, constants, design.sides.mu[j])
+        loss = max(used_share * (share * loss + beyond), -constants.guards.largest_loss)
+        loss -= used_share * guard_penalty(memory.grip, constants, design.sides.mu[j])
         scratch.log_likelihood[j] = 0.0
         if not blind:
-            charged = charge_penalty(memory, j, believed * price * scratch.moved[j])
+            charged = charge_penalty(memory, j, used_share * price * scratch.moved[j])
             scratch.log_likelihood[j] = loss - charged
 
 
@@ -248,9 +248,9 @@ def advance_usual(usual: FloatArray, i: int, now: float, keep: float) -> float:
     """
     if math.isnan(now):
         return 0.0
-    apart = abs(now - usual[i])
+    deviation = abs(now - usual[i])
     usual[i] = keep * usual[i] + (1.0 - keep) * now
-    return float(apart)
+    return float(deviation)
 
 
 @compiled

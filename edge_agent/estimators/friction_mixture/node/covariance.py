@@ -87,11 +87,11 @@ def mix_states(
     matching). `mean` (n, LANES) and `covariance` are changed in place.
     """
     for i in range(mean.shape[0]):
-        apart = z * (1.0 - z) * (overall_mean[i] - lanes_at(mean, i))
+        scaled_difference = z * (1.0 - z) * (overall_mean[i] - lanes_at(mean, i))
         for j in range(i + 1):
             own = lanes_at(covariance, (i, j))
             foreign = z * (overall_covariance[i, j] - own)
-            mixed = own + foreign + apart * (overall_mean[j] - lanes_at(mean, j))
+            mixed = own + foreign + scaled_difference * (overall_mean[j] - lanes_at(mean, j))
             put_lanes(covariance, (i, j), mixed)
     for i in range(mean.shape[0]):
         own = lanes_at(mean, i)

@@ -157,7 +157,7 @@ def weigh_rows(
     features = scratch.features
     node = scratch.node
     across = inflation * doubted_noise(memory.trust, constants) / features.novelty
-    unlike = rear_noise(memory, constants)
+    rear_factor = rear_noise(memory, constants)
     surplus = 1.0 - 1.0 / features.axle_scale
     squares = 0.0 * share
     product = 1.0 + squares
@@ -172,7 +172,7 @@ def weigh_rows(
         excess = residual * residual * (1.0 / constants.guards.huber**2) - variance
         factor = inflation if r < 4 else across
         if r in REAR_ROWS:
-            factor *= unlike
+            factor *= rear_factor
         inflated = max(noise * factor, excess) + curvature + lanes_at(node.abrupt, r)
         put_lanes(node.residual, r, -residual)
         spread = lanes_at(node.spread, (r, r)) + inflated
@@ -238,8 +238,8 @@ def spread_points(
             centre += lanes_at(node.middle, (column, r)) * (1.0 / CURVED)
         nonlinearity = 0.0
         for column in range(CURVED):
-            apart = lanes_at(node.middle, (column, r)) - centre
-            nonlinearity += apart * apart * (1.0 / CURVED)
+            deviation = lanes_at(node.middle, (column, r)) - centre
+            nonlinearity += deviation * deviation * (1.0 / CURVED)
         at_mean = slides if r < 4 else 0.0
         residual = at_mean * lanes_at(node.residual, r) + (1.0 - at_mean) * centre
         put_lanes(node.residual, r, residual)
@@ -308,8 +308,8 @@ def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
     """
     total = 0.0
     for i in range(NodeState.LN_KX, mean.shape[0]):
-        apart = (lanes_at(mean, i) - nominal.mean[i]) * (1.0 / nominal.std[i])
-        total += apart * apart
+        deviation = (lanes_at(mean, i) - nominal.mean[i]) * (1.0 / nominal.std[i])
+        total += deviation * deviation
     return 0.5 * total
 
 
@@ -430,8 +430,8 @@ def predict_nodes(
     put_lanes(mean, NodeState.VX, cos * vx + sin * vy + gained_x)
     put_lanes(mean, NodeState.VY, cos * vy - sin * vx + gained_y)
     for i in range(NodeState.LN_KX, STATES):
-        apart = lanes_at(mean, i) - nominal.mean[i]
-        put_lanes(mean, i, nominal.mean[i] + keep[i] * apart)
+        deviation = lanes_at(mean, i) - nominal.mean[i]
+        put_lanes(mean, i, nominal.mean[i] + keep[i] * deviation)
     covariance = memory.covariance[group]
     gain = memory.block.gain
     predict_covariance(covariance, scratch.node.turned, gain, turn, keep, scratch.process)

@@ -273,7 +273,7 @@ def correct_forces(
     if features.locked_pull != 0.0:
         turning -= held * locked_axle_force(row, features.loads)
     for axle in range(2):
-        beside = held * held if axle == 1 else 0.0 * held
+        locked_square = held * held if axle == 1 else 0.0 * held
         left = 2 * axle
         right = 2 * axle + 1
         side = (
@@ -296,14 +296,14 @@ def correct_forces(
             put_lanes(
                 out.slip_at_force,
                 wheel,
-                _slip_at_force(curve, mu, per_mu, force, across * across + beside),
+                _slip_at_force(curve, mu, per_mu, force, across * across + locked_square),
             )
         if known:
             force = side - shape * lanes_at(node.shape_force, 4 + axle)
             per_mu = lanes_at(node.per_axle_mu, axle)
             mu = lanes_at(node.axle_mu, axle)
             put_lanes(out.force, 4 + axle, force)
-            other_square = mean_along * mean_along + beside
+            other_square = mean_along * mean_along + locked_square
             found = _slip_at_force(curve, mu, per_mu, force, other_square)
             put_lanes(out.slip_at_force, 4 + axle, found)
 
@@ -347,8 +347,8 @@ def share_by_sides(mean: float, most: float, most_other: float) -> float:
         most_other: limit of the other side [1].
     """
     size = abs(mean)
-    more = size + max(size - most_other, 0.0)
-    shared = select(most < most_other, min(size, most), more)
+    compensated = size + max(size - most_other, 0.0)
+    shared = select(most < most_other, min(size, most), compensated)
     return select(mean < 0.0, -shared, shared)
 
 

@@ -142,7 +142,7 @@ class Scratch:
     mixing: Annotated[FloatArray, PLACES]  # share of probability that a road change brought
     share: Annotated[FloatArray, PLACES]  # probabilities of the active nodes, 0 elsewhere
     updated: Annotated[LaneArray, GROUPS, 2]  # velocity after the measurements [m/s]
-    apart: Annotated[LaneArray, GROUPS, STATES]  # deviation from the mean of the mixture
+    deviation: Annotated[LaneArray, GROUPS, STATES]  # deviation from the mean of the mixture
     process: Annotated[FloatArray, STATES]  # process variances of the block
     keep: Annotated[FloatArray, STATES]  # factors by which states return to their prior
     log_likelihood: Annotated[FloatArray, PLACES]  # [nat] with the inflated R
