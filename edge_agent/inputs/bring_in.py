@@ -120,8 +120,8 @@ def _read_mdf(path: Path, profile: Profile | None, database: Database | None) ->
     identifiers = (
         None if database is None else {message.identifier for message in database.values()}
     )
-    wanted = None if profile is None else profile.needed_signals()
-    content = mdf.read_isolated(path, identifiers, wanted)
+    requested_signals = None if profile is None else profile.needed_signals()
+    content = mdf.read_isolated(path, identifiers, requested_signals)
     if content.recording is not None:
         return content.recording
     return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)
@@ -135,11 +135,11 @@ def _decode_frames(
     every = {
         f"{message.name}.{signal}" for message in database.values() for signal in message.signals
     }
-    wanted = every if profile is None else profile.needed_signals()
+    requested_signals = every if profile is None else profile.needed_signals()
     rules = list(profile.channels.values()) if profile else []
     buses = {rule.message: rule.bus for rule in rules if rule.message and rule.bus is not None}
     with foreign_errors(path, "CAN log"):
-        return can_log.decode_log(frames, path.name, database, wanted, buses)
+        return can_log.decode_log(frames, path.name, database, requested_signals, buses)
 
 
 def profile_of(log: Path) -> Profile:

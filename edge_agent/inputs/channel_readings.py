@@ -202,11 +202,11 @@ def straighten_times(t: FloatArray) -> tuple[FloatArray, float]:
         return t, 0.0
     count = np.arange(len(t))
     period = (t[-1] - t[0]) / (len(t) - 1)
-    away = t - t[0] - period * count
-    total = np.concatenate([[0.0], np.cumsum(away)])
+    deviation = t - t[0] - period * count
+    total = np.concatenate([[0.0], np.cumsum(deviation)])
     half = np.minimum(np.minimum(count, count[::-1]), SMOOTH)
     smooth = (total[count + half + 1] - total[count - half]) / (2 * half + 1)
-    jitter = float(np.std(away - smooth))
+    jitter = float(np.std(deviation - smooth))
     is_bursty = 0.05 * period < jitter < period and float(np.max(np.diff(t))) < 10.0 * period
     if is_bursty:
         t = np.asarray(t[0] + period * count + smooth)

@@ -34,8 +34,8 @@ class Corrector:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._known = vehicle.calibration
-        self._waits = _device_waits(self._known)
+        self._calibration = vehicle.calibration
+        self._waits = _device_waits(self._calibration)
         self._t = np.empty(0)
         self._rows = np.empty((0, len(CHANNELS)))
 
@@ -45,8 +45,8 @@ class Corrector:
 
         If there is nothing to correct, the result is the array `signals` itself.
         """
-        if self._known is not None:
-            signals = _correct_signals(signals, self._known)
+        if self._calibration is not None:
+            signals = _correct_signals(signals, self._calibration)
         if self._waits:
             signals = self._wait_for_latest(t, signals)
         signals = scale_axles(signals, self._vehicle)

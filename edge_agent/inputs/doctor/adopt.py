@@ -147,7 +147,7 @@ def _shift_channel(t: FloatArray, values: FloatArray, seconds: float, *, angle: 
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     share = np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)
     before = values[after - 1]
-    behind = values[after]
-    nearest = np.where(share < 0.5, before, behind)
-    between = before + share * (behind - before)
+    following = values[after]
+    nearest = np.where(share < 0.5, before, following)
+    between = before + share * (following - before)
     return np.where(np.isfinite(between) & (not angle), between, nearest)

@@ -61,14 +61,16 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
     return _travel_direction(front, rear, fast, wheelbase)
 
 
-def _side_unevenness(apart: FloatArray, wheelbase: float) -> FloatArray:
-    """Return the speed difference `apart` (n,) between the left and right wheel of an axle, minus
-    its running mean over WINDOW wheelbases. What remains is road unevenness and noise.
+def _side_unevenness(speed_difference: FloatArray, wheelbase: float) -> FloatArray:
+    """Return the difference in speed (n,) between the left and right wheel of an axle, minus its
+    running mean over WINDOW wheelbases. What remains is road unevenness and noise.
     """
     width = 2 * round(0.5 * WINDOW * wheelbase / STEP_M) + 1
-    if width >= len(apart):
-        return np.zeros_like(apart)
-    return np.asarray(apart - np.convolve(apart, np.ones(width) / width, "same"))
+    if width >= len(speed_difference):
+        return np.zeros_like(speed_difference)
+    return np.asarray(
+        speed_difference - np.convolve(speed_difference, np.ones(width) / width, "same")
+    )
 
 
 def _travel_direction(

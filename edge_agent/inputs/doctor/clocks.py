@@ -84,6 +84,6 @@ def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
         return {"wheels": wheel, "steering": steer}
     late = -0.5 * (wheel + steer)
     along = diagnosis.fits["longitudinal"]
-    told = along.is_known and np.isfinite(along.lag_error_s)
-    alone = told and abs(along.lag_s - CLOCK_CENTRE_S["longitudinal"]) < 0.5 * abs(late)
+    has_lag = along.is_known and np.isfinite(along.lag_error_s)
+    alone = has_lag and abs(along.lag_s - CLOCK_CENTRE_S["longitudinal"]) < 0.5 * abs(late)
     return {"gyro" if alone else "imu": late}

@@ -81,11 +81,11 @@ class EvenDrive:
         predicts, that is, does not slide.
         """
         fast = np.maximum(np.abs(self.v), 1.0)
-        wanted = self.wheelbase * self.r / fast
-        steered = np.isfinite(self.delta) & np.isfinite(wanted)
+        needed_tangent = self.wheelbase * self.r / fast
+        steered = np.isfinite(self.delta) & np.isfinite(needed_tangent)
         return steered & (
-            np.abs(np.tan(np.clip(self.delta, -1.0, 1.0)) - wanted)
-            < FOLLOWED * np.abs(wanted) + 0.01
+            np.abs(np.tan(np.clip(self.delta, -1.0, 1.0)) - needed_tangent)
+            < FOLLOWED * np.abs(needed_tangent) + 0.01
         )
 
 
@@ -172,14 +172,14 @@ class EvenTimes:
         self.at = np.arange(t[0], min(t[-1], t[0] + longest), 1.0 / RATE_HZ)
         if len(self.at) < 2:  # a derivative needs two samples; the log has no reading at the second
             self.at = t[0] + np.arange(2) / RATE_HZ
-        self._near = _is_between(t, self.at) if len(t) > 1 else np.zeros(len(self.at), bool)
+        self._is_covered = _is_between(t, self.at) if len(t) > 1 else np.zeros(len(self.at), bool)
 
     def interpolate_channel(self, x: FloatArray) -> FloatArray:
         """Return the readings x (T,) of a signal at the even time steps (n,); see
         `interpolate_near`."""
         if not np.isfinite(x).all():
             return interpolate_near(self.t, x, self.at)
-        return np.where(self._near, np.interp(self.at, self.t, x), np.nan)
+        return np.where(self._is_covered, np.interp(self.at, self.t, x), np.nan)
 
     def smooth_channel(self, x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
         """Return the readings x (T,) of a signal at the even time steps (n,), smoothed."""
@@ -203,8 +203,8 @@ def _is_between(known: FloatArray, at: FloatArray) -> BoolArray:
     that are at most JOINED_S apart.
     """
     place = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
-    apart = np.diff(known)[place - 1]
-    return np.asarray((apart <= JOINED_S) & (at >= known[0]) & (at <= known[-1]))
+    interval = np.diff(known)[place - 1]
+    return np.asarray((interval <= JOINED_S) & (at >= known[0]) & (at <= known[-1]))
 
 
 def over_ground(
@@ -260,8 +260,8 @@ def prepare_drive(
     fast = float(np.nanpercentile(np.abs(v), 95)) if np.isfinite(v).any() else 0.0
     place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
     located = np.isfinite(place[0]).sum() > 5
-    nothing = np.full(len(at), np.nan)
-    v_ground, course = over_ground(even, *place) if located else (nothing, nothing)
+    missing = np.full(len(at), np.nan)
+    v_ground, course = over_ground(even, *place) if located else (missing, missing)
     if ground is not None and np.isfinite(ground).sum() > 5:
         v_ground = even.smooth_channel(ground)
     yaw = signals[:, S.YAW]
@@ -312,12 +312,12 @@ def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:
     moves = np.abs(speed) > CREEP * fast
     off = np.zeros(len(wheels), bool)
     for side in range(2):
-        apart = (wheels[:, side] - wheels[:, 2 + side]) / size
-        known = np.isfinite(apart) & moves
+        difference = (wheels[:, side] - wheels[:, 2 + side]) / size
+        known = np.isfinite(difference) & moves
         if not known.any():
             continue
-        usual = float(np.median(apart[known]))
-        here = np.isfinite(apart) & (np.abs(apart - usual) > UNLIKE)
+        usual = float(np.median(difference[known]))
+        here = np.isfinite(difference) & (np.abs(difference - usual) > UNLIKE)
         if here[moves].mean() < 0.9:
             off |= here
     width = 2 * round(SLIP_S * RATE_HZ) + 1

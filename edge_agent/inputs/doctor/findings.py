@@ -200,13 +200,13 @@ def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
     wheels = wheels[rows]
     medians = median_of_others(wheels)
     for i, wheel in enumerate(WHEELS):
-        others = medians[:, i]
-        fast = float(np.percentile(np.abs(others), 95))
-        above = wheels[:, i] - others
-        off = np.abs(above) > 0.3 * np.abs(others) + 0.3 * fast
+        other_wheels = medians[:, i]
+        fast = float(np.percentile(np.abs(other_wheels), 95))
+        above = wheels[:, i] - other_wheels
+        off = np.abs(above) > 0.3 * np.abs(other_wheels) + 0.3 * fast
         if off.mean() <= JUMPS or not (
             has_equal_steps(above, off)
-            or is_foreign(np.delete(wheels, i, axis=1), others, off, fast)
+            or is_foreign(np.delete(wheels, i, axis=1), other_wheels, off, fast)
         ):
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))

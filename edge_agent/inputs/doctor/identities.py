@@ -71,7 +71,7 @@ class Fit:
     lag_error_s: float
     left: FloatArray
     right: FloatArray
-    beside: tuple[float, ...] = ()  # gains of the further terms of the left side
+    further_gains: tuple[float, ...] = ()  # gains of the further terms of the left side
     parts: tuple[float, ...] = ()  # gain in each part of the excited time
     offset_error: float = np.inf  # standard deviation of the offset
 
@@ -106,7 +106,7 @@ class Relation(NamedTuple):
 
     left: FloatArray
     right: FloatArray
-    beside: tuple[FloatArray, ...] = ()
+    further_terms: tuple[FloatArray, ...] = ()
     per: FloatArray | None = None
     bend: FloatArray | None = None
     loose: tuple[float, ...] = ()
@@ -198,7 +198,10 @@ def fit_identity(sides: Relation, moving: FloatArray, grips: FloatArray, *, leve
     if np.isfinite(lag_error_s) and abs(lag_s) > 1.0 / RATE_HZ:
         left = shift_series(left, -lag_s)
     good = np.isfinite(left) & np.isfinite(right) & (moving > 0) & (grips > 0)
-    for other in (*sides.beside, *(one for one in (sides.per, sides.bend) if one is not None)):
+    for other in (
+        *sides.further_terms,
+        *(one for one in (sides.per, sides.bend) if one is not None),
+    ):
         good &= np.isfinite(other)
     if good.sum() < FEWEST_S * RATE_HZ:
         return NOTHING
@@ -231,8 +234,8 @@ def _fit_changes(sides: Relation, left: FloatArray, good: BoolArray) -> Fit:
     """
     x = sides.right[good]
     y = left[good]
-    away = np.abs(x - find_median(x))
-    excited = away > SLOW_SHARE * np.percentile(away, 95)
+    deviation = np.abs(x - find_median(x))
+    excited = deviation > SLOW_SHARE * np.percentile(deviation, 95)
     excited_s = excited.sum() / RATE_HZ
     count = max(excited_s / CORRELATED_S, 1.0)
     constant = np.ones(len(x)) if sides.per is None else sides.per[good]
@@ -241,7 +244,7 @@ def _fit_changes(sides: Relation, left: FloatArray, good: BoolArray) -> Fit:
     if sides.bend is not None:
         bend, bend_error = _bend_of(x, y, constant, sides.bend[good], count)
         x = x * (1.0 + bend * sides.bend[good])
-    table = np.stack([x, constant, *(other[good] for other in sides.beside)], axis=1)
+    table = np.stack([x, constant, *(other[good] for other in sides.further_terms)], axis=1)
     solution, errors = _fit_with_priors(table, y, sides.loose, count)
     rest = y - table[:, 1:] @ solution[1:]
     correlation = correlate_series(x, rest)
@@ -250,10 +253,10 @@ def _fit_changes(sides: Relation, left: FloatArray, good: BoolArray) -> Fit:
         slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
         gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope)))
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
-    beside = tuple(float(k) for k in solution[2:])
+    further_gains = tuple(float(k) for k in solution[2:])
     if sides.bend is not None:
         per_square = find_median(sides.bend[good] / np.maximum(np.square(constant), 1e-12))
-        beside = (gain * bend * per_square * sides.length,)
+        further_gains = (gain * bend * per_square * sides.length,)
     return Fit(
         gain=gain,
         offset=float(solution[1]),
@@ -264,7 +267,7 @@ def _fit_changes(sides: Relation, left: FloatArray, good: BoolArray) -> Fit:
         lag_error_s=np.inf,
         left=rest,
         right=x,
-        beside=beside,
+        further_gains=further_gains,
         parts=_gains_of_parts(x, rest, excited),
         offset_error=float(errors[1]),
     )
@@ -308,9 +311,9 @@ def _fit_line(x: FloatArray, constant: FloatArray, y: FloatArray) -> tuple[float
     (n,). k is 0 if x is a multiple of `constant`.
     """
     square = constant @ constant
-    apart = x - constant @ x / square * constant
-    size = apart @ apart
-    gain = float(apart @ y / size) if size > 1e-24 * (x @ x) else 0.0
+    centred = x - constant @ x / square * constant
+    size = centred @ centred
+    gain = float(centred @ y / size) if size > 1e-24 * (x @ x) else 0.0
     return gain, float(constant @ (y - gain * x) / square)
 
 
@@ -400,8 +403,8 @@ def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[flo
         _correlation_peak(left[p], right[p], moving[p])
         for p in (slice(None, half), slice(half, None))
     ]
-    apart = [abs(part[0] - lag) for part in parts if part[1]]
-    return lag, 0.02 + (0.7 * float(np.mean(apart)) if apart else 0.1)
+    differences = [abs(part[0] - lag) for part in parts if part[1]]
+    return lag, 0.02 + (0.7 * float(np.mean(differences)) if differences else 0.1)
 
 
 def _correlation_peak(

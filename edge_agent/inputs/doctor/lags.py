@@ -84,18 +84,18 @@ def find_lags(
             if name == "wheel_lag"
             else (_bicycle_yaw_rate(v, delta, vehicle),)
         )
-        told = list[_Peak]()
+        peaks = list[_Peak]()
         for side in sides:
             peak = _find_delay(side, turning, driven & np.isfinite(side), least)
-            told += [] if peak is None else [peak]
-            if told and told[0].likeness > 1.0 - ALIKE:
+            peaks += [] if peak is None else [peak]
+            if peaks and peaks[0].likeness > 1.0 - ALIKE:
                 break  # no other side can agree clearly better with the gyroscope
         # Prefer the mean of both axles. If one axle is locked, its yaw rate shows nothing and
         # distorts the mean. Then the other axle agrees best with the gyroscope.
-        if told:
-            likest = max(peak.likeness for peak in told)
+        if peaks:
+            likest = max(peak.likeness for peak in peaks)
             found[name] = (
-                next(peak for peak in told if peak.likeness > likest - ALIKE).seconds + LEAD[name]
+                next(peak for peak in peaks if peak.likeness > likest - ALIKE).seconds + LEAD[name]
             )
     return found
 

@@ -68,9 +68,10 @@ def is_on_lift(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> bool:
         return False
     gained = np.gradient(fastest, 1.0 / RATE_HZ)[turns]
     gains = float(np.sqrt(np.nanmean(np.square(gained)))) > GAINS_M_S2
-    felt = float(np.nanstd(even.smooth_channel(signals[:, S.AX])[turns]))
+    acceleration_std = float(np.nanstd(even.smooth_channel(signals[:, S.AX])[turns]))
     return bool(
-        one_stands.sum() > LEAST_SHARE * turns.sum() or (gains and felt < 0.25 * GAINS_M_S2)
+        one_stands.sum() > LEAST_SHARE * turns.sum()
+        or (gains and acceleration_std < 0.25 * GAINS_M_S2)
     )
 
 

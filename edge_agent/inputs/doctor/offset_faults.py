@@ -74,8 +74,8 @@ def _compare_wheels(rims: FloatArray, v_dot: FloatArray, doubts: set[str]) -> li
     coasts = v_dot < -0.1  # a wheel can spin only while it is driven
     medians = median_of_others(rims)
     for i, wheel in enumerate(WHEELS):
-        others = medians[:, i]
-        ratio = rims[:, i] / np.where(others == 0, np.nan, others) - 1.0
+        other_wheels = medians[:, i]
+        ratio = rims[:, i] / np.where(other_wheels == 0, np.nan, other_wheels) - 1.0
         parts = np.array(
             [float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)]
         )
@@ -137,20 +137,26 @@ def find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     steering = found["steering"]
     # Items: channel, measured offset, its standard deviation, largest usual offset, unit.
     listed: list[tuple[str, float, float, float, str]] = []
-    beside = (drive.ax - drive.v_dot)[moving]
-    if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
+    difference = (drive.ax - drive.v_dot)[moving]
+    if np.isfinite(difference).sum() > FEWEST_OFFSET_S * RATE_HZ:
         driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
         largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
         listed.append(
-            ("ax", float(np.nanmedian(beside)), spread_of_parts(beside), largest, "m/s^2")
+            ("ax", float(np.nanmedian(difference)), spread_of_parts(difference), largest, "m/s^2")
         )
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
         straight &= drive.follows_steering
-    beside = (drive.ay - drive.v * drive.r)[straight]
-    if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
+    difference = (drive.ay - drive.v * drive.r)[straight]
+    if np.isfinite(difference).sum() > FEWEST_OFFSET_S * RATE_HZ:
         listed.append(
-            ("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2")
+            (
+                "ay",
+                float(np.nanmedian(difference)),
+                spread_of_parts(difference),
+                LARGEST_AY,
+                "m/s^2",
+            )
         )
     if axle.is_known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
         error = float(

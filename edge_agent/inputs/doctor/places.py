@@ -48,7 +48,7 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
     if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
         yaw = drive.course_yaw[good]
         course = drive.course[good]
-        fits = {name: _course_agreement(made(yaw), course) for name, made in COMPASS.items()}
+        fits = {name: _course_agreement(convert(yaw), course) for name, convert in COMPASS.items()}
         best = max(fits, key=lambda name: fits[name])
         turns = min(_total_turn(COMPASS[best](yaw)), _total_turn(course))
         if turns > LEAST_TURN and fits[best] > max(_course_agreement(yaw, course) + BETTER, SOUND):

@@ -78,7 +78,7 @@ def report_document(diagnosis: Diagnosis) -> dict[str, object]:
             for finding in diagnosis.findings
         ],
         "identities": {
-            name: {what: _finite_or_none(getattr(fit, what)) for what in SHOWN}
+            name: {field: _finite_or_none(getattr(fit, field)) for field in SHOWN}
             for name, fit in diagnosis.fits.items()
         },
     }

@@ -219,8 +219,8 @@ def explain_fits(found: Mapping[str, Fit], vehicle: Vehicle, fast: float) -> Ver
     best = {quantity: choices[quantity][chosen[least]] for quantity, chosen in sets.items()}
     margins = dict.fromkeys(QUANTITIES, 0.0)
     for quantity in {member.quantity for name in known for member in LAWS[name].members}:
-        others = [not _are_equivalent(fault, best[quantity]) for fault in choices[quantity]]
-        rivals = costs[np.array(others)[sets[quantity]]]
+        is_rival = [not _are_equivalent(fault, best[quantity]) for fault in choices[quantity]]
+        rivals = costs[np.array(is_rival)[sets[quantity]]]
         margins[quantity] = float(rivals.min() - costs[least])
     return Verdict(best, margins)
 
@@ -257,8 +257,8 @@ def _prices_of(
     for joint in JOINT:
         together = np.ones(np.shape(prices), bool)
         for quantity, name in joint:
-            named = [fault is not None and fault.name == name for fault in choices[quantity]]
-            together &= np.array(named)[sets[quantity]]
+            is_chosen = [fault is not None and fault.name == name for fault in choices[quantity]]
+            together &= np.array(is_chosen)[sets[quantity]]
         saved = np.maximum(saved, np.where(together, (len(joint) - 1.25) * FAULT_COST, 0.0))
     return np.asarray(prices - saved)
 
@@ -273,8 +273,8 @@ def _misfits_of(name: str, fit: Fit, factors: Mapping[str, FloatArray]) -> Float
     )
     if name in UNSIGNED:
         gains = np.abs(gains)
-    away = np.log(abs(fit.gain) / np.abs(gains)) if fit.gain else np.full(len(gains), 10.0)
-    costs = away**2 / (law.spread**2 + fit.error**2)
+    log_ratio = np.log(abs(fit.gain) / np.abs(gains)) if fit.gain else np.full(len(gains), 10.0)
+    costs = log_ratio**2 / (law.spread**2 + fit.error**2)
     costs += np.where(fit.gain * gains < 0.0, WRONG_SIGN * fit.correlation**2, 0.0)
     return np.minimum(costs, 400.0)
 
@@ -301,8 +301,10 @@ def late_clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
         total = 0.0
         for name, fit in known.items():
             left, right = CLOCKS[name]
-            away = fit.lag_s - CLOCK_CENTRE_S[name] - late.get(left, 0.0) + late.get(right, 0.0)
-            total += min(away**2 / (CLOCK_SPREAD_S[name] ** 2 + fit.lag_error_s**2), 100.0)
+            deviation = (
+                fit.lag_s - CLOCK_CENTRE_S[name] - late.get(left, 0.0) + late.get(right, 0.0)
+            )
+            total += min(deviation**2 / (CLOCK_SPREAD_S[name] ** 2 + fit.lag_error_s**2), 100.0)
         return total
 
     base = lateness_cost({})

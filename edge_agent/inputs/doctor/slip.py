@@ -54,24 +54,26 @@ def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
     ) < 0.1 * np.abs(steps)
     sudden = np.abs(steps) > 0.9 * np.abs(above[enters + 1])
     usual = float(np.median(np.abs(steps)))
-    alike = np.abs(np.abs(steps) / usual - np.maximum(np.round(np.abs(steps) / usual), 1.0)) < 0.1
-    return bool(np.mean(sudden & alike) > 0.8 and (np.mean(whole) > 0.3 or off.mean() > 0.1))
+    is_multiple = (
+        np.abs(np.abs(steps) / usual - np.maximum(np.round(np.abs(steps) / usual), 1.0)) < 0.1
+    )
+    return bool(np.mean(sudden & is_multiple) > 0.8 and (np.mean(whole) > 0.3 or off.mean() > 0.1))
 
 
-def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
+def is_foreign(rest: FloatArray, other_speed: FloatArray, off: BoolArray, fast: float) -> bool:
     """Return True if a wheel disagrees with the other three wheels most of the time while those
     agree with each other. No wheel spins for that long, so the caller reports that the signal is
     not the speed of this wheel.
 
     Args:
         rest: speeds of the other wheels (n, 3), in any unit.
-        others: common speed of the other wheels (n,), in the same unit.
-        off: True where the wheel differs from `others` (n,).
+        other_speed: common speed of the other wheels (n,), in the same unit.
+        off: True where the wheel differs from `other_speed` (n,).
         fast: 95 % quantile of the car's speed in this drive, in the same unit. Samples below 0.3
             times this speed are not used.
     """
-    agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
-    moves = np.abs(others) > 0.3 * fast
+    agree = np.ptp(rest, axis=1) < 0.1 * np.abs(other_speed) + 0.02 * fast
+    moves = np.abs(other_speed) > 0.3 * fast
     return bool(
         moves.sum() > FOREIGN_ROWS
         and np.mean(off[moves & agree]) > 0.6
@@ -158,7 +160,7 @@ def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
     return True
 
 
-def spread_of_parts(beside: FloatArray) -> float:
+def spread_of_parts(readings: FloatArray) -> float:
     """Return the variation of a quantity, given by its readings (n,), over a drive: the standard
     deviation of its medians in RADIUS_PARTS equal parts of the drive.
 
@@ -167,7 +169,7 @@ def spread_of_parts(beside: FloatArray) -> float:
     """
     parts = [
         float(np.nanmedian(part))
-        for part in np.array_split(beside, RADIUS_PARTS)
+        for part in np.array_split(readings, RADIUS_PARTS)
         if np.isfinite(part).any()
     ]
     return float(np.std(parts))
@@ -213,14 +215,14 @@ def measure_lags_twice(
         for rows in (slice(None, half), slice(half, None))
         if whole
     ]
-    told = {}
+    consistent_lags = {}
     for name in whole:
         values = [part[name] for part in (whole, *halves) if name in part]
         lag = float(np.median(values))
-        apart = max(LAGS_APART_S, LAGS_APART * abs(lag))
-        if len(values) == 1 + len(halves) and np.ptp(values) < apart:
-            told[name] = lag
-    return told
+        tolerance = max(LAGS_APART_S, LAGS_APART * abs(lag))
+        if len(values) == 1 + len(halves) and np.ptp(values) < tolerance:
+            consistent_lags[name] = lag
+    return consistent_lags
 
 
 def _holds_with_lag(fit: Fit) -> bool:

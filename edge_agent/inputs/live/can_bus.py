@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from edge_agent.inputs.live.feed import TICK_S, Feed, Heard, HostClock
+from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock, Received
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.readers.can_log import Frames, Log, decode_log
 from edge_agent.inputs.readers.dbc import Database
@@ -35,22 +35,22 @@ class Decoder:
         self.database = {
             name: message for name, message in database.items() if name not in elsewhere
         }
-        self.wanted = {
+        self.requested_signals = {
             name for name in profile.needed_signals() if name.partition(".")[0] in self.database
         }
-        messages = {name.partition(".")[0] for name in self.wanted}
+        messages = {name.partition(".")[0] for name in self.requested_signals}
         self.identifiers = {
             (self.database[name].identifier, self.database[name].extended) for name in messages
         }
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals decoded from received CAN frames, by name. Each element of `heard` is
-        a frame (time, (identifier, extended, data)).
+    def series(self, received: list[Received]) -> dict[str, Series]:
+        """Return the signals decoded from received CAN frames, by name. Each element of `received`
+        is a frame (time, (identifier, extended, data)).
         """
         log: Log = {}
-        for time, (identifier, extended, data) in heard:
+        for time, (identifier, extended, data) in received:
             log.setdefault((0, identifier, extended), Frames()).add(time, data)
-        return decode_log(lambda _: (log, 0.0), OWN, self.database, self.wanted).signals
+        return decode_log(lambda _: (log, 0.0), OWN, self.database, self.requested_signals).signals
 
 
 class CanFeed(Feed):
@@ -70,7 +70,7 @@ class CanFeed(Feed):
         self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]
     ) -> None:
         super().__init__(name, clock)
-        self._can = import_optional("can")
+        self._can_library = import_optional("can")
         self._decoder = decoder
         self._options = dict(options)
 
@@ -84,15 +84,15 @@ class CanFeed(Feed):
             }
             for identifier, extended in sorted(self._decoder.identifiers)
         ]
-        with self._can.Bus(can_filters=filters, **self._options) as bus:
+        with self._can_library.Bus(can_filters=filters, **self._options) as bus:
             self.openings += 1
             while not self.stopping.is_set():
                 message = bus.recv(TICK_S)
                 if message is None or message.is_error_frame or message.is_remote_frame:
                     continue
                 frame = message.arbitration_id, message.is_extended_id, bytes(message.data)
-                self.hear(round(message.timestamp * NS), frame)
+                self.store_message(round(message.timestamp * NS), frame)
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
+    def series(self, received: list[Received]) -> dict[str, Series]:
         """Return the needed signals by name, decoded from the received CAN frames."""
-        return self._decoder.series(heard)
+        return self._decoder.series(received)

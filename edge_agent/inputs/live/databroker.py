@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.inputs.live.feed import Feed, Heard, HostClock
+from edge_agent.inputs.live.feed import Feed, HostClock, Received
 from edge_agent.inputs.live.kuksa.connection import BrokerConnection
 from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
@@ -89,11 +89,11 @@ class DatabrokerFeed(Feed):
             self._call.cancel()
         super().close()
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the values from the databroker's updates `heard`, by signal path."""
+    def series(self, received: list[Received]) -> dict[str, Series]:
+        """Return the values from the databroker's updates `received`, by signal path."""
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
-        for time, (path, value) in heard:
+        for time, (path, value) in received:
             times.setdefault(path, []).append(time)
             values.setdefault(path, []).append(value)
         return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
@@ -114,7 +114,7 @@ class DatabrokerFeed(Feed):
             except connection.grpc.RpcError as error:
                 if error.code() != connection.grpc.StatusCode.NOT_FOUND:
                     raise ConnectionError(f"{error.code().name}: {error.details()}") from None
-                self.say(f"has no signal {path}")
+                self.log_problem(f"has no signal {path}")
         return known
 
     def _hear_update(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
@@ -125,4 +125,4 @@ class DatabrokerFeed(Feed):
                 at = stamp.seconds * NS + stamp.nanos
                 if standing:
                     at = self.clock.start_ns + round(self.clock.now() * NS)
-                self.hear(at, (path, float(getattr(point.value, kind))))
+                self.store_message(at, (path, float(getattr(point.value, kind))))

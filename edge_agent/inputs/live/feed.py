@@ -34,7 +34,7 @@ SILENT_S: Final = 2.0  # [s] silence after which a source counts as lost
 MOST_WAITING: Final = 200_000
 LEAVE_S: Final = 2.0  # [s] time to wait for the thread at the end
 
-Heard: TypeAlias = tuple[float, Any]
+Received: TypeAlias = tuple[float, Any]
 """A received message: its time [s of the host's clock], and its content."""
 
 log = logging.getLogger(__name__)
@@ -64,26 +64,26 @@ class Stamps:
     """Conversion of the time stamps of one live source to the clock of the host (this computer)."""
 
     def __init__(self) -> None:
-        self._before = self._lately = float("inf")
-        self._turned = 0.0
+        self._previous_min_delay = self._current_min_delay = float("inf")
+        self._turn_time = 0.0
 
     @property
     def lead(self) -> float:
         """Return the time [s] that is added to the source's time stamps; 0 where the stamps are
         used unchanged.
         """
-        least = min(self._before, self._lately)
-        return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
+        min_delay = min(self._previous_min_delay, self._current_min_delay)
+        return 0.0 if -EARLY_S <= min_delay < BELIEVED_S or min_delay == float("inf") else min_delay
 
     def host_time(self, stamp: float, arrival: float) -> float:
         """Convert the time stamp [s] of a message from the clock of its source to the clock of this
         host [s]. The message arrived at `arrival` [s] by the host's clock.
         """
-        if arrival - self._turned > WHILE_S:
-            self._before = self._lately
-            self._lately = float("inf")
-            self._turned = arrival
-        self._lately = min(self._lately, arrival - stamp)
+        if arrival - self._turn_time > WHILE_S:
+            self._previous_min_delay = self._current_min_delay
+            self._current_min_delay = float("inf")
+            self._turn_time = arrival
+        self._current_min_delay = min(self._current_min_delay, arrival - stamp)
         return stamp + self.lead
 
 
@@ -92,7 +92,7 @@ class Feed(ABC):
 
     Attributes:
         name: the source as given on the command line.
-        heard: number of messages received.
+        received_count: number of messages received.
         lost: number of messages known to be missing.
         broken: number of messages that could not be read.
         openings: number of times that the source was opened.
@@ -102,26 +102,26 @@ class Feed(ABC):
     def __init__(self, name: str, clock: HostClock) -> None:
         self.name = name
         self.clock = clock
-        self.heard = self.lost = self.broken = self.openings = self.losses = 0
+        self.received_count = self.lost = self.broken = self.openings = self.losses = 0
         self.stopping = threading.Event()
         self.stamps = Stamps()
         self.last = 0.0  # time of the last message [s of the host's clock]
         self.newest = 0.0  # latest time stamp [s of the host's clock]
         self._reasons: set[str] = set()
-        self._waiting: deque[Heard] = deque()
+        self._waiting: deque[Received] = deque()
         self._thread = threading.Thread(target=self._listen_loop, name=name, daemon=True)
 
     @abstractmethod
     def listen(self) -> None:
-        """Open the live source, increment `openings`, and call `hear` for each message until the
-        event `stopping` is set.
+        """Open the live source, increment `openings`, and call `store_message` for each message
+        until the event `stopping` is set.
 
         If this method returns earlier or raises, the source counts as lost and is opened again.
         """
 
     @abstractmethod
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
-        """Return the signals (times and values) from the received messages `heard`, by name."""
+    def series(self, received: list[Received]) -> dict[str, Series]:
+        """Return the signals (times and values) from the messages `received`, by name."""
 
     def start(self) -> None:
         """Start the thread that listens to the live source."""
@@ -142,17 +142,17 @@ class Feed(ABC):
         """
         return self._thread.is_alive()
 
-    def hear(self, stamp_ns: int, what: object) -> None:
-        """Store a received message `what` for the next call of `take`. `stamp_ns` is the time stamp
-        that the source gave to the message [ns UTC].
+    def store_message(self, stamp_ns: int, message: object) -> None:
+        """Store a received message for the next call of `take`. `stamp_ns` is the time stamp that
+        the source gave to the message [ns UTC].
         """
         self.last = self.clock.now()
-        self.heard += 1
+        self.received_count += 1
         if len(self._waiting) >= MOST_WAITING:
             self._waiting.popleft()
             self.lost += 1
         placed = self.stamps.host_time(self.clock.seconds_of(stamp_ns), self.last)
-        self._waiting.append((placed, what))
+        self._waiting.append((placed, message))
         self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
@@ -160,14 +160,14 @@ class Feed(ABC):
         the error), unless the same reason was logged before.
         """
         self.broken += 1
-        self.say(reason)
+        self.log_problem(reason)
 
     def take(self) -> dict[str, Series]:
         """Return the signals, by name, that the source has received since the last call of this
         method.
         """
-        heard = [self._waiting.popleft() for _ in range(len(self._waiting))]
-        return self.series(heard) if heard else {}
+        received = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        return self.series(received) if received else {}
 
     @property
     def trouble(self) -> str | None:
@@ -186,10 +186,10 @@ class Feed(ABC):
                 reason = (str(error) or type(error).__name__).splitlines()[0][:200]
             if not self.stopping.is_set():
                 self.losses += 1
-                self.say(f"lost ({reason}); trying again")
+                self.log_problem(f"lost ({reason}); trying again")
             self.stopping.wait(RETRY_S)
 
-    def say(self, reason: str) -> None:
+    def log_problem(self, reason: str) -> None:
         """Log a problem with the live source. Each different `reason` is logged only once."""
         if reason not in self._reasons and len(self._reasons) < 50:
             self._reasons.add(reason)

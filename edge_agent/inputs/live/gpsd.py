@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.live.feed import TICK_S, Feed, Heard, HostClock
+from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock, Received
 from edge_agent.inputs.readers.gnss import LONGEST_LINE, UNITS, parse_gpsd
 from edge_agent.inputs.recording import Series
 
@@ -58,14 +58,14 @@ class GpsdFeed(Feed):
             self.unreadable(f"a report that cannot be read ({type(error).__name__})")
             return
         if fix is not None:
-            self.hear(fix.time, fix)
+            self.store_message(fix.time, fix)
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
+    def series(self, received: list[Received]) -> dict[str, Series]:
         """Return the positions in received gpsd reports as the signals latitude, longitude, speed
         and course.
         """
-        t = np.array([time for time, _ in heard])
+        t = np.array([time for time, _ in received])
         return {
-            name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name])
+            name: Series(t, np.array([getattr(fix, name) for _, fix in received]), UNITS[name])
             for name in UNITS
         }

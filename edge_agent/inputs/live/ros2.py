@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge_agent.inputs.live.can_bus import Decoder
-from edge_agent.inputs.live.feed import Feed, Heard, HostClock
+from edge_agent.inputs.live.feed import Feed, HostClock, Received
 from edge_agent.inputs.readers.rosbag import FRAME, Leaf, leaves_of, stamp_of
 from edge_agent.inputs.recording import Series, import_optional
 from schemas.config import ZenohSettings
@@ -95,9 +95,9 @@ class Ros2Feed(Feed):
         self._settings = settings
         self._domain = topics.domain
         self._decoder = topics.decoder
-        self._wanted = {signal for signal in topics.signals if signal.startswith("/")}
-        named = {signal.partition(".")[0] for signal in self._wanted}
-        self._topics = sorted(named | set(topics.buses))
+        self._requested_signals = {signal for signal in topics.signals if signal.startswith("/")}
+        named_topics = {signal.partition(".")[0] for signal in self._requested_signals}
+        self._topics = sorted(named_topics | set(topics.buses))
         if not self._topics:
             raise InputError(
                 "profile",
@@ -106,7 +106,7 @@ class Ros2Feed(Feed):
             )
         self._store = _load_typestore(topics.types)
         self._leaves: dict[str, list[Leaf]] = {}
-        self._after: dict[bytes, int] = {}  # publisher -> next expected sequence number
+        self._next_numbers: dict[bytes, int] = {}  # publisher -> next expected sequence number
 
     def listen(self) -> None:
         """Receive messages until the source is stopped. The method does not handle a lost router,
@@ -126,17 +126,17 @@ class Ros2Feed(Feed):
             for subscriber in held:
                 subscriber.undeclare()
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
+    def series(self, received: list[Received]) -> dict[str, Series]:
         """Return the values in received ROS messages by signal name. CAN frames are decoded with
         the CAN database.
         """
-        frames = [(time, what) for time, what in heard if isinstance(what, tuple)]
+        frames = [(time, message) for time, message in received if isinstance(message, tuple)]
         found = self._decoder.series(frames) if self._decoder and frames else {}
         times: dict[str, list[float]] = {}
         values: dict[str, list[float]] = {}
-        for time, what in heard:
-            if isinstance(what, dict):
-                for name, value in what.items():
+        for time, message in received:
+            if isinstance(message, dict):
+                for name, value in message.items():
                     times.setdefault(name, []).append(time)
                     values.setdefault(name, []).append(value)
         return found | {
@@ -166,12 +166,12 @@ class Ros2Feed(Feed):
         if kind == FRAME:
             if not (message.is_error or message.is_rtr):
                 data = bytes(message.data)[: message.dlc]
-                self.hear(at, (int(message.id), bool(message.is_extended), data))
+                self.store_message(at, (int(message.id), bool(message.is_extended), data))
             return
         if topic not in self._leaves:
-            named = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
-            self._leaves[topic] = [leaf for leaf in named if leaf[0] in self._wanted]
-        self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
+            leaves = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
+            self._leaves[topic] = [leaf for leaf in leaves if leaf[0] in self._requested_signals]
+        self.store_message(at, {name: float(take(message)) for name, take in self._leaves[topic]})
 
     def _publication_time(self, attachment: bytes) -> int:
         """Return the time of publication [ns] that a message's attachment contains; 0 if it is
@@ -181,11 +181,11 @@ class Ros2Feed(Feed):
             return 0
         number, at = ATTACHMENT.unpack_from(attachment)
         publisher = attachment[ATTACHMENT.size :][:MOST_IDENTITY]
-        if publisher not in self._after and len(self._after) >= MOST_PUBLISHERS:
-            self._after.pop(next(iter(self._after)))
-        expected = self._after.get(publisher, number)
+        if publisher not in self._next_numbers and len(self._next_numbers) >= MOST_PUBLISHERS:
+            self._next_numbers.pop(next(iter(self._next_numbers)))
+        expected = self._next_numbers.get(publisher, number)
         self.lost += max(number - expected, 0)
-        self._after[publisher] = max(number + 1, expected)
+        self._next_numbers[publisher] = max(number + 1, expected)
         return int(at)
 
 

@@ -108,10 +108,10 @@ class LiveRows:
                 self._wait(max(0.0, due - self._clock.now()))
                 while self._may_deliver(due - DELAY_S) and self._clock.now() < due + PATIENCE_S:
                     self._wait(TICK_S / 10.0)
-                behind = int((self._clock.now() - due) * self.rate_hz)
-                if behind > MOST_BEHIND_S * self.rate_hz:
-                    self._next += behind
-                    self.skipped += behind
+                late_rows = int((self._clock.now() - due) * self.rate_hz)
+                if late_rows > MOST_BEHIND_S * self.rate_hz:
+                    self._next += late_rows
+                    self.skipped += late_rows
                 yield self._make_block(size)
         finally:
             for feed in self.feeds:
@@ -130,7 +130,10 @@ class LiveRows:
         are rare.
         """
         return any(
-            feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
+            feed.received_count
+            and feed.newest < time
+            and feed.trouble is None
+            and "course" not in kept
             for feed, kept in zip(self.feeds, self._readings, strict=True)
         )
 

@@ -134,12 +134,12 @@ def _open_can(
     if given_bus and not given_bus.isdecimal():
         raise InputError("source", f"{source!r}: the bus is not a number", "write it like ?bus=0")
     bus = int(given_bus) if given_bus else None
-    given = {name: _parse_option(value) for name, value in options.items()}
+    bus_options = {name: _parse_option(value) for name, value in options.items()}
     return CanFeed(
         source,
         clock,
         Decoder(profile, database, bus),
-        {"interface": interface, "channel": channel} | given,
+        {"interface": interface, "channel": channel} | bus_options,
     )
 
 

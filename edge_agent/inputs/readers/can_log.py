@@ -65,7 +65,7 @@ def decode_log(
     take: Taker,
     name: str,
     database: Database,
-    wanted: Iterable[str],
+    requested_signals: Iterable[str],
     buses: dict[str, int] | None = None,
 ) -> Recording:
     """Return the signals of a CAN log by their full names `MESSAGE.SIGNAL`.
@@ -74,12 +74,12 @@ def decode_log(
         take: function that returns the log's frames with the wanted identifiers.
         name: name of the log.
         database: CAN database that decodes the frames.
-        wanted: full names of signals; names that the database or the log does not have are left
-            out.
+        requested_signals: full names of signals; names that the database or the log does not have
+            are left out.
         buses: bus number by message, where it is known.
     """
     messages: dict[str, list[str]] = defaultdict(list)
-    for whole in wanted:
+    for whole in requested_signals:
         message, _, signal = whole.partition(".")
         if message in database and signal in database[message].signals:
             messages[message].append(signal)
@@ -89,15 +89,15 @@ def decode_log(
         log, [database[message] for message in messages], buses or {}
     ).items():
         times, data = log[key].to_columns()
-        how = database[message]
+        layout = database[message]
         lengths = np.array(log[key].lengths)
-        names = [s for s in messages[message] if how.signals[s].last_byte < lengths.max()]
+        names = [s for s in messages[message] if layout.signals[s].last_byte < lengths.max()]
         t = np.rint((times - first) * MICRO) / MICRO
         order = np.argsort(t, kind="stable")
-        for signal, values in how.decode(data, names).items():
-            values[how.signals[signal].last_byte >= lengths] = np.nan  # a frame that was cut
+        for signal, values in layout.decode(data, names).items():
+            values[layout.signals[signal].last_byte >= lengths] = np.nan  # a frame that was cut
             recording.signals[f"{message}.{signal}"] = Series(
-                t[order], values[order], how.signals[signal].unit
+                t[order], values[order], layout.signals[signal].unit
             )
     return recording
 
@@ -130,9 +130,9 @@ def no_database(path: Path) -> InputError:
     )
 
 
-def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Read a log of CAN frames with python-can. Return the frames whose identifier is in `wanted`,
-    and the time of the log's first frame [s].
+def log_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
+    """Read a log of CAN frames with python-can. Return the frames whose identifier is in
+    `identifiers`, and the time of the log's first frame [s].
     """
     log: Log = defaultdict(Frames)
     first = np.inf
@@ -143,7 +143,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
             time = message.timestamp
             first = min(first, time)
             if (
-                message.arbitration_id in wanted
+                message.arbitration_id in identifiers
                 and not message.is_error_frame
                 and not message.is_remote_frame
             ):

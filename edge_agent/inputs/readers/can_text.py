@@ -40,9 +40,9 @@ def is_bare_trace(path: Path) -> bool:
     return "$FILEVERSION" not in head
 
 
-def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the CAN frames of a GVRET CSV file whose identifier is in `wanted`, and the time of
-    the file's first frame [s].
+def gvret_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
+    """Return the CAN frames of a GVRET CSV file whose identifier is in `identifiers`, and the time
+    of the file's first frame [s].
 
     Raises:
         InputError: a row has another format; the error names the row.
@@ -70,14 +70,14 @@ def gvret_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
                     "export the log again",
                 ) from error
             first = time if first is None else first
-            if identifier in wanted:
+            if identifier in identifiers:
                 log[bus, identifier, extended].add(time, data)
     return require_steady_clock(path, log), first or 0.0
 
 
-def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
-    """Return the CAN frames of a PCAN trace without header whose identifier is in `wanted`, and the
-    time of the trace's first frame [s]. The trace itself has times in milliseconds.
+def trace_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
+    """Return the CAN frames of a PCAN trace without header whose identifier is in `identifiers`,
+    and the time of the trace's first frame [s]. The trace itself has times in milliseconds.
 
     Raises:
         InputError: no line is a frame.
@@ -92,7 +92,7 @@ def trace_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
             time = float(found["time"]) * MILLI
             first = time if first is None else first
             identifier = int(found["id"], 16)
-            if identifier in wanted:
+            if identifier in identifiers:
                 data = bytes.fromhex(found["data"].replace(" ", ""))
                 log[int(found["bus"] or 0), identifier, len(found["id"]) > 4].add(time, data)
     if first is None:

@@ -82,10 +82,10 @@ class Signal:
             byte = self.start // 8
             top = self.start % 8
             while left > 0:
-                taken = min(left, top + 1)
-                part = (data[:, byte] >> np.uint8(top + 1 - taken)) & np.uint8((1 << taken) - 1)
-                raw = (raw << np.uint64(taken)) | part.astype(np.uint64)
-                left = left - taken
+                bits = min(left, top + 1)
+                part = (data[:, byte] >> np.uint8(top + 1 - bits)) & np.uint8((1 << bits) - 1)
+                raw = (raw << np.uint64(bits)) | part.astype(np.uint64)
+                left = left - bits
                 byte = byte + 1
                 top = 7
         return raw if self.size == 64 else raw & np.uint64((1 << self.size) - 1)
@@ -203,15 +203,17 @@ def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
     return (signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None), mux
 
 
-def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
-    """Return the CAN database to use: the file `given` on the command line, else the file that the
-    profile names (in `folder`, or shipped with the package), else None.
+def database_of(profile: Profile | None, folder: Path, given_file: Path | None) -> Database | None:
+    """Return the CAN database to use: the file `given_file` on the command line, else the file that
+    the profile names (in `folder`, or shipped with the package), else None.
     """
-    if given is not None:
-        return read_dbc(given)
+    if given_file is not None:
+        return read_dbc(given_file)
     if profile is None or profile.dbc is None:
         return None
-    beside = folder / profile.dbc
+    local_file = folder / profile.dbc
     return read_dbc(
-        beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc
+        local_file
+        if local_file.exists() or not (FOLDER / profile.dbc).exists()
+        else FOLDER / profile.dbc
     )

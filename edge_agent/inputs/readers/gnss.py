@@ -85,8 +85,8 @@ def parse_gpsd(line: str) -> Fix | None:
     if report.get("class") != "TPV" or mode < 2 or "time" not in report:
         return None
     moment = datetime.fromisoformat(str(report["time"])).astimezone(UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    time = (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
+    since_epoch = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    time = (since_epoch.days * 86_400 + since_epoch.seconds) * NS + since_epoch.microseconds * 1_000
     place = (float(report.get(key, math.nan)) for key in ("lat", "lon", "speed", "track"))
     return _check_position(Fix(time, *place))
 

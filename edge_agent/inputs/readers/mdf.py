@@ -146,9 +146,9 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
     return any("CAN_DataFrame" in name for name in mdf.channels_db)
 
 
-def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the CAN frames of an MDF file whose identifier is in `wanted`, and the start of the
-    log [s since 1970 UTC].
+def mdf_frames(mdf: Any, needed_identifiers: set[int]) -> tuple[Log, float]:  # noqa: ANN401
+    """Return the CAN frames of an MDF file whose identifier is in `needed_identifiers`, and
+    the start of the log [s since 1970 UTC].
     """
     log: Log = {}
     first = np.inf
@@ -167,7 +167,7 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
         buses = rows["CAN_DataFrame.BusChannel"].astype(np.int64)
         lengths = rows["CAN_DataFrame.DataLength"].astype(np.int64)
         data = rows["CAN_DataFrame.DataBytes"]
-        for row in np.flatnonzero(np.isin(identifiers, list(wanted))):
+        for row in np.flatnonzero(np.isin(identifiers, list(needed_identifiers))):
             key = int(buses[row]), int(identifiers[row]), bool(extended[row])
             frame = bytes(data[row][: lengths[row]])
             log.setdefault(key, Frames()).add(float(channel.timestamps[row]), frame)
@@ -177,9 +177,9 @@ def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
     return log, start
 
 
-def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the channels `wanted` of a measurement in an MDF file, by name; all channels if
-    `wanted` is None.
+def read_mdf(mdf: Any, path: Path, requested: set[str] | None) -> Recording:  # noqa: ANN401
+    """Return the channels `requested` of a measurement in an MDF file, by name; all
+    channels if `requested` is None.
 
     If several channels have the same name, the first one with samples is used.
     """
@@ -187,7 +187,7 @@ def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noq
     recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)
     with foreign_errors(path, "MDF 4"):
         for name, places in mdf.channels_db.items():
-            if wanted is not None and name not in wanted:
+            if requested is not None and name not in requested:
                 continue
             for group, index in places:
                 if index == mdf.masters_db.get(group):

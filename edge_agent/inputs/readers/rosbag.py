@@ -70,9 +70,9 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
     return any(connection.msgtype == FRAME for connection in reader.connections)
 
 
-def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the CAN frames of a ROS bag whose identifier is in `wanted`, and the time of the first
-    frame [s since 1970 UTC]. Each topic counts as a bus.
+def bag_frames(reader: Any, path: Path, identifiers: set[int]) -> tuple[Log, float]:  # noqa: ANN401
+    """Return the CAN frames of a ROS bag whose identifier is in `identifiers`, and the time of the
+    first frame [s since 1970 UTC]. Each topic counts as a bus.
     """
     log: Log = {}
     first = np.inf
@@ -80,18 +80,18 @@ def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]: 
     with foreign_errors(path, "ROS bag"):
         for connection, _, time, message in _read_messages(reader, topics):
             first = min(first, time)
-            if message.id in wanted and not message.is_error and not message.is_rtr:
+            if message.id in identifiers and not message.is_error and not message.is_rtr:
                 key = topics.index(connection), int(message.id), bool(message.is_extended)
                 log.setdefault(key, Frames()).add(time / NS, bytes(message.data)[: message.dlc])
     return log, first / NS if np.isfinite(first) else 0.0
 
 
-def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals `wanted` of a ROS bag by name; all signals if `wanted` is None."""
+def read_bag(reader: Any, path: Path, requested: set[str] | None) -> Recording:  # noqa: ANN401
+    """Return the signals `requested` of a ROS bag by name; all signals if it is None."""
     topics = [
         c
         for c in reader.connections
-        if wanted is None or any(name.startswith(f"{c.topic}.") for name in wanted)
+        if requested is None or any(name.startswith(f"{c.topic}.") for name in requested)
     ]
     times: dict[str, list[int]] = {}
     values: dict[str, list[float]] = {}
@@ -103,7 +103,9 @@ def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # 
             topic = connection.topic
             if topic not in leaves:
                 found = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
-                leaves[topic] = [leaf for leaf in found if wanted is None or leaf[0] in wanted]
+                leaves[topic] = [
+                    leaf for leaf in found if requested is None or leaf[0] in requested
+                ]
             for name, take in leaves[topic]:
                 times.setdefault(name, []).append(time)
                 values.setdefault(name, []).append(float(take(message)))
@@ -165,10 +167,10 @@ def _array_leaves(
     ):
         return
     labels = getattr(message, "name", None) if not prefix else None
-    named = isinstance(labels, list) and len(labels) == len(value)
+    has_labels = isinstance(labels, list) and len(labels) == len(value)
     take = attrgetter(path[1:])
     for index in range(len(value)):
-        label = labels[index] if named else index  # type: ignore[index]
+        label = labels[index] if has_labels else index  # type: ignore[index]
         yield f"{path}[{label}]", _element_at(take, index)
 
 

@@ -89,9 +89,9 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
     stripped = {name.strip(): values for name, values in numbers.items()}
     if has_vbo_columns(stripped):
         return convert_vbo(path, stripped, {})
-    named = _plain_names(table.column_names)
-    column = _time_column(path, named, time)
-    title = named[column]
+    titles = _plain_names(table.column_names)
+    column = _time_column(path, titles, time)
+    title = titles[column]
     t, start_ns = _parse_seconds(table[title], column, time_unit or _unit_in(title) or None)
     back = np.flatnonzero(~((np.diff(t) >= 0.0) & np.isfinite(t[1:])))
     if len(back):
@@ -102,7 +102,7 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
         )
     recording = Recording(path.name, {}, start_ns, rows=True, notes=notes)
     left = []
-    for name, title in named.items():
+    for name, title in titles.items():
         if name == column:
             continue
         if title in numbers:
@@ -237,24 +237,24 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
-    if given is not None:
-        whole = next((name for name, full in named.items() if given in (name, full)), None)
+def _time_column(path: Path, titles: dict[str, str], requested: str | None) -> str:
+    if requested is not None:
+        whole = next((name for name, full in titles.items() if requested in (name, full)), None)
         if whole is not None:
             return whole
         raise InputError(
             "time",
-            f"{path} has no column {given}",
-            f"choose one of {', '.join(list(named)[:MOST_NAMES])}",
+            f"{path} has no column {requested}",
+            f"choose one of {', '.join(list(titles)[:MOST_NAMES])}",
         )
-    lower = {name.lower(): name for name in reversed(named)}
+    lower = {name.lower(): name for name in reversed(titles)}
     for name in TIMES:
         if name in lower:
             return lower[name]
-    for name in named:  # take the first name with such a word, such as "INS_time_sec"
+    for name in titles:  # take the first name with such a word, such as "INS_time_sec"
         if {"time", "timestamp", "datetime"} & set(_WORD.findall(name.lower())):
             return name
-    seen = ", ".join(list(named)[:MOST_NAMES])
+    seen = ", ".join(list(titles)[:MOST_NAMES])
     raise InputError(
         "time",
         f"{path} has no time column; its columns are {seen}",

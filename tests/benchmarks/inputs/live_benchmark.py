@@ -141,11 +141,11 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
             next(blocks)
         running.send_go()
         began = time.monotonic()
-        heard = 0
+        received_count = 0
         for block in blocks:
             parts.append(block.signals[:, 0])
-            if feeds[0].heard > heard:
-                heard = feeds[0].heard
+            if feeds[0].received_count > received_count:
+                received_count = feeds[0].received_count
                 quiet_since = time.monotonic()
             if (
                 time.monotonic() > quiet_since + SETTLED_S
@@ -162,7 +162,7 @@ def count_lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     if np.isfinite(table).all(axis=1).sum() < samples // 2:
         # Messages were received, but no signal row was built: count all samples as missing.
         return samples, samples
-    missing = -(-(sent - heard) * samples // max(sent, 1))
+    missing = -(-(sent - received_count) * samples // max(sent, 1))
     return max(missing, 0) + feeds[0].lost + rows.late, samples
 
 

@@ -290,7 +290,7 @@ def test_databroker_sends_lasting_signals_first_and_then_changes() -> None:
         (feed,), _, clock = open_sources([f"vss:127.0.0.1:{port}"], None)
         assert isinstance(feed, DatabrokerFeed)
         feed.start()
-        until(lambda: feed.heard >= 2)
+        until(lambda: feed.received_count >= 2)
         standing = feed.take()
         assert {name: series.values.tolist() for name, series in standing.items()} == {
             air: [AIR],
@@ -300,7 +300,7 @@ def test_databroker_sends_lasting_signals_first_and_then_changes() -> None:
             "the value of now, however old its stamp"
         )
         broker.publish({abs_: 1.0}, time.time_ns())
-        until(lambda: feed.heard >= 3)
+        until(lambda: feed.received_count >= 3)
         assert feed.take()[abs_].values.tolist() == [1.0]
         feed.close()
 

@@ -90,8 +90,8 @@ def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_
                 running.send_go()
                 running.wait_for("ready")
                 running.send_go()
-                before = feed.heard
-                until(lambda: feed.heard > before + 20)  # noqa: B023 waited for in this iteration
+                before = feed.received_count
+                until(lambda: feed.received_count > before + 20)  # noqa: B023 waited for here
             until(lambda: feed.trouble is not None)
     finally:
         feed.close()
@@ -123,13 +123,13 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
     for _ in range(200):
         session.put(key, rng.bytes(int(rng.integers(400))))
     good = b"\x00\x01\x00\x00" + bytes(8) + b"\x01\x00\x00\x00" + bytes(300)
-    hears(good, lambda: feed.heard > 0)
+    hears(good, lambda: feed.received_count > 0)
     assert list(feed.take()) == ["/imu.angular_velocity.z"]
     broken = feed.broken
     hears(good + bytes(MOST_MESSAGE), lambda: feed.broken > broken)
     for number in range(2 * MOST_PUBLISHERS):
         feed._publication_time(struct.pack("<qqq", 1, 2, number))
-    assert len(feed._after) == MOST_PUBLISHERS
+    assert len(feed._next_numbers) == MOST_PUBLISHERS
     session.put("0/imu/nonsense/RIHS01_0", good)
     session.close()
     feed.close()
@@ -155,7 +155,7 @@ def test_hostile_lines_of_a_receiver_are_counted() -> None:
             connection.sendall(b"\n".join([*bad, b'{"class":"TPV","mode":3,"time":"soon"}', b""]))
             now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
             connection.sendall(json.dumps(fix | {"time": now}).encode() + b"\n")
-            until(lambda: feed.heard)
+            until(lambda: feed.received_count)
             assert feed.broken == 5
             assert set(feed.take()) == {"latitude", "longitude", "speed", "course"}
             connection.sendall(b"x" * 200_000)  # a real receiver sends no endless line
@@ -174,7 +174,7 @@ def test_databroker_is_queried_and_old_values_are_no_readings(
         feed.start()
         until(lambda: broker.subscribers)
         broker.publish({paths[1]: 2.0}, time.time_ns())
-        until(lambda: feed.heard)
+        until(lambda: feed.received_count)
         assert {name: series.values.tolist() for name, series in feed.take().items()} == {
             paths[1]: [2.0]
         }

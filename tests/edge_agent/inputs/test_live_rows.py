@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge_agent.inputs.live import feed
-from edge_agent.inputs.live.feed import BELIEVED_S, WHILE_S, Feed, Heard, HostClock, Stamps
+from edge_agent.inputs.live.feed import BELIEVED_S, WHILE_S, Feed, HostClock, Received, Stamps
 from edge_agent.inputs.live.rows import DELAY_S, LiveRows
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Series
@@ -46,15 +46,15 @@ class Scripted(Feed):
     def listen(self) -> None:
         self.stopping.wait()
 
-    def series(self, heard: list[Heard]) -> dict[str, Series]:
-        names = {name for _, values in heard for name in values}
+    def series(self, received: list[Received]) -> dict[str, Series]:
+        names = {name for _, values in received for name in values}
         found = {
-            name: [(t, values[name]) for t, values in heard if name in values] for name in names
+            name: [(t, values[name]) for t, values in received if name in values] for name in names
         }
         return {name: Series(*np.array(pairs).T) for name, pairs in found.items()}
 
     def tell(self, t: float, **values: float) -> None:
-        self.hear(self.clock.start_ns + round(t * NS), values)
+        self.store_message(self.clock.start_ns + round(t * NS), values)
 
 
 @pytest.fixture
@@ -221,7 +221,7 @@ def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
     feed = Failing("bus", HostClock())
     with caplog.at_level(logging.WARNING):
         feed.start()
-        until(lambda: feed.heard)
+        until(lambda: feed.received_count)
     feed.close()
     assert feed.losses == 2
     assert [record.getMessage() for record in caplog.records] == [
