@@ -114,12 +114,14 @@ class DetectionTally:
         """Return the mean of all values added under the name `name`; NaN if there are none."""
         return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
 
-    def rate(self, over: str, under: str) -> float:
-        """Return the sum of the measure named `over` divided by the sum of the measure named
-        `under`; NaN if the divisor is zero or missing.
+    def rate(self, numerator: str, denominator: str) -> float:
+        """Return the sum of the measure named `numerator` divided by the sum of the measure named
+        `denominator`; NaN if the divisor is zero or missing.
         """
         return (
-            self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
+            self.total.get(numerator, 0.0) / self.total[denominator]
+            if self.total.get(denominator)
+            else float("nan")
         )
 
     def quantile(self, name: str, share: float) -> float:
@@ -198,17 +200,17 @@ def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
     grip (lower end of the interval too far above the true friction).
     """
     mu = drive.mu
-    apart = ~drive.stood
+    is_moving = ~drive.stood
     inside = (drive.lower <= mu) & (mu <= drive.upper)
     for name, (above, most) in SURFACES.items():
         among = (mu > above) & (mu <= most)
-        tally.add(f"coverage90.{name}", inside[among & apart])
-        tally.add(f"coverage90.{name}.stood", inside[among & ~apart])
+        tally.add(f"coverage90.{name}", inside[among & is_moving])
+        tally.add(f"coverage90.{name}.stood", inside[among & ~is_moving])
         score = interval_score(
             drive.lower.astype(np.float64), drive.upper.astype(np.float64), mu.astype(np.float64)
         )
-        tally.add(f"score.{name}", score[among & apart])
-    ice = (mu <= ICE_MU) & apart
+        tally.add(f"score.{name}", score[among & is_moving])
+    ice = (mu <= ICE_MU) & is_moving
     called = drive.slippery > CALLED_SHARE
     grips = mu > SNOW_MU
     tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
@@ -289,10 +291,12 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
         if float(drive.mu_wheel[first:end, n].mean()) >= TOLD_MU or drive.stood[first:end, n].any():
             continue
         late = end + round(TOLD_AFTER_S * RATE_HZ)
-        told = bool((drive.slippery[first:late, n] > CALLED_SHARE).any())
+        is_found = bool((drive.slippery[first:late, n] > CALLED_SHARE).any())
         four = bridge_gaps(np.asarray(beyond[first:end].all(axis=1)), BRIDGED_S)
         whole = any(b - a >= round(TOLD_SLIDE_S * RATE_HZ) for a, b in runs_of(four))
-        tally.add_case("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
+        tally.add_case(
+            "slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=is_found
+        )
 
 
 def _judge_contradictions(
@@ -370,15 +374,15 @@ def _judge_visits(
         )
         if not slid and float(drive.used[now, n].max()) <= EXCITED_SHARE:
             continue
-        apart = ".stood" if drive.stood[now, n].any() else ""
-        _note_visit(tally, f"{kind}.", likelihood, (slid, apart))
+        suffix = ".stood" if drive.stood[now, n].any() else ""
+        _note_visit(tally, f"{kind}.", likelihood, (slid, suffix))
         if oracle and kind == "ice":
             grip = drive.mu_wheel[now, n].astype(np.float64)
             force = drive.used[now, n] * grip
             slip = drive.theta[now, n] * grip
             rng = np.random.default_rng([n, now.start])
             found = visit_evidence(force, slip, drive.speed[now, n].astype(np.float64), rng)
-            _note_visit(tally, f"oracle.{kind}.", found, (slid, apart))
+            _note_visit(tally, f"oracle.{kind}.", found, (slid, suffix))
 
 
 def _note_visit(

@@ -59,14 +59,14 @@ def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
     return lambda tally: tally.quantile(name, share)
 
 
-def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
+def rate_of(numerator: str, denominator: str) -> Callable[[DetectionTally], float]:
     """Return a function that computes a rate from a tally (sums of the evaluation by name): 1000
-    times the sum named `over`, divided by the sum named `under`.
+    times the sum named `numerator`, divided by the sum named `denominator`.
 
-    If `under` is a distance [km] or a time [s], the unit of the rate is "per 1000 km" or "per 1000
-    s".
+    If `denominator` is a distance [km] or a time [s], the unit of the rate is "per 1000 km" or "per
+    1000 s".
     """
-    return lambda tally: 1e3 * tally.rate(over, under)
+    return lambda tally: 1e3 * tally.rate(numerator, denominator)
 
 
 PER_1000_KM = "per 1000 km"

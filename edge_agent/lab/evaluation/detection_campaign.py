@@ -143,15 +143,15 @@ def town_named(text: str) -> DetectionTown:
         InputError: the text does not have this form.
     """
     usual = ("", "rough", "120", "")
-    given = text.split(":")
-    seed, kind, seconds, season = [*given, *usual[len(given) :]][:4]
+    parts = text.split(":")
+    seed, kind, seconds, season = [*parts, *usual[len(parts) :]][:4]
     sound = (
         seed.isdecimal()
         and kind in KINDS
         and seconds.replace(".", "", 1).isdecimal()
         and season in ("", "winter")
     )
-    if len(given) > len(usual) or not sound:
+    if len(parts) > len(usual) or not sound:
         raise InputError(
             "town", f"{text!r} is not a town", "give SEED, SEED:plain:900 or SEED:plain:900:winter"
         )

@@ -159,8 +159,8 @@ def stood_where_it_appeared(
             continue
         appears = (mu[now - 1] - mu[now] > APPEARED) & (speed[now] < STANDING_M_S)
         for n in np.flatnonzero(appears & (mu[now] <= SURFACES["snow"][1])):
-            gone = np.flatnonzero(mu[now:, n] > SURFACES["snow"][1])
-            out[now : now + gone[0] if len(gone) else None, n] = True
+            grip_returns = np.flatnonzero(mu[now:, n] > SURFACES["snow"][1])
+            out[now : now + grip_returns[0] if len(grip_returns) else None, n] = True
     return out
 
 

@@ -81,14 +81,14 @@ class OracleSignals(NamedTuple):
     readings and true values (`batch`), and effects of the body's tilt.
 
     The body rolls with a lag after a_y, and pitches with a lag after a_x. `rolled` and `pitched`
-    (T,) are a_y and a_x with this lag [m/s^2]. `felt` (T, 2) are the readings of a_x and a_y
-    [m/s^2] by accelerometers whose only error is the gravity that this tilt adds.
+    (T,) are a_y and a_x with this lag [m/s^2]. `body_acceleration` (T, 2) are the readings of
+    a_x and a_y [m/s^2] by accelerometers whose only error is the gravity that this tilt adds.
     """
 
     batch: DriveSet
     rolled: FloatArray
     pitched: FloatArray
-    felt: FloatArray  # (T, 2), from accelerometers without other errors
+    body_acceleration: FloatArray  # (T, 2), from accelerometers without other errors
 
 
 def speed(seeds: Sequence[int]) -> FloatArray:
@@ -98,34 +98,40 @@ def speed(seeds: Sequence[int]) -> FloatArray:
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
     batch = realistic(scenario, seeds)
-    felt = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
-    leaked = felt - np.stack([batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1)
-    heard = OracleSignals(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
+    readings = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
+    leaked = readings - np.stack(
+        [batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1
+    )
+    oracle_signals = OracleSignals(
+        batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, readings
+    )
     known = [vehicle.wheel_radius / car.vehicle.wheel_radius - 1.0 for vehicle in batch.vehicles]
-    return np.array([_oracle_speed_rmse(heard, n, rho) for n, rho in enumerate(known)])
+    return np.array([_oracle_speed_rmse(oracle_signals, n, rho) for n, rho in enumerate(known)])
 
 
-def _oracle_speed_rmse(heard: OracleSignals, n: int, rho: float) -> float:
+def _oracle_speed_rmse(signals: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
     `rho` is the true relative error of the wheel radius, unknown to the oracle (ideal observer).
     After each second, the oracle estimates this error from all readings so far, and corrects the
     wheel speeds by its estimate.
     """
-    batch = heard.batch
+    batch = signals.batch
     car = PAPERS["002.sine"].vehicle
     v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))
     dt = float(batch.t[1, n] - batch.t[0, n])
     wheels = (1.0 + rho) * v
     slipping = vy - car.vehicle.cg_to_rear_axle * r
-    across = batch.signals[:, n, S.AY] - heard.felt[:, 1] + (v - wheels) * r
-    along = batch.signals[:, n, S.AX] - heard.felt[:, 0] + np.gradient(v - wheels, dt)
+    across = batch.signals[:, n, S.AY] - signals.body_acceleration[:, 1] + (v - wheels) * r
+    along = (
+        batch.signals[:, n, S.AX] - signals.body_acceleration[:, 0] + np.gradient(v - wheels, dt)
+    )
     none = np.zeros_like(v)
     one = np.ones_like(v)
-    rolling = (heard.rolled, car.roll_leak * np.gradient(heard.rolled, dt))
+    rolling = (signals.rolled, car.roll_leak * np.gradient(signals.rolled, dt))
     sideways = np.stack([-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1)
     ahead = np.stack(
-        [-np.gradient(wheels, dt), none, none, r * slipping, none, heard.pitched, one], axis=1
+        [-np.gradient(wheels, dt), none, none, r * slipping, none, signals.pitched, one], axis=1
     )
     white, offset = SENSORS[USUAL].acceleration
     std = np.array(

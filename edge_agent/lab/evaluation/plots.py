@@ -163,8 +163,8 @@ def _draw_rough_car(world: RealWorldResults, path: Path) -> Path:
     axes[3].legend(fontsize="x-small", ncols=3)
     axes[1].legend(fontsize="x-small")
     for flag in Health:
-        if flag and (when := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
-            axes[4].plot(t[when], [flag.name] * int(when.sum()), "|")
+        if flag and (is_set := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
+            axes[4].plot(t[is_set], [flag.name] * int(is_set.sum()), "|")
     axes[0].set(
         ylabel="v_x [m/s]",
         title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.reported))}",
@@ -352,14 +352,14 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
                         color=colour,
                         label=f"{name}, {road}",
                     )
-            told = (
+            point = (
                 values.get(f"passes.{road}.short.{kind}"),
                 values.get(f"false_events.short.{kind}"),
             )
-            if None not in told:
+            if None not in point:
                 axis.plot(
-                    told[1],
-                    told[0],
+                    point[1],
+                    point[0],
                     "*",
                     ms=11,
                     color=estimator.colour,

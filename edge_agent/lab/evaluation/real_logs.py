@@ -196,7 +196,7 @@ def judge_estimates(
         adopted.vehicle.wheel_radius * np.median(wheels, axis=1) > MOVING_M_S
     )
     width = values[:, Column.MU_UPPER] - values[:, Column.MU_LOWER]
-    told = moving & (width < INFORMATIVE * float(width[0]))
+    is_informative = moving & (width < INFORMATIVE * float(width[0]))
     least = known_friction(t, signals, moving, known)
     met = values[:, Column.MU_UPPER] >= least - MARGIN
     exact = np.isfinite(truth["mu"])
@@ -216,8 +216,8 @@ def judge_estimates(
         name=name,
         seconds=float(t[-1] - t[0]),
         passed=adopted.diagnosis.is_passed,
-        informative=share_of(told, moving),
-        right=share_of(right, told),
+        informative=share_of(is_informative, moving),
+        right=share_of(right, is_informative),
         ice=share_of(values[:, Column.P_SLIPPERY] > CALLED_SHARE, moving & grips),
         contradicted=share_of(contradicted, moving),
         urgent_per_hour=math.nan if urgent is None or hours == 0.0 else urgent / hours,
@@ -246,15 +246,15 @@ def known_friction(
     )
     used = np.hypot(along, across)[np.interp(at, t, moving.astype(float)) > 0.5] / GRAVITY
     used = used[np.isfinite(used)]
-    felt = float(np.percentile(used, USED_SHARE)) if len(used) else 0.0
-    return max(felt, CERTAIN * known if known is not None else 0.0)
+    used_friction = float(np.percentile(used, USED_SHARE)) if len(used) else 0.0
+    return max(used_friction, CERTAIN * known if known is not None else 0.0)
 
 
-def share_of(what: BoolArray, among: BoolArray) -> float:
-    """Return the share of samples in which the mask `what` (T,) is True, among those that the mask
-    `among` (T,) selects; NaN if no sample is selected.
+def share_of(mask: BoolArray, among: BoolArray) -> float:
+    """Return the share of samples in which `mask` (T,) is True, among those that the mask `among`
+    (T,) selects; NaN if no sample is selected.
     """
-    return float(np.mean(what[among])) if among.any() else math.nan
+    return float(np.mean(mask[among])) if among.any() else math.nan
 
 
 def root_mean_square(error: FloatArray, among: BoolArray) -> float:
@@ -274,8 +274,12 @@ def summarise(found: Sequence[LogFigures]) -> list[Figure]:
 
     def mean(name: str) -> float:
         column = np.array([getattr(log, name) for log in found])
-        told = np.isfinite(column)
-        return float(np.average(column[told], weights=seconds[told])) if told.any() else math.nan
+        is_finite = np.isfinite(column)
+        return (
+            float(np.average(column[is_finite], weights=seconds[is_finite]))
+            if is_finite.any()
+            else math.nan
+        )
 
     def worst(name: str) -> float:
         column = [getattr(log, name) for log in found if math.isfinite(getattr(log, name))]

@@ -87,10 +87,10 @@ class Tally:
         """Add values (T, N) to the mean of the measure called `name`. If the mask `among` (T, N) is
         given, only values where `among` is True are added. NaN values are left out.
         """
-        taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
-        taken = taken[np.isfinite(taken)]
-        self.total[name] = self.total.get(name, 0.0) + float(taken.sum())
-        self.count[name] = self.count.get(name, 0) + taken.size
+        selected = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
+        selected = selected[np.isfinite(selected)]
+        self.total[name] = self.total.get(name, 0.0) + float(selected.sum())
+        self.count[name] = self.count.get(name, 0) + selected.size
 
     def means(self) -> dict[str, float]:
         """Return the mean of the values added under each name; NaN without values.

@@ -122,15 +122,15 @@ def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
         middle = _median(found, count)
         most = found[:count].max()
         least = found[:count].min()
-        wanted = most if ax < -BRAKING else least if ax > BRAKING else middle
+        target = most if ax < -BRAKING else least if ax > BRAKING else middle
         if not begun:
             speed = middle
             begun = True
-        speed = min(max(wanted, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
-        alike = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(
+        speed = min(max(target, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
+        agrees = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(
             speed, SLOWEST
         )
-        agreed = agreed + period if alike else 0.0
+        agreed = agreed + period if agrees else 0.0
         if agreed > AGREE_S:
             speed = middle
         v = max(speed, SLOWEST)

@@ -198,8 +198,12 @@ def ratio(scores: Scores, name: str) -> float:
     divided by that of another variant. RATIOS states the two variants; the result is NaN if either
     was not measured.
     """
-    over, under = (scores.get(way) for way in RATIOS[name])
-    return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan
+    numerator, denominator = (scores.get(way) for way in RATIOS[name])
+    return (
+        float(numerator["all"].mean() / denominator["all"].mean())
+        if numerator and denominator
+        else math.nan
+    )
 
 
 def figures(scores: Scores) -> list[Figure]:
@@ -212,13 +216,13 @@ def figures(scores: Scores) -> list[Figure]:
         if not {over, under} <= set(scores):
             continue
         ratios = {key: scores[over][key] / scores[under][key] for key in scores[over]}
-        apart = scores[over]["all"] - scores[under]["all"]
-        listed.append(Figure(f"{name}.difference", float(apart.mean()), "1"))
-        if len(apart) > 1:
-            error = float(np.std(apart, ddof=1) / math.sqrt(len(apart)))
+        difference = scores[over]["all"] - scores[under]["all"]
+        listed.append(Figure(f"{name}.difference", float(difference.mean()), "1"))
+        if len(difference) > 1:
+            error = float(np.std(difference, ddof=1) / math.sqrt(len(difference)))
             listed.append(Figure(f"{name}.difference.se", error, "1"))
             listed.append(Figure(f"{name}.sd", float(np.std(ratios["all"], ddof=1)), "1"))
-            listed.append(Figure(f"{name}.wins", float((apart < 0.0).mean()), "1"))
+            listed.append(Figure(f"{name}.wins", float((difference < 0.0).mean()), "1"))
         listed += [
             Figure(f"{name}.{key}", float(np.nanmean(found)), "1")
             for key, found in ratios.items()
@@ -261,8 +265,8 @@ def comparison_table(values: dict[str, float]) -> str:
         if f"{name}.difference.se" not in values:
             continue
         error = values[f"{name}.difference.se"]
-        apart = f"{values[f'{name}.difference']:.4f} ± {error:.4f}"
-        cells = (f"`{name}`", f"{over}, {under}", f"{values[name]:.3f}", apart)
+        difference = f"{values[f'{name}.difference']:.4f} ± {error:.4f}"
+        cells = (f"`{name}`", f"{over}, {under}", f"{values[name]:.3f}", difference)
         lines.append(f"| {' | '.join(cells)} | {values[f'{name}.wins']:.2f} |")
     return "\n".join(lines)
 

@@ -80,10 +80,10 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
     x[Motion.ESC_LEFT] = max(x[Motion.ESC_LEFT] - dt, 0.0)
     unit = p[Parameter.MASS] * GRAVITY * p[Parameter.RADIUS]
-    wheel, wanted = stabilise(x, p, u, dt)
+    wheel, esc_brake_ratio = stabilise(x, p, u, dt)
     traction_active = cut_drive(x, p, u, w, dt)
     for i in range(4):
-        target = wanted * unit if i == wheel else 0.0
+        target = esc_brake_ratio * unit if i == wheel else 0.0
         if traction_active and spin_excess(x, p, w, i) > MUCH and u[Control.DRIVE, i] > 0.0:
             target = max(target, TCS_BRAKE * unit)
         step = HELD_RATE * unit * dt
@@ -103,23 +103,23 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
     which is changed, `p` the vehicle's parameters, `u` the inputs and `w` the forces and slips of
     the wheels.
     """
-    asked = u[Control.BRAKE, i] + x[Motion.HELD + i]
+    demanded = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
     slip = w[Wheel.SLIP, i]
     pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
-    if asked <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
+    if demanded <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
         x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
     elif slip < -limit:
-        now = asked if x[Motion.LIMIT + i] <= 0.0 else min(x[Motion.LIMIT + i], asked)
+        now = demanded if x[Motion.LIMIT + i] <= 0.0 else min(x[Motion.LIMIT + i], demanded)
         if x[Motion.PEAK + i] <= 0.0:
             x[Motion.PEAK + i] = now
-        x[Motion.LIMIT + i] = max(now * math.exp(-DUMP * pace), LEAST_SHARE * asked)
+        x[Motion.LIMIT + i] = max(now * math.exp(-DUMP * pace), LEAST_SHARE * demanded)
         x[Motion.ABS_LEFT] = SHOWN_S
     elif x[Motion.LIMIT + i] > 0.0 and slip > -0.5 * limit:
         fast = x[Motion.LIMIT + i] < NEARLY * abs(x[Motion.PEAK + i])
         x[Motion.LIMIT + i] *= math.exp((BUILD_FAST if fast else BUILD) * pace)
         x[Motion.PEAK + i] = -abs(x[Motion.PEAK + i])
-        if x[Motion.LIMIT + i] >= asked:
+        if x[Motion.LIMIT + i] >= demanded:
             x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
 
 
@@ -173,17 +173,17 @@ def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[i
         return -1, 0.0
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     steer = 0.5 * (u[Control.STEER, 0] + u[Control.STEER, 1])
-    asked = vx * math.tan(steer) / (base * (1.0 + (vx / CHARACTERISTIC) ** 2))
-    asked = min(max(asked, -MOST_LATERAL / vx), MOST_LATERAL / vx)
-    x[Motion.ASKED] += (asked - x[Motion.ASKED]) * -math.expm1(-dt / FOLLOWS_S)
-    asked = x[Motion.ASKED]
-    off = r - asked
-    beyond = abs(off) - YAW_OFF - YAW_SHARE * abs(asked)
+    target_rate = vx * math.tan(steer) / (base * (1.0 + (vx / CHARACTERISTIC) ** 2))
+    target_rate = min(max(target_rate, -MOST_LATERAL / vx), MOST_LATERAL / vx)
+    x[Motion.ASKED] += (target_rate - x[Motion.ASKED]) * -math.expm1(-dt / FOLLOWS_S)
+    target_rate = x[Motion.ASKED]
+    off = r - target_rate
+    beyond = abs(off) - YAW_OFF - YAW_SHARE * abs(target_rate)
     x[Motion.DEVIATES] = x[Motion.DEVIATES] + dt if beyond > 0.0 else 0.0
     if x[Motion.DEVIATES] < ESC_S:
         return -1, 0.0
     x[Motion.ESC_LEFT] = SHOWN_S
-    turns_too_much = off * asked > 0.0 or abs(r) > abs(asked)
+    turns_too_much = off * target_rate > 0.0 or abs(r) > abs(target_rate)
     right_side = 1 if off > 0.0 else 0
     wheel = right_side if turns_too_much else 2 + right_side
     return wheel, min(ESC_GAIN * beyond, ESC_BRAKE if turns_too_much else ESC_REAR)

@@ -290,16 +290,18 @@ def wished_acceleration(
     last = lanes[1][lane] + lanes[2][lane] - 1
     stays = lanes[1][lane] <= row <= last
     here = lanes[0][lanes[1][lane] + g[Route.POINT], LanePoint.PROFILE + g[Route.WAY]]
-    there = (
+    squared_speed_ahead = (
         lanes[0][row, LanePoint.PROFILE + g[Route.WAY]]
         if stays
         else min(here, lanes[0][row, LanePoint.PROFILE])
     )
     if stays and row < last:
-        there += (
-            (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
+        squared_speed_ahead += (
+            (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - squared_speed_ahead)
+            * beyond
+            / lanes[3][lane]
         )
-    aim = min(q * there, cruise(d) ** 2)
+    aim = min(q * squared_speed_ahead, cruise(d) ** 2)
     if heeds_warning(d):
         aim = min(
             aim,

@@ -56,34 +56,34 @@ in place; `when` (T,), which is True during the fault; and the size of the fault
 """
 
 
-def drop_readings(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Apply the fault "no reading": replace a channel's readings with NaN where `when` (T,) is
+def drop_readings(values: FloatArray, affected: BoolArray, _size: float) -> None:
+    """Apply the fault "no reading": replace a channel's readings with NaN where `affected` (T,) is
     True.
     """
-    values[when] = np.nan
+    values[affected] = np.nan
 
 
-def hold_reading(values: FloatArray, when: BoolArray, _size: float) -> None:
-    """Apply the fault "frozen": replace a channel's readings where `when` (T,) is True with the
+def hold_reading(values: FloatArray, affected: BoolArray, _size: float) -> None:
+    """Apply the fault "frozen": replace a channel's readings where `affected` (T,) is True with the
     last reading before the fault.
     """
-    if when.any():
-        first = int(np.argmax(when))
-        values[when] = values[max(first - 1, 0)]
+    if affected.any():
+        first = int(np.argmax(affected))
+        values[affected] = values[max(first - 1, 0)]
 
 
-def add_spikes(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Apply the fault "spikes": add `size` to every tenth reading of a channel where `when` (T,) is
-    True.
+def add_spikes(values: FloatArray, affected: BoolArray, size: float) -> None:
+    """Apply the fault "spikes": add `size` to every tenth reading of a channel where `affected`
+    (T,) is True.
     """
-    values[np.flatnonzero(when)[::10]] += size
+    values[np.flatnonzero(affected)[::10]] += size
 
 
-def add_bias(values: FloatArray, when: BoolArray, size: float) -> None:
-    """Apply the fault "offset": add the constant `size` to a channel's readings where `when` (T,)
-    is True.
+def add_bias(values: FloatArray, affected: BoolArray, size: float) -> None:
+    """Apply the fault "offset": add the constant `size` to a channel's readings where `affected`
+    (T,) is True.
     """
-    values[when] += size
+    values[affected] += size
 
 
 FAULTS: Final[dict[str, Effect]] = {
@@ -101,7 +101,7 @@ def apply_faults(t: FloatArray, signals: FloatArray, faults: tuple[Fault, ...]) 
     """
     faulty = signals.copy()
     for fault in faults:
-        when = (t >= fault.start) & (t < fault.end)
+        affected = (t >= fault.start) & (t < fault.end)
         for i in fault.indices:
-            FAULTS[fault.kind](faulty[:, i], when, fault.size)
+            FAULTS[fault.kind](faulty[:, i], affected, fault.size)
     return faulty

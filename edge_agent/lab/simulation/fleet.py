@@ -237,7 +237,7 @@ class SimulatedFleet:
         self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
         self._states[1][:, Driver.CROSS_SLOPE] = self.scenario.relief.crossfall
         # Earlier records, which sensors with late clocks still report.
-        self._before = np.empty((0, vehicles, RECORD))
+        self._previous_records = np.empty((0, vehicles, RECORD))
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table
         self._surface = self.scenario.relief.surface_table
@@ -260,12 +260,12 @@ class SimulatedFleet:
         samples = (self._next, steps)
         records = run(self._states, self._parameters, ground, self._keys, samples, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
-        known = np.concatenate([self._before, records])
-        lead = len(self._before)
+        known = np.concatenate([self._previous_records, records])
+        lead = len(self._previous_records)
         clock = (self._next, self.rate_hz, lead)
         signals = sense(known, self._errors, self._wander, place, self._noise, clock)
         memory = memory_of(self._errors[:, ErrorColumn.MOUNTED :], self.rate_hz)
-        self._before = known[len(known) - min(memory, len(known)) :]
+        self._previous_records = known[len(known) - min(memory, len(known)) :]
         t = np.repeat(
             (np.arange(self._next, self._next + steps) / self.rate_hz)[:, None],
             len(self.names),

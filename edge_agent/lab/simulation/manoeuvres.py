@@ -275,10 +275,10 @@ def pulses(now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) that alternate two seconds of
     acceleration with two seconds of braking, while weaving slightly, as in town traffic.
     """
-    wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
+    acceleration = 2.5 if now.t % 4.0 < 2.0 else -2.5
     return 0.03 * math.sin(
         2.0 * now.t
-    ), wanted if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
+    ), acceleration if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
 
 
 def standing(_now: Moment) -> tuple[float, float]:

@@ -75,14 +75,16 @@ def at_rest() -> FloatArray:
 
 
 @compiled
-def turn_motor(state: FloatArray, motor: Pmsm, wanted: float, omega: float, dt: float) -> float:
+def turn_motor(
+    state: FloatArray, motor: Pmsm, demanded_torque: float, omega: float, dt: float
+) -> float:
     """Advance one motor's state (4,) by `dt` [s] at wheel speed `omega` [rad/s]; return its torque
     at the wheel [N m].
 
-    `wanted` is the demanded torque at the wheel [N m].
+    `demanded_torque` is the demanded torque at the wheel [N m].
     """
     per_ampere = 1.5 * motor.pole_pairs * motor.flux
-    aim = wanted / (motor.gear * per_ampere)
+    aim = demanded_torque / (motor.gear * per_ampere)
     electrical = motor.pole_pairs * motor.gear * omega
     count = max(1, math.ceil(dt / STEP_S - 1e-9))
     step = dt / count

@@ -270,9 +270,11 @@ def turn_wheels(
         damping = radius * w[Wheel.SLOPE, i]
         smooth = p[TrueParameter.ABS_HZ] <= 0.0
         if smooth and slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
-            asked = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
+            demanded_torque = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
             damping += (
-                asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+                demanded_torque
+                * radius
+                / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
             )
         if abs(omega) < BRAKED:
             damping += u[Control.BRAKE, i] / BRAKED

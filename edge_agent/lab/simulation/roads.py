@@ -247,7 +247,10 @@ def network_of(
     for k in range(roads, len(lanes)):
         limits[k] = np.minimum(limits[k], YIELD_M)
     if allowed is not None:
-        limits = [np.minimum(own, given) for own, given in zip(limits, allowed, strict=True)]
+        limits = [
+            np.minimum(own, allowed_limit)
+            for own, allowed_limit in zip(limits, allowed, strict=True)
+        ]
     _plan_speeds(tables, limits, ways, spacing)
     return Network(np.concatenate(tables), np.cumsum(size) - size, size, spacing, onward, roads)
 

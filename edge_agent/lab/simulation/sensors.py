@@ -211,9 +211,9 @@ def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: 
     `place` is (latitude and longitude of the origin [deg], degrees per metre north, degrees per
     metre east).
     """
-    felt = error[ErrorColumn.LEAK] > 0.0
-    signals[S.AX] = record[RecordColumn.AX_FELT] if felt else record[RecordColumn.AX]
-    signals[S.AY] = record[RecordColumn.AY_FELT] if felt else record[RecordColumn.AY]
+    has_leak = error[ErrorColumn.LEAK] > 0.0
+    signals[S.AX] = record[RecordColumn.AX_FELT] if has_leak else record[RecordColumn.AX]
+    signals[S.AY] = record[RecordColumn.AY_FELT] if has_leak else record[RecordColumn.AY]
     signals[S.YAW_RATE] = record[RecordColumn.YAW_RATE]
     for i in range(4):
         signals[S.DELTA + i] = record[RecordColumn.DELTA + i]

@@ -226,17 +226,19 @@ def _drive_manoeuvre(
             # In a standing car, the driver has pressed the pedal before the drive begins.
             force = float(p[Parameter.MASS]) * acceleration
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
-        wanted = float(p[Parameter.MASS]) * acceleration
-        force += (wanted - force) * (1.0 if truth.motors else -math.expm1(-dt / PEDAL_LAG_S))
+        demanded_force = float(p[Parameter.MASS]) * acceleration
+        force += (demanded_force - force) * (
+            1.0 if truth.motors else -math.expm1(-dt / PEDAL_LAG_S)
+        )
         force = min(force, strongest_pull(p, float(x[Motion.VX])))
         command(p, u, steer, force)
         if p[TrueParameter.REGENERATION] > 0.0:
             regenerate(x, p, u)
         if truth.motors is not None:
             for i in range(4):
-                asked = float(u[Control.DRIVE, i] - u[Control.BRAKE, i])
+                demanded_torque = float(u[Control.DRIVE, i] - u[Control.BRAKE, i])
                 u[Control.DRIVE, i] = turn_motor(
-                    currents[i], truth.motors, asked, float(x[Motion.OMEGA + i]), dt
+                    currents[i], truth.motors, demanded_torque, float(x[Motion.OMEGA + i]), dt
                 )
                 u[Control.BRAKE, i] = 0.0
         velocity = ground_velocity(x)

@@ -24,11 +24,11 @@ def scheduled_variance(t: FloatArray) -> FloatArray:
     return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
 
 
-def on_ay(t: FloatArray, others: float) -> FloatArray:
+def on_ay(t: FloatArray, other_variance: float) -> FloatArray:
     """Return noise variances (T, 3) of a_x, a_y and yaw rate [SI units squared] at the times t
-    (T,): according to SCHEDULE for a_y, and the constant `others` for the other two.
+    (T,): according to SCHEDULE for a_y, and the constant `other_variance` for the other two.
     """
-    variance = np.full((len(t), 3), others)
+    variance = np.full((len(t), 3), other_variance)
     variance[:, 1] = scheduled_variance(t)
     return variance
 

@@ -98,8 +98,8 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
     """
     vertices = len(reachable)
     p = retrace ** (1.0 / vertices)
-    others = np.maximum(reachable.sum(axis=1, keepdims=True) - 1, 1)
-    lowest: FloatArray = np.minimum(HIGHEST * (1.0 - p) / (others * p), HIGHEST)
+    other_count = np.maximum(reachable.sum(axis=1, keepdims=True) - 1, 1)
+    lowest: FloatArray = np.minimum(HIGHEST * (1.0 - p) / (other_count * p), HIGHEST)
     return lowest
 
 

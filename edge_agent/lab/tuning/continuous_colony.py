@@ -189,8 +189,8 @@ def _next_vector(
     scale = habits.greed * habits.archive
     weight = np.exp(-0.5 * (np.arange(len(ranked)) / scale) ** 2)
     chosen = int(rng.choice(len(ranked), p=weight / weight.sum()))
-    apart = np.abs(ranked - ranked[chosen]).sum(axis=0) / (len(ranked) - 1)
-    sigma = np.maximum(habits.spread * apart, LEAST_SPREAD * (tally.upper - tally.lower))
+    mean_distance = np.abs(ranked - ranked[chosen]).sum(axis=0) / (len(ranked) - 1)
+    sigma = np.maximum(habits.spread * mean_distance, LEAST_SPREAD * (tally.upper - tally.lower))
     for _ in range(REDRAWS):
         vector = tally.fit(rng.normal(ranked[chosen], sigma))
         if tally.problem.admissible(vector):

@@ -39,12 +39,12 @@ def optimise(
         found = []
         for _one in range(ants):
             child = parent if tally.count == 0 else _mutate_vector(tally, parent, step, rng)
-            got = tally.evaluate(child)
-            found.append(got)
-            success = got >= value
+            score = tally.evaluate(child)
+            found.append(score)
+            success = score >= value
             if success:
                 parent = child
-                value = got
+                value = score
             step *= GROWTH if success else GROWTH**-0.25
             step = min(step, 1.0)
         tally.record(found, progress)

@@ -278,13 +278,13 @@ def detection_scores(
     score = interval_score(lower, upper, truth)
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
     called = upper < SLIPPERY_MU
-    felt = (truth < SLIPPERY_MU - SURE_MARGIN) & (used >= FELT_SHARE)
+    is_noticeable = (truth < SLIPPERY_MU - SURE_MARGIN) & (used >= FELT_SHARE)
     return {
         "surface_score": float(
             np.mean([score[met].mean() for met in surfaces if met.any()] or [np.nan])
         ),
         "false_ice": _share(called, truth > SURFACES["wet"][0]),
-        "missed_ice": _share(~called, felt),
+        "missed_ice": _share(~called, is_noticeable),
     }
 
 

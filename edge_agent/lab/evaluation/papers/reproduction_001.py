@@ -132,8 +132,8 @@ def _table_rows(
     rows = []
     place = 0 if name == "improved" else 1
     prefix = "" if name == "improved" else "fkf."
-    ours = matched.values(name)
-    elsewhere = own.values(name)
+    matched_values = matched.values(name)
+    own_values = own.values(name)
     for measure, printed in PRINTED.items():
         for key, numbers in printed.items():
             full = f"{measure}_{key}"
@@ -142,8 +142,8 @@ def _table_rows(
                     f"{prefix}{full}",
                     f"{measure.upper()} {NAMES[key]}",
                     numbers[place],
-                    ours[full],
-                    elsewhere[full],
+                    matched_values[full],
+                    own_values[full],
                     real.get(full, NONE),
                     default.get(full, NONE),
                 )

@@ -217,8 +217,8 @@ def _table_rows(
     rows = []
     units = {"v_x": " [m/s]", "v_y": " [m/s]", "β": " [rad]"} if measure == "erms" else {}
     for stage, place in (("B", 1), ("A", 0)):
-        ours = getattr(run, measure)(stage)
-        elsewhere = getattr(own, measure)(stage)
+        run_values = getattr(run, measure)(stage)
+        own_values = getattr(own, measure)(stage)
         for name, numbers in PRINTED[drive][measure].items():
             force = name in FORCES
             label = "TFC" if force and stage == "B" else f"WCKF-{stage}"
@@ -231,8 +231,8 @@ def _table_rows(
                     f"{drive}.{label.lower()}.{measure}_{short}",
                     f"{label}, {name}{unit}",
                     numbers[place],
-                    ours[name],
-                    elsewhere[name],
+                    run_values[name],
+                    own_values[name],
                     real[0].get(key, NONE),
                     real[1].get(key, NONE),
                     bar=bar,

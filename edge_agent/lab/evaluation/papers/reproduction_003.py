@@ -113,8 +113,8 @@ def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
     true motion.
     """
     batch = ideal(spec)
-    given = given_motion(batch, spec.vehicle)
-    return CaseRuns(batch, {name: estimate(given, setting) for name, setting in filters.items()})
+    motion = given_motion(batch, spec.vehicle)
+    return CaseRuns(batch, {name: estimate(motion, setting) for name, setting in filters.items()})
 
 
 def reproduce(seeds: Sequence[int]) -> Reproduction:
@@ -293,21 +293,21 @@ def _ablation_rows() -> tuple[PaperRow, ...]:
 def _sensor_errors() -> tuple[PaperRow, ...]:
     spec = MATCHED["003.split"]
     batch = ideal(spec)
-    given = given_motion(batch, spec.vehicle)
+    motion = given_motion(batch, spec.vehicle)
     rows = []
     for name, what, omega in (
         (
             "noise",
             f"wheel speed noise {WHEEL_SPEED_NOISE:g} rad/s, MAE μ",
-            _add_noise(given.signals),
+            _add_noise(motion.signals),
         ),
         (
             "radius",
             f"wheel radius off by {WHEEL_RADIUS_ERROR:g}, MAE μ",
-            _scale_radius(given.signals),
+            _scale_radius(motion.signals),
         ),
     ):
-        run = estimate(replace(given, signals=omega), AS_PRINTED)
+        run = estimate(replace(motion, signals=omega), AS_PRINTED)
         error = float(np.abs(run.mu - batch.mu_wheel[:, 0]).mean())
         rows.append(PaperRow(f"split.{name}.mae_mu", what, NONE, error))
     return tuple(rows)

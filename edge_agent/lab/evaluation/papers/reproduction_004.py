@@ -73,10 +73,10 @@ class NoisyRun:
             "mu": self.batch.mu
         }
         for key, true in truth.items():
-            got = getattr(self.reported[name], key)
-            found[f"mae_{key}"] = float(np.abs(got - true).mean())
-            found[f"rmse_{key}"] = float(np.sqrt(((got - true) ** 2).mean(axis=0)).mean())
-            peak = np.abs(got).max(axis=0)
+            reported = getattr(self.reported[name], key)
+            found[f"mae_{key}"] = float(np.abs(reported - true).mean())
+            found[f"rmse_{key}"] = float(np.sqrt(((reported - true) ** 2).mean(axis=0)).mean())
+            peak = np.abs(reported).max(axis=0)
             true_peak = np.abs(true).max(axis=0)
             found[f"peak_{key}"] = float((np.abs(peak - true_peak) / true_peak).mean())
         return found
