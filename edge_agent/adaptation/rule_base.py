@@ -171,10 +171,10 @@ def evidence_share(
         for fresh in range(2):
             of_force = new if fresh == 1 else 1.0 - new
             first = 6 * sliding + fresh
-            asked = (
+            demand_share = (
                 low * rules.shares[first]
                 + middle * rules.shares[first + 2]
                 + top * rules.shares[first + 4]
             )
-            total += of_slide * of_force * asked
+            total += of_slide * of_force * demand_share
     return min(total, 0.0)

@@ -78,9 +78,9 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
         raise WireError("cell", "occurs twice", "send each cell and sector once")
     # Time at which the service made the tile. It may lie well in the past, because the answer may
     # come from a cache.
-    heard = np.minimum(last + (age * NS).astype(np.int64), now)
+    map_time = np.minimum(last + (age * NS).astype(np.int64), now)
     return tile, ReceivedCells(
-        place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard
+        place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), map_time
     )
 
 

@@ -85,35 +85,35 @@ def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
     inverse = inverse.reshape(path.places.shape)
-    there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
+    is_known = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
     # For each metre take the first place with an alert, else the first measured place, else the
     # first place of which the map knows anything.
     is_measured = found.basis[inverse] == MEASURED
-    rank = np.select([~there, found.alerted[inverse], is_measured], [3, 0, 1], default=2)
+    rank = np.select([~is_known, found.alerted[inverse], is_measured], [3, 0, 1], default=2)
     column = rank.argmin(axis=1)
     row = inverse[np.arange(len(column)), column]
-    nothing = rank.min(axis=1) == 3
+    is_unknown = rank.min(axis=1) == 3
     slippery = justifies_warning(found)
     values = (
-        np.where(nothing, np.nan, column[row])
+        np.where(is_unknown, np.nan, column[row])
         for column in (found.mu, found.mu_lower, found.mu_upper, found.p_slippery, found.age_s)
     )
     mu, lower, upper, p, age = values
-    basis = np.where(nothing, UNKNOWN, found.basis[row])
+    basis = np.where(is_unknown, UNKNOWN, found.basis[row])
     return Horizon(
         path,
-        np.where(nothing, NONE, places[row]),
+        np.where(is_unknown, NONE, places[row]),
         mu,
         lower,
         upper,
         p,
         age,
         basis,
-        np.where(nothing, False, slippery[row]),
-        np.where(nothing, False, found.alerted[row]),
+        np.where(is_unknown, False, slippery[row]),
+        np.where(is_unknown, False, found.alerted[row]),
         safe_speed(
             path.curvature,
-            np.where((basis == MEASURED) | (slippery[row] & ~nothing), lower, np.nan),
+            np.where((basis == MEASURED) | (slippery[row] & ~is_unknown), lower, np.nan),
         ),
     )
 

@@ -52,7 +52,7 @@ class ReceivedCells(NamedTuple):
     vehicles: IntArray
     last_time: IntArray  # [ns UTC] time of the last observation
     # [ns UTC] time at which the service made the tile, at most the time of receipt
-    heard: IntArray
+    map_time: IntArray
 
 
 class PlaceBelief(NamedTuple):
@@ -111,11 +111,11 @@ class LocalMap:
     """
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
-        self._most = most_cells
+        self._most_cells = most_cells
         self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
         # cells of all tiles, sorted by key; None if it must be rebuilt
-        self._all: ReceivedCells | None = NOTHING
+        self._combined: ReceivedCells | None = NOTHING
 
     @property
     def cells(self) -> int:
@@ -133,12 +133,14 @@ class LocalMap:
         removed.
         """
         before = self._tiles.pop(tile, NOTHING)
-        both = _concatenate_cells([_select_cells(before, now - before.heard < HELD_S * NS), cells])
-        latest_first = np.lexsort((both.heard, both.key))[::-1]
+        both = _concatenate_cells(
+            [_select_cells(before, now - before.map_time < HELD_S * NS), cells]
+        )
+        latest_first = np.lexsort((both.map_time, both.key))[::-1]
         _, newest = np.unique(both.key[latest_first], return_index=True)
         self._tiles[tile] = _select_cells(both, latest_first[newest])
-        self._all = None
-        while len(self._tiles) > 1 and self.cells > self._most:
+        self._combined = None
+        while len(self._tiles) > 1 and self.cells > self._most_cells:
             self._tiles.popitem(last=False)
 
     def store_alert(self, alert: Alert, now: int) -> bool:
@@ -177,10 +179,10 @@ class LocalMap:
         for tile in [
             tile
             for tile, cells in self._tiles.items()
-            if now - cells.heard.max(initial=0) > HELD_S * NS
+            if now - cells.map_time.max(initial=0) > HELD_S * NS
         ]:
             del self._tiles[tile]
-            self._all = None
+            self._combined = None
         for key in [key for key, (_, at) in self._alerts.items() if now - at > ALERT_HELD_S * NS]:
             del self._alerts[key]
 
@@ -193,23 +195,23 @@ class LocalMap:
         """
         cells = self._find_cells(key)
         alerted = self._apply_alerts(cells, now)
-        since = np.maximum(now - cells.heard, 0) / NS
-        share = -np.expm1(-since / CHANGE_S)[:, None]
+        age_s = np.maximum(now - cells.map_time, 0) / NS
+        share = -np.expm1(-age_s / CHANGE_S)[:, None]
         faded = (1.0 - share) * cells.belief + share * mugrid.PRIOR
-        there = (cells.basis != UNKNOWN) & (since <= HELD_S)
+        is_known = (cells.basis != UNKNOWN) & (age_s <= HELD_S)
         lower, mu, upper = (
-            np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
+            np.where(is_known, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
         )
         return PlaceBelief(
             key,
             np.where(cells.basis == BOUND, np.nan, mu),
             lower,
             upper,
-            np.where(there, faded @ SLIPPERY_BINS, np.nan),
-            np.where(there, np.maximum(now - cells.last_time, 0) / NS, np.nan),
-            np.where(there, cells.basis, UNKNOWN),
-            np.where(there, cells.vehicles, 0),
-            alerted & there,
+            np.where(is_known, faded @ SLIPPERY_BINS, np.nan),
+            np.where(is_known, np.maximum(now - cells.last_time, 0) / NS, np.nan),
+            np.where(is_known, cells.basis, UNKNOWN),
+            np.where(is_known, cells.vehicles, 0),
+            alerted & is_known,
         )
 
     def _apply_alerts(self, cells: ReceivedCells, now: int) -> BoolArray:
@@ -223,8 +225,8 @@ class LocalMap:
         for k in np.flatnonzero(has_alert).tolist():
             place = int(key[k])
             is_own = place in self._alerts
-            alert, heard = self._alerts[place if is_own else place ^ OTHER_WAY]
-            if now - heard > ALERT_HELD_S * NS:
+            alert, receive_time = self._alerts[place if is_own else place ^ OTHER_WAY]
+            if now - receive_time > ALERT_HELD_S * NS:
                 continue
             is_measured = cells.basis[k] == MEASURED
             # An alert of the opposite direction does not count if a vehicle has found grip on this
@@ -236,7 +238,7 @@ class LocalMap:
                 cells.belief[k] = _belief_of_alert(alert)
                 cells.basis[k] = MEASURED if is_own else BORROWED
                 cells.last_time[k] = alert.time
-                cells.heard[k] = heard
+                cells.map_time[k] = receive_time
                 cells.vehicles[k] = alert.vehicles
         return alerted
 
@@ -246,7 +248,7 @@ class LocalMap:
         the place.
         """
         cells = self._find_cells(np.array([key]))
-        if cells.basis[0] != MEASURED or now - cells.heard[0] > HELD_S * NS:
+        if cells.basis[0] != MEASURED or now - cells.map_time[0] > HELD_S * NS:
             return None
         share = -np.expm1(-max(now - int(cells.last_time[0]), 0) / NS / CHANGE_S)
         return np.asarray((1.0 - share) * cells.belief[0] + share * mugrid.PRIOR)
@@ -256,11 +258,11 @@ class LocalMap:
         return self._all_cells().key
 
     def _all_cells(self) -> ReceivedCells:
-        if self._all is None:
+        if self._combined is None:
             found = _concatenate_cells(list(self._tiles.values()))
             order = np.argsort(found.key)
-            self._all = _select_cells(found, order)
-        return self._all
+            self._combined = _select_cells(found, order)
+        return self._combined
 
     def _find_cells(self, key: IntArray) -> ReceivedCells:
         """Return a copy of the values of n places, given by their keys `key` (n,). A place without
@@ -277,7 +279,7 @@ class LocalMap:
             belief=np.where(is_known[:, None], whole.belief[row], mugrid.PRIOR),
             basis=np.where(is_known, whole.basis[row], 0),
             last_time=np.where(is_known, whole.last_time[row], 0),
-            heard=np.where(is_known, whole.heard[row], 0),
+            map_time=np.where(is_known, whole.map_time[row], 0),
             vehicles=np.where(is_known, whole.vehicles[row], 0),
         )
 

@@ -63,11 +63,9 @@ class LookoutCounts:
     busy_s: float = 0.0  # [s] processor time of the lookout's thread
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
-    def total_of(self, what: str) -> int:
-        """Return the sum of the counter `what`, such as "bytes", over the map receivers of all
-        vehicles.
-        """
-        return sum(one.counts[what] for one in self.subscribers.values())
+    def total_of(self, counter: str) -> int:
+        """Return the sum of a counter, such as "bytes", over the map receivers of all vehicles."""
+        return sum(one.counts[counter] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
         """Return the counters, by name, that the agent prints in its last line of output."""
@@ -116,7 +114,7 @@ class Lookout:
         self._number = {watcher.name: k for k, watcher in self._watchers.items()}
         self._poses: Sequence[Pose] = ()
         self._prior = MapPrior(len(names))
-        self._here = np.full((len(names), 3), np.nan)
+        self._current_grip = np.full((len(names), 3), np.nan)
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._look_loop, name="lookout", daemon=True)
@@ -168,7 +166,9 @@ class Lookout:
                 finally:
                     subscriber.map_lock().release()
         informed = self._prior.step(places, *beliefs, map_beliefs)
-        self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
+        self._current_grip = np.column_stack(
+            [mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)]
+        )
 
     def outlook(self, name: str) -> Outlook | None:
         """Return the latest outlook of the vehicle `name` (its warnings, and the map values of the
@@ -261,7 +261,7 @@ class Lookout:
             paths[0].kind,
             (*(one.warning for one in watcher.active), *ended),
             runs_of_places(horizons[0]),
-            tuple(self._here[k].tolist()),
+            tuple(self._current_grip[k].tolist()),
         )
         subscriber.follow_paths(paths, pose, length)
         outlook = watcher.outlook
@@ -276,9 +276,9 @@ def paths_ahead(
 
     `subscriber` holds the received map; the caller must hold its lock.
     """
-    given = route.ahead(pose, length) if route is not None else None
-    if given is not None:
-        return [given]
+    route_path = route.ahead(pose, length) if route is not None else None
+    if route_path is not None:
+        return [route_path]
     return ways_on(pose, subscriber.local_map.keys(), length) or [straight_path(pose, length)]
 
 

@@ -77,7 +77,7 @@ class MapSubscriber:
         self._clock = clock
         self._lock = threading.Lock()
         self._map = LocalMap()
-        self._asked = RequestLog()
+        self._requests = RequestLog()
         self._tiles = Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
@@ -134,13 +134,13 @@ class MapSubscriber:
         if is_reconnected:
             self._repeats.begin(self._clock())
         if is_reconnected or self._repeats.is_due(self._clock()):
-            self._asked.request_again()
+            self._requests.request_again()
             tiles = self._tiles.subscribed_tiles
         # Query the active alerts only after subscribing, so that no alert is missed in between.
         for tile in tiles:
             self._send_query(keys.alert_key(tile), self._on_standing)
         for path in paths:
-            for box in self._asked.missing_boxes(path, pose, within):
+            for box in self._requests.missing_boxes(path, pose, within):
                 self._query_box(box)
         with self._lock:
             self._map.drop_old(pose.time)

@@ -89,12 +89,12 @@ class Tiles:
     """
 
     def __init__(self) -> None:
-        self._wanted: dict[int, int] = {}  # tile -> last time at which it was ahead [ns UTC]
+        self._last_ahead: dict[int, int] = {}  # tile -> last time at which it was ahead [ns UTC]
 
     @property
     def subscribed_tiles(self) -> list[int]:
         """Return the map tiles to whose alerts the vehicle subscribes."""
-        return list(self._wanted)
+        return list(self._last_ahead)
 
     def update_subscriptions(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
         """Update the set of map tiles whose alerts the vehicle needs on the possible paths ahead.
@@ -107,19 +107,19 @@ class Tiles:
             ahead += _in_order(
                 grid.tile_of(grid.cell_of(*to_degrees(path.x[::STEP], path.y[::STEP], pose)))
             )
-        wanted = list(dict.fromkeys(ahead))[:MOST_TILES]
-        fresh = [tile for tile in wanted if tile not in self._wanted]
-        self._wanted |= dict.fromkeys(wanted, pose.time)
-        late = [tile for tile, at in self._wanted.items() if pose.time - at > LEAVE_S * NS]
+        needed = list(dict.fromkeys(ahead))[:MOST_TILES]
+        fresh = [tile for tile in needed if tile not in self._last_ahead]
+        self._last_ahead |= dict.fromkeys(needed, pose.time)
+        late = [tile for tile, at in self._last_ahead.items() if pose.time - at > LEAVE_S * NS]
         by_age = sorted(
             (at, tile)
-            for tile, at in self._wanted.items()
-            if tile not in late and tile not in wanted
+            for tile, at in self._last_ahead.items()
+            if tile not in late and tile not in needed
         )
-        surplus = len(self._wanted) - len(late) - MOST_TILES
+        surplus = len(self._last_ahead) - len(late) - MOST_TILES
         dropped = late + [tile for _, tile in by_age[: max(surplus, 0)]]
         for tile in dropped:
-            del self._wanted[tile]
+            del self._last_ahead[tile]
         return fresh, dropped
 
 
@@ -138,13 +138,13 @@ def _in_order(tiles: IntArray) -> list[int]:
     return list(dict.fromkeys(tiles.tolist()))
 
 
-def _split_path(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
+def _split_path(path: Path, needed: BoolArray) -> list[tuple[int, int]]:
     """Split a path ahead into parts with small bounding boxes. Return a pair (first metre, last
-    metre) per part. Together the parts contain all points where the mask `wanted` is True.
+    metre) per part. Together the parts contain all points where the mask `needed` is True.
     """
     found: list[tuple[int, int]] = []
     first = last = -1
-    for k in (np.flatnonzero(wanted) * STEP).tolist():
+    for k in (np.flatnonzero(needed) * STEP).tolist():
         if first >= 0 and _fits_box(path, first, k):
             last = k
             continue

@@ -73,8 +73,8 @@ def _remove_joining_ways(ways: list[list[int]]) -> None:
     if len(ways) == 1:
         return
     for way in reversed(ways.copy()):
-        others = [other for other in ways if other is not way]
-        if len(set(way).difference(*others)) < LEAST_OWN:
+        other_ways = [other for other in ways if other is not way]
+        if len(set(way).difference(*other_ways)) < LEAST_OWN:
             ways.remove(way)
 
 

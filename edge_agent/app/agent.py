@@ -172,9 +172,9 @@ class Agent:
             options.config,
         )
         events = event_logger("agent", options.config.log, sys.stderr)
-        who = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
+        label = options.names[0] if len(options.names) == 1 else f"{len(options.names)} vehicles"
         events.info(
-            f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s; records wait in "
+            f"{label}: driving; a line of counts every {STATUS_EVERY_S:.0f} s; records wait in "
             f"{publisher.status.outbox_path} until they are acknowledged",
             extra=values(
                 event="ready", vehicles=len(options.names), outbox=str(publisher.status.outbox_path)

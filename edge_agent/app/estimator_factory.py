@@ -19,11 +19,11 @@ def known_estimators() -> dict[str, str]:
     """Return a dictionary from the name of each estimator to a one-line description. Estimators of
     other installed packages are included.
     """
-    others = {
+    plugin_estimators = {
         name: f"from {point.value}"
         for name, point in plugins.entry_points_of(plugins.ESTIMATORS).items()
     }
-    return others | ESTIMATORS
+    return plugin_estimators | ESTIMATORS
 
 
 def bank_of(
@@ -43,8 +43,8 @@ def bank_of(
     """
     estimator, _, own = estimator.partition("@")
     if own and own not in plugins.entry_points_of(plugins.TYRE_CURVES):
-        others = ", ".join(plugins.entry_points_of(plugins.TYRE_CURVES)) or "none is installed"
-        raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of {others}")
+        curve_names = ", ".join(plugins.entry_points_of(plugins.TYRE_CURVES)) or "none is installed"
+        raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of {curve_names}")
     curve = plugins.load_entry_point(plugins.TYRE_CURVES, own) if own else None
     if estimator not in ESTIMATORS and estimator in plugins.entry_points_of(plugins.ESTIMATORS):
         if memberships is not None:

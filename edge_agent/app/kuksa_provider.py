@@ -65,7 +65,7 @@ class KuksaProvider:
         self.written = 0
         self.refused = 0
         self._connection = BrokerConnection(text, f"{host}:{port or PORT}", files)
-        self._unknown: set[str] = set()
+        self._unknown_paths: set[str] = set()
         self._problem = ""
         self._latest: tuple[Mapping[str, float], int] | None = None
         self._changed = threading.Condition()
@@ -115,7 +115,9 @@ class KuksaProvider:
         }
         values[CONDITION] = messages.Value(string=surface_condition(signals))
         for path, value in values.items():
-            if path not in self._unknown and not self._write_one(publish, path, value, time_ns):
+            if path not in self._unknown_paths and not self._write_one(
+                publish, path, value, time_ns
+            ):
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
@@ -134,7 +136,7 @@ class KuksaProvider:
         except grpc.RpcError as error:
             code = error.code()
             if code in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT):
-                self._unknown.add(path)
+                self._unknown_paths.add(path)
                 log.warning("the databroker rejects %s: %s", path, error.details())
             else:
                 self._log_problem(f"{code.name}: {error.details()}")

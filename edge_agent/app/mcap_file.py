@@ -57,11 +57,13 @@ class McapTableWriter:
     def write_table(self, table: pa.Table) -> None:
         """Write each row of a table of estimates as one JSON message of the MCAP file."""
         for row in table.to_pylist():
-            told = {
+            values = {
                 name: value
                 for name, value in row.items()
                 if value is not None and math.isfinite(value)
             }
             at = max(round(row["t"] * NS), 0)
-            self._writer.add_message(self._channel, at, json.dumps(told).encode(), at, self._count)
+            self._writer.add_message(
+                self._channel, at, json.dumps(values).encode(), at, self._count
+            )
             self._count += 1

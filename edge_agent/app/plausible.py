@@ -55,7 +55,7 @@ class Plausibility:
     resets: int = 0
     violations: int = 0
     excited: int = 0
-    away: list[FloatArray] = field(default_factory=list)
+    speed_errors: list[FloatArray] = field(default_factory=list)
 
     def add(self, t: FloatArray, signals: FloatArray, estimates: Estimates) -> None:
         """Add a block of samples of the replayed log: t (T, 1), signals (T, 1, 18) and the
@@ -66,7 +66,7 @@ class Plausibility:
         speed = np.full(len(wheels), np.nan)
         speed[some] = np.nanmedian(wheels[some], axis=1) * self.radius
         fast = speed > LEAST_SPEED
-        self.away.append(np.abs(estimates.vx[fast, 0] - speed[fast]) / speed[fast])
+        self.speed_errors.append(np.abs(estimates.vx[fast, 0] - speed[fast]) / speed[fast])
         health = np.asarray(estimates.health[:, 0], dtype=np.int64)
         self.sliding += int(np.sum(health & Health.SLIDING != 0))
         self.resets += int(np.sum(health & Health.RESET != 0))
@@ -89,8 +89,8 @@ class Plausibility:
         """Return the median relative difference [1] between the estimated forward speed and the
         wheels' speed; 0 if the car never drove fast enough for a comparison.
         """
-        away = np.concatenate(self.away) if self.away else np.zeros(0)
-        return float(np.median(away)) if len(away) else 0.0
+        speed_errors = np.concatenate(self.speed_errors) if self.speed_errors else np.zeros(0)
+        return float(np.median(speed_errors)) if len(speed_errors) else 0.0
 
     def problems(self) -> list[str]:
         """Return one message per reason for which the estimates are implausible; an empty list

@@ -86,10 +86,10 @@ def _store_drive(drive: DriveBatches, outbox: Outbox, counts: Counts) -> None:
 
 
 def close_publisher(
-    publisher: Publisher, progress: Progress, drain_s: float, **more: float
+    publisher: Publisher, progress: Progress, drain_s: float, **extra_values: float
 ) -> None:
     """Wait at most `drain_s` seconds until the service has acknowledged the sent records, and close
-    the publisher. Print the counts of records and the additional values `more` as one line of JSON
+    the publisher. Print the counts of records and the values `extra_values` as one line of JSON
     on stdout.
 
     Records without an acknowledgement stay in the outbox (store on disk) and are sent after the
@@ -130,7 +130,7 @@ def close_publisher(
             "warning: a session did not close in time; exiting without closing it", sys.stderr
         )
         left_behind.set()
-    print(json.dumps(final_counts(progress, publisher) | more), flush=True)
+    print(json.dumps(final_counts(progress, publisher) | extra_values), flush=True)
 
 
 def print_status(progress: Progress, publisher: Publisher, events: logging.Logger) -> None:

@@ -157,7 +157,7 @@ class ReasonReporter:
         self._events = events
         self._clock = clock
         self._due: float | None = None
-        self._told: list[str] = []
+        self._last_printed: list[str] = []
 
     def print_if_due(self) -> None:
         """Print the reasons why nothing is published, if it is time for a check and the reasons
@@ -170,10 +170,10 @@ class ReasonReporter:
             return
         self._due = now + EVERY_S
         found = self._find()
-        alike = [_NUMBER.sub("", reason) for reason in found]
-        if alike == self._told:
+        without_numbers = [_NUMBER.sub("", reason) for reason in found]
+        if without_numbers == self._last_printed:
             return
-        self._told = alike
+        self._last_printed = without_numbers
         text = f"not published: {'; '.join(found)}" if found else "publishing: records are sent"
         event = "unpublished" if found else "publishing"
         self._events.info(text, extra=values(event=event, reasons=found))

@@ -78,21 +78,21 @@ class Trip:
         self._plain = vehicle.model_copy(update={"calibration": None})
         self._path = path
         self._trusted = trusted
-        self._known = _read_state(path, _car_identity(self._plain, profile))
-        learned = weigh_estimates(self._known.drives, self._plain)
+        self._saved_state = _read_state(path, _car_identity(self._plain, profile))
+        learned = weigh_estimates(self._saved_state.drives, self._plain)
         self.vehicle = vehicle.model_copy(
             update={"calibration": surer_values(vehicle.calibration, learned)}
         )
         # Blocks of the current section: t, signals, ground.
         self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        self._since = self._looked = 0.0
+        self._part_start = self._looked = 0.0
         self._faults: list[str] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
         self._looking: Future[None] | None = None
 
     def is_admitted(self) -> bool:
         """Return True if records made from the signals of this trip may be published."""
-        return self._trusted or self._known.passed
+        return self._trusted or self._saved_state.passed
 
     def health_problems(self) -> list[str]:
         """Return the reason why nothing is published, as a list; the list is empty if records are
@@ -141,9 +141,9 @@ class Trip:
     def _keep_block(self, block: Block, ground: FloatArray) -> None:
         now = float(block.t[-1, 0])
         if not self._blocks:
-            self._since = self._looked = float(block.t[0, 0])
+            self._part_start = self._looked = float(block.t[0, 0])
         self._blocks.append((block.t[:, 0], block.signals[:, 0], ground))
-        if now - self._since >= PART_S:
+        if now - self._part_start >= PART_S:
             self._start_examination(final=True)
         elif not self.is_admitted() and now - self._looked >= LOOK_S:
             self._looked = now
@@ -177,18 +177,22 @@ class Trip:
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             log.warning("a part of this trip cannot be analysed: %s", error)
             return
-        if diagnosis.is_passed and not self._known.passed:
+        if diagnosis.is_passed and not self._saved_state.passed:
             log.info(
                 "the signal doctor has passed: units, signs, clocks and offsets agree with each "
                 "other"
             )
-        passed = diagnosis.is_passed or (self._known.passed and not self._faults)
-        if estimates or passed != self._known.passed:
+        passed = diagnosis.is_passed or (self._saved_state.passed and not self._faults)
+        if estimates or passed != self._saved_state.passed:
             drives = (
-                [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
+                [*self._saved_state.drives, estimates][-MOST_DRIVES:]
+                if estimates
+                else self._saved_state.drives
             )
-            self._known = self._known.model_copy(update={"passed": passed, "drives": drives})
-            _write_state(self._path, self._known)
+            self._saved_state = self._saved_state.model_copy(
+                update={"passed": passed, "drives": drives}
+            )
+            _write_state(self._path, self._saved_state)
 
 
 def state_path_for(spool: Path, name: str) -> Path:

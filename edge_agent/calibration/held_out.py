@@ -153,11 +153,11 @@ def is_worse(tried: Sequence[Prediction], best: Sequence[Prediction]) -> bool:
     Either of two reasons suffices. The mean log-likelihood is lower by more than WORSE. Or, on at
     least one drive, the share of time with the flag CONTRADICTION is larger by more than LONGER.
     """
-    lost = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
+    lost_likelihood = _mean_prediction(best).log_likelihood - _mean_prediction(tried).log_likelihood
     longer = np.max(
         [new.contradicted - old.contradicted for new, old in zip(tried, best, strict=True)]
     )
-    return not (lost <= WORSE and bool(longer <= LONGER))
+    return not (lost_likelihood <= WORSE and bool(longer <= LONGER))
 
 
 def _mean_prediction(predictions: Sequence[Prediction]) -> Prediction:

@@ -220,9 +220,9 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
         [np.ones(int(rows.sum())), drive.wheelbase * (drive.r / fast)[rows], across[rows]], axis=1
     )
     angle = drive.delta[rows]
-    away = angle - table @ fit_robustly(table, angle)
-    spread = max(ROBUST * float(np.median(np.abs(away))), LEAST_ANGLE)
-    near = np.abs(away) <= 3.0 * spread
+    residual = angle - table @ fit_robustly(table, angle)
+    spread = max(ROBUST * float(np.median(np.abs(residual))), LEAST_ANGLE)
+    near = np.abs(residual) <= 3.0 * spread
     usual = np.array([ERRORS[name].usual for name in TRACED])
     centre = np.array([ERRORS[name].mean for name in TRACED])
     weight = 1.0 / (CORRELATED_S * RATE_HZ * spread**2)
@@ -230,10 +230,10 @@ def trace_steering(drive: EvenDrive) -> DriveEstimates:
     covariance = np.linalg.inv(information)
     found = covariance @ (weight * (table[near].T @ angle[near]) + centre / usual**2)
     std = np.sqrt(np.diag(covariance))
-    told = zip(TRACED, found.tolist(), std.tolist(), strict=True)
+    estimates = zip(TRACED, found.tolist(), std.tolist(), strict=True)
     return {
         key: value
-        for name, mean, error in told
+        for name, mean, error in estimates
         for key, value in ((name, mean), (f"{name}_std", error))
     }
 

@@ -49,8 +49,10 @@ def run(args: argparse.Namespace) -> int:
         if args.log.count(path) > 1:
             raise InputError("log", f"{path} is given twice", "give each drive once")
     drives = [_read_drive(path, vehicle, trusted=args.trust) for path in args.log]
-    alike = vehicle.model_copy(update={"wheel_radius_front": None, "wheel_radius_rear": None})
-    found = learn_validated(drives, alike, predict_drive)
+    without_radii = vehicle.model_copy(
+        update={"wheel_radius_front": None, "wheel_radius_rear": None}
+    )
+    found = learn_validated(drives, without_radii, predict_drive)
     text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
         indent=1, exclude_none=True
     )

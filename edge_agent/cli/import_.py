@@ -110,8 +110,8 @@ def _check_paths(args: argparse.Namespace) -> None:
     if args.out.resolve() in used:
         raise InputError("out", f"{args.out} is one of the recordings", "name another file")
     used[args.out.resolve()] = "the signal log"
-    if args.draft and (taken := used.get(args.draft.resolve())):
-        raise InputError("draft", f"{args.draft} is {taken}", "name another file")
+    if args.draft and (existing_use := used.get(args.draft.resolve())):
+        raise InputError("draft", f"{args.draft} is {existing_use}", "name another file")
 
 
 def _check_shifts(shifts: Iterable[str], recordings: Sequence[Recording]) -> None:
@@ -189,9 +189,9 @@ def _lacking_channels(columns: Collection[str]) -> list[str]:
     return lacking if is_steered else [*lacking, FRONT_STEERING[0]]
 
 
-def _parse_shifts(given: list[str]) -> dict[str, float]:
+def _parse_shifts(texts: list[str]) -> dict[str, float]:
     shifts = {}
-    for text in given:
+    for text in texts:
         name, _, seconds = text.rpartition("=")
         try:
             shift = float(seconds)

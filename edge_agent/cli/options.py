@@ -54,9 +54,9 @@ def config_of(args: argparse.Namespace) -> AgentConfig:
     return config.model_copy(update={"zenoh": config.zenoh.with_endpoint(args.connect)})
 
 
-def add_json(parser: argparse.ArgumentParser, what: str) -> None:
+def add_json(parser: argparse.ArgumentParser, content: str) -> None:
     """Add the option `--json` for machine-readable output."""
-    parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
+    parser.add_argument("--json", action="store_true", help=f"print {content} as JSON")
 
 
 def print_list(entries: Mapping[str, str], *, as_json: bool) -> None:

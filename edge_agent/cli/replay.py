@@ -275,10 +275,10 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
         if outcome.error is not None:
             bad += 1
             print(f"error: {outcome.task.log}: {outcome.error}", file=sys.stderr, flush=True)
-        spent = time.monotonic() - began
-        if spent - last >= PROGRESS_S or done == count:
-            last = spent
-            rate = samples / max(spent, 1e-9)
+        elapsed = time.monotonic() - began
+        if elapsed - last >= PROGRESS_S or done == count:
+            last = elapsed
+            rate = samples / max(elapsed, 1e-9)
             print(
                 f"{done} of {count} logs, {samples} samples, {rate:.0f}/s",
                 file=sys.stderr,
@@ -324,10 +324,10 @@ def _make_records(
     return (found if last is None else [*found, last]), progress
 
 
-def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, again: str) -> int:
+def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, advice: str) -> int:
     """Send the outbox of `publisher`, which contains the records of a log that begins at `start_ns`
     [ns UTC] and was estimated with `progress`. Return 1 if a record was refused, lost or not
-    acknowledged, else 0. For the last two cases, print the instruction `again`.
+    acknowledged, else 0. For the last two cases, print the instruction `advice`.
     """
     from edge_agent.app.publishing import close_publisher
 
@@ -346,7 +346,7 @@ def _publish_drive(publisher: Publisher, progress: Progress, start_ns: int, agai
     left = publisher.count_unsettled() or publisher.status.lost_records
     if left:
         print(
-            f"error: publish: {left} records were not acknowledged; {again}, no record counts "
+            f"error: publish: {left} records were not acknowledged; {advice}, no record counts "
             "twice",
             file=sys.stderr,
         )
@@ -365,23 +365,23 @@ def _wait_for_answers(publisher: Publisher) -> None:
             answered = time.monotonic()
 
 
-def _start_time(given: str | None, log: SignalLog) -> int:
+def _start_time(start: str | None, log: SignalLog) -> int:
     """Return the time [ns UTC] of t = 0 in a recorded log: the given time, else the time stated in
     the log, else a time such that the log ends now.
     """
     from schemas.config import moment
 
-    if given is not None and given != NOW:
-        return moment(given, "start")
-    if given is None and log.start_ns is not None:
+    if start is not None and start != NOW:
+        return moment(start, "start")
+    if start is None and log.start_ns is not None:
         return log.start_ns
     # A whole second, so that `_start_text` is exact.
     return (time.time_ns() - round(float(log.t[-1]) * NS)) // NS * NS
 
 
-def _is_start_now(given: str | None, log: SignalLog) -> bool:
+def _is_start_now(start: str | None, log: SignalLog) -> bool:
     """Return True if neither `--start` nor the log states the time of t = 0."""
-    return given == NOW or (given is None and log.start_ns is None)
+    return start == NOW or (start is None and log.start_ns is None)
 
 
 def _start_text(start_ns: int) -> str:

@@ -142,11 +142,11 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
     fixes["latitude"], fixes["longitude"], fixes["yaw"] = latitude, longitude, signals[..., S.YAW]
-    there = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
+    is_located = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
     fixes["cell"] = NOWHERE
-    fixes["cell"][there] = cell = grid.cell_of(latitude[there], longitude[there])
+    fixes["cell"][is_located] = cell = grid.cell_of(latitude[is_located], longitude[is_located])
     for name, border in zip(("west", "south", "east", "north"), grid.bounds(cell), strict=True):
-        fixes[name][there] = border
+        fixes[name][is_located] = border
     return fixes
 
 

@@ -75,9 +75,9 @@ def new_flag_records(vehicles: int) -> RecordArray:
     """Return the initial state of the controller flags of N vehicles, (N, len(FLAGS)) records; no
     flag has been read yet.
     """
-    made = records(FlagRecord, vehicles, len(FLAGS))
-    made["time"] = np.nan
-    return made
+    flag_records = records(FlagRecord, vehicles, len(FLAGS))
+    flag_records["time"] = np.nan
+    return flag_records
 
 
 def trusted_context(

@@ -76,7 +76,8 @@ class Visit:
     speed_sum: float  # [m/s] sum over the samples
     # [1] largest grip used in the visit's last part; during its first second the latest value
     mu_utilised: float
-    felt: float  # [1] upper limit of the grip used, from the accelerometers in this cell alone
+    # [1] upper limit of the grip used, from the accelerometers in this cell alone
+    measured_grip: float
     ax: float  # [m/s²] smoothed, also over earlier visits
     ay: float
     travelled: float  # [m] driven in the visit
@@ -88,7 +89,7 @@ class Visit:
     earlier_used: float  # [1] smallest grip used of the earlier parts
     known: Annotated[FloatArray, len(CONTEXT)]  # number of samples with each context signal
     # Sum of each context signal over these samples; for a flag, the number of samples with 1
-    told: Annotated[FloatArray, len(CONTEXT)]
+    context_sum: Annotated[FloatArray, len(CONTEXT)]
     # [m²/s⁴] sums of squared accelerations, forward, backward, to the left and to the right
     driving: float
     braking: float
@@ -179,17 +180,17 @@ def build_records(
 class SampleNotes(NamedTuple):
     """Additional data per sample for the visits.
 
-    The friction may change k times within visits of the block. Then `told` (k, 32) has one row per
-    change: the log-likelihood of friction from the part of the visit before the change. `row` (T,
-    N) links samples to these rows: it is the row's index at the sample of a change, and -1 at all
-    other samples.
+    The friction may change k times within visits of the block. Then `likelihoods` (k, 32) has one
+    row per change: the log-likelihood of friction from the part of the visit before the change.
+    `row` (T, N) links samples to these rows: it is the row's index at the sample of a change, and
+    -1 at all other samples.
 
     `context` (T, N, len(CONTEXT)) contains controller flags, air temperature and wiper; empty if
     unknown. `position_std` is the standard deviation of the position [m].
     """
 
     row: IntArray
-    told: FloatArray
+    likelihoods: FloatArray
     context: FloatArray
     position_std: float
 
@@ -197,13 +198,13 @@ class SampleNotes(NamedTuple):
 def _sample_notes(
     estimates: Estimates, context: FloatArray | None, position_std: float
 ) -> SampleNotes:
-    heard = np.zeros((0, 0, len(CONTEXT))) if context is None else np.ascontiguousarray(context)
+    signals = np.zeros((0, 0, len(CONTEXT))) if context is None else np.ascontiguousarray(context)
     row = np.full(estimates.mu.shape, -1)
     if estimates.jumps is None or estimates.evidence is None:
-        return SampleNotes(row, np.zeros((0, mugrid.BINS)), heard, position_std)
-    told = estimates.evidence[estimates.jumps]
-    row[estimates.jumps] = np.arange(len(told))
-    return SampleNotes(row, told, heard, position_std)
+        return SampleNotes(row, np.zeros((0, mugrid.BINS)), signals, position_std)
+    likelihoods = estimates.evidence[estimates.jumps]
+    row[estimates.jumps] = np.arange(len(likelihoods))
+    return SampleNotes(row, likelihoods, signals, position_std)
 
 
 def _visit_samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
@@ -255,7 +256,7 @@ def _advance_visits(
                     visit.longitude = located.longitude[k, n]
                     visit.yaw = located.yaw[k, n]
                 if notes.row[k, n] >= 0:
-                    _begin_part(visit, time[k, n], notes.told[notes.row[k, n]])
+                    _begin_part(visit, time[k, n], notes.likelihoods[notes.row[k, n]])
     return count
 
 
@@ -271,7 +272,7 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
     visit.braking = 0.0
     visit.left = 0.0
     visit.right = 0.0
-    visit.felt = np.inf
+    visit.measured_grip = np.inf
     visit.speed_sum = 0.0
     visit.latitude = 0.0
     visit.longitude = 0.0
@@ -283,29 +284,31 @@ def _begin_visit(visit: Visit, time: int, cell: int, sector: int) -> None:
     visit.earlier_used = np.inf
     for i in range(len(visit.known)):
         visit.known[i] = 0.0
-        visit.told[i] = 0.0
+        visit.context_sum[i] = 0.0
 
 
 @compiled
-def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
+def _begin_part(visit: Visit, time: int, log_likelihood: FloatArray) -> None:
     """Begin a new part of a visit, because the friction changed within the cell.
 
-    `told` is the log-likelihood of friction from the part that ends. The grip used in that part
-    cannot exceed the largest friction that `told` leaves possible. Therefore the stored grip is
-    limited to this friction.
+    `log_likelihood` is the log-likelihood of friction from the part that ends. The grip used
+    in that part cannot exceed the largest friction that `log_likelihood` leaves possible.
+    Therefore the stored grip is limited to this friction.
     """
     most = mugrid.UPPER
     for i in range(mugrid.BINS - 1, -1, -1):
-        if told[i] >= EXCLUDED_NATS:
+        if log_likelihood[i] >= EXCLUDED_NATS:
             most = mugrid.CENTRES[i]
             break
-    visit.earlier_used = min(visit.earlier_used, visit.mu_utilised, visit.felt, most)
+    visit.earlier_used = min(visit.earlier_used, visit.mu_utilised, visit.measured_grip, most)
     for i in range(mugrid.BINS):
-        visit.earlier[i] = told[i] if visit.parts == 0 else max(visit.earlier[i], told[i])
+        visit.earlier[i] = (
+            log_likelihood[i] if visit.parts == 0 else max(visit.earlier[i], log_likelihood[i])
+        )
     visit.parts += 1
     visit.part_time = time
     visit.mu_utilised = 0.0
-    visit.felt = np.inf
+    visit.measured_grip = np.inf
 
 
 @compiled
@@ -313,7 +316,7 @@ def _add_sample(visit: Visit, time: int, sample: Sample, position_std: float) ->
     """Add one sample at `time` [ns UTC] to a visit. `position_std` is the standard deviation of the
     vehicle's position [m].
     """
-    _update_felt_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
+    _update_measured_grip(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
     visit.health |= sample.health
@@ -338,12 +341,12 @@ def _add_context(visit: Visit, context: FloatArray) -> None:
     for i in range(len(context)):
         if np.isfinite(context[i]):
             visit.known[i] += 1.0
-            visit.told[i] += context[i]
+            visit.context_sum[i] += context[i]
 
 
 @compiled
-def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
-    """Update `visit.felt`, the upper limit of the grip used in a visit according to the
+def _update_measured_grip(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
+    """Update `visit.measured_grip`, the upper limit of the grip used in a visit according to the
     accelerometers. `dt` [s] is the time since the previous sample.
 
     The limit is infinite (no limit) in a new visit until the first accelerometer reading.
@@ -352,11 +355,13 @@ def _update_felt_grip(visit: Visit, dt: float, sample: Sample, position_std: flo
         share = 1.0 - np.exp(-dt / FELT_S)
         visit.ax += share * (sample.ax - visit.ax)
         visit.ay += share * (sample.ay - visit.ay)
-        felt = 0.0 if np.isinf(visit.felt) else visit.felt
+        measured_grip = 0.0 if np.isinf(visit.measured_grip) else visit.measured_grip
         if visit.travelled >= position_std and visit.from_fix <= NEAR_FIX_M:
             along = (DRIVEN_SHARE if visit.ax > 0.0 else 1.0) * visit.ax
-            felt = max(felt, WHEEL_SHARE * np.hypot(along, visit.ay) / GRAVITY + FELT_STD)
-        visit.felt = felt
+            measured_grip = max(
+                measured_grip, WHEEL_SHARE * np.hypot(along, visit.ay) / GRAVITY + FELT_STD
+            )
+        visit.measured_grip = measured_grip
     if visit.samples > 0:  # the way to the first sample, perhaps a long gap, lies before the visit
         visit.travelled += sample.speed * dt
         visit.from_fix += sample.speed * dt
@@ -403,7 +408,7 @@ def _grip_used(ended: RecordArray) -> FloatArray:
     before and after each change. The result is the smallest of these values, so that the friction
     of every part is at least the result.
     """
-    last = np.minimum(ended["mu_utilised"], ended["felt"])
+    last = np.minimum(ended["mu_utilised"], ended["measured_grip"])
     return np.asarray(np.minimum(last, ended["earlier_used"]))
 
 
@@ -449,10 +454,10 @@ def _context_columns(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
     KNOWN_SHARE of the samples. Otherwise it is unknown.
     """
     known = ended["known"]
-    told = ended["told"]
+    context_sum = ended["context_sum"]
     enough = known[:, : len(FLAGS)] >= KNOWN_SHARE * np.maximum(ended["samples"], 1)[:, None]
-    flags = np.where(told[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, UNKNOWN))
-    mean = np.where(known > 0.0, told / np.maximum(known, 1.0), np.nan)
+    flags = np.where(context_sum[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, UNKNOWN))
+    mean = np.where(known > 0.0, context_sum / np.maximum(known, 1.0), np.nan)
     return {
         **{name: flags[:, index] for index, name in enumerate(FLAGS)},
         "air_temperature": mean[:, C.AIR_TEMPERATURE],

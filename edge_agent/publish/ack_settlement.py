@@ -76,12 +76,12 @@ class AckSettlement:
         while not self._acks.empty():
             vehicle, payload = self._acks.get()
             try:
-                named, streams = decode_ack(payload)
+                ack_vehicle, streams = decode_ack(payload)
             except WireError as error:
                 self._counts.bad_acks += 1
                 log.warning("an acknowledgement for %s cannot be read: %s", vehicle, error)
                 continue
-            if named != vehicle:
+            if ack_vehicle != vehicle:
                 self._counts.bad_acks += 1
                 continue
             for ack in streams:

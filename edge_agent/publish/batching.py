@@ -103,21 +103,21 @@ class Batcher:
         else:
             cells = grid.cell_of(columns["latitude"], columns["longitude"])
         owners = np.stack([records.vehicle, grid.region_of(cells)], axis=1)
-        unique, which = np.unique(owners, axis=0, return_inverse=True)
+        unique, owner_index = np.unique(owners, axis=0, return_inverse=True)
         for index, (vehicle, region) in enumerate(unique.tolist()):
-            chosen = np.flatnonzero(which.ravel() == index)
+            chosen = np.flatnonzero(owner_index.ravel() == index)
             group = self._groups.setdefault(_Place(vehicle, records.kind, region), _Group(now))
             group.parts.append({name: column[chosen] for name, column in columns.items()})
             group.rows += len(chosen)
             group.urgent |= bool(records.urgent[chosen].any())
 
-    def take_due(self, now: float, *, everything: bool = False) -> list[Draft]:
+    def take_due(self, now: float, *, flush_all: bool = False) -> list[Draft]:
         """Remove the records whose batch is due at time `now` [s] from the collector, and return
-        the batches. With `everything`, all batches are due.
+        the batches. With `flush_all`, all batches are due.
         """
         drafts: list[Draft] = []
         for place, group in list(self._groups.items()):
-            whole = everything or group.urgent or now - group.since >= self._flush_s
+            whole = flush_all or group.urgent or now - group.since >= self._flush_s
             ready = group.rows if whole else group.rows - group.rows % self._rows
             if not ready:
                 continue
@@ -183,7 +183,7 @@ def _make_drafts(records: Sequence[RecordBlock], batcher: Batcher) -> list[Draft
     drafts: list[Draft] = []
     for block in records:
         batcher.add(block, 0.0)
-        drafts += batcher.take_due(0.0, everything=True)
+        drafts += batcher.take_due(0.0, flush_all=True)
     return drafts
 
 

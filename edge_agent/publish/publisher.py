@@ -168,7 +168,7 @@ class Publisher:
         self._settlement.settle_received()
         for vehicle in self._links.update_connections():
             self._outbox.reset_in_flight(vehicle, self._clock())
-        self._waiting += self._batcher.take_due(self._clock(), everything=self._closing.is_set())
+        self._waiting += self._batcher.take_due(self._clock(), flush_all=self._closing.is_set())
         self._store_and_send()
         self._resend_due()  # before the deletion, which a full disk may refuse
         self._outbox.delete_settled()

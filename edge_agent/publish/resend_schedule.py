@@ -34,12 +34,12 @@ class ResendSchedule:
         self._random = random.Random(seed)
         self._pacers: dict[tuple[str, int], Pacer] = {}
         # heap of (time at which a batch in flight counts as lost [s], key)
-        self._later: list[tuple[float, int]] = []
+        self._due_heap: list[tuple[float, int]] = []
 
     def remove_all(self) -> None:
         """Remove all batches from the schedule."""
         self._pacers = {}
-        self._later = []
+        self._due_heap = []
 
     def _pacer_of(self, batch: HeldBatch) -> Pacer:
         return self._pacers.setdefault((batch.stream.vehicle, batch.stream.region), Pacer())
@@ -62,7 +62,7 @@ class ResendSchedule:
         )
         batch.attempts += 1
         batch.due = now + delay * self._random_jitter()
-        heapq.heappush(self._later, (batch.due, key))
+        heapq.heappush(self._due_heap, (batch.due, key))
         self._pacer_of(batch).record_sent(now)
 
     def send_or_queue(self, key: int, now: float) -> bool:
@@ -97,7 +97,7 @@ class ResendSchedule:
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
                 pacer.record_reconnect(now)
-        for _, key in self._later:
+        for _, key in self._due_heap:
             if key not in self._held:
                 continue
             batch = self._held[key]
@@ -113,8 +113,8 @@ class ResendSchedule:
         key is yielded, and the caller must remove this batch from the outbox before requesting the
         next key.
         """
-        while self._later and self._later[0][0] <= now:
-            at, key = heapq.heappop(self._later)
+        while self._due_heap and self._due_heap[0][0] <= now:
+            at, key = heapq.heappop(self._due_heap)
             if key not in self._held or self._held[key].due != at:
                 continue
             batch = self._held[key]
@@ -141,11 +141,11 @@ class ResendSchedule:
         keys: list[int] = []
 
         def take_from(pacer: Pacer, most: int) -> bool:
-            taken = pacer.take_due(now, self._random_jitter(), most, self._held)
-            for key in taken:
+            due_keys = pacer.take_due(now, self._random_jitter(), most, self._held)
+            for key in due_keys:
                 self.mark_in_flight(key, now)
-            keys.extend(taken)
-            return bool(taken)
+            keys.extend(due_keys)
+            return bool(due_keys)
 
         for pacer in pacers:
             take_from(pacer, 0)  # only probes of silent regions

@@ -67,9 +67,9 @@ def _read_cell(page: bytes, at: int, pages: dict[int, bytes]) -> tuple[int, list
     record = page[at : at + local]
     following = int.from_bytes(page[at + local : at + local + 4], "big") if local < size else 0
     while len(record) < size:
-        more = pages[following]
-        following = int.from_bytes(more[:4], "big")
-        record = record + more[4:]
+        overflow_page = pages[following]
+        following = int.from_bytes(overflow_page[:4], "big")
+        record = record + overflow_page[4:]
     return key, _read_record(record[:size])
 
 

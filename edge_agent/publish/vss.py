@@ -70,7 +70,7 @@ class RoadFrictionOutput:
 
     Args:
         names: names of the vehicles; row k of the reported values belongs to vehicle k.
-        say: function that prints a line.
+        print_line: function that prints a line.
         rate_hz: reports per second.
         provider: additional receiver of the same signals, if given.
     """
@@ -78,12 +78,12 @@ class RoadFrictionOutput:
     def __init__(
         self,
         names: Sequence[str],
-        say: Callable[[str], None],
+        print_line: Callable[[str], None],
         rate_hz: float,
         provider: SignalProvider | None = None,
     ) -> None:
         self._names = names
-        self._say = say
+        self._print_line = print_line
         self._provider = provider
         self._step_ns = round(NS / rate_hz)
         self.publishers: dict[str, Any] = {}
@@ -113,7 +113,7 @@ class RoadFrictionOutput:
             line = json.dumps(
                 {"event": "vss", "vehicle": name, "time": at.replace("+00:00", "Z"), **known}
             )
-            self._say(line)
+            self._print_line(line)
             if self._provider is not None:
                 self._provider.write(known, int(grip.time[k]))
             publisher = self.publishers.get(name)

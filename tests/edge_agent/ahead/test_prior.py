@@ -70,7 +70,7 @@ def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
     shares = []
     for age_s in (0.0, 1800.0, 4 * 3600.0):
         said = cells(road, 0.2, at=NOW - round(age_s * NS))
-        belief = make_local_map([said._replace(heard=np.full(len(road), NOW))]).belief_at(
+        belief = make_local_map([said._replace(map_time=np.full(len(road), NOW))]).belief_at(
             place, NOW
         )
         assert belief is not None

@@ -337,11 +337,11 @@ def test_many_sessions_open_together(router: Router, tmp_path: Path) -> None:
 def drafts_of(records: RecordBlock) -> list[Draft]:
     batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=5)
     batcher.add(records, 0.0)
-    return batcher.take_due(0.0, everything=True)
+    return batcher.take_due(0.0, flush_all=True)
 
 
 def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[tuple[str, int]]:
-    return sorted((d.vehicle, d.records) for d in batcher.take_due(now, everything=everything))
+    return sorted((d.vehicle, d.records) for d in batcher.take_due(now, flush_all=everything))
 
 
 def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
@@ -380,7 +380,7 @@ def test_a_batch_never_spans_regions() -> None:
     records.columns["cell"][2:] += 1 << (2 * (grid.CELL_ZOOM - grid.REGION_ZOOM))
     batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
     batcher.add(records, now=0.0)
-    drafts = batcher.take_due(now=0.0, everything=True)
+    drafts = batcher.take_due(now=0.0, flush_all=True)
     assert sorted(d.records for d in drafts) == [2, 2]
     assert len({d.region for d in drafts}) == 2
     assert batcher.records == 0
