@@ -34,7 +34,7 @@ class Topic(NamedTuple):
     Attributes:
         name: first chunk of the key after the root.
         zoom: zoom of the grid square in the key; None if the key has no grid square.
-        named: True if the last chunk is a name (of a vehicle or a service).
+        has_name: True if the last chunk is a name (of a vehicle or a service).
         message: type of the payload; None for a liveliness token (sign that a process is alive).
         priority: name of the Zenoh priority.
         block: on an overloaded link, the sender waits (True) or the message is dropped (False).
@@ -44,7 +44,7 @@ class Topic(NamedTuple):
 
     name: str
     zoom: int | None
-    named: bool
+    has_name: bool
     message: str | None
     priority: str
     block: bool
@@ -219,7 +219,7 @@ def parse(key: str) -> Parsed:
             f"use {ROOT}/ and one of {', '.join(TOPICS)}",
         )
     parts = rest.split("/")
-    name = parts.pop() if topic.named else None
+    name = parts.pop() if topic.has_name else None
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise InputError("key", f"{name[:80]!r} is not a name", f"use {NAME_PATTERN}")
     digits = "".join(parts)

@@ -51,20 +51,20 @@ def region_of(tile: int) -> str:
     return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
 
 
-def unserved_expressions(asked: MapQuery, served: Collection[str]) -> list[str]:
+def unserved_expressions(query: MapQuery, served: Collection[str]) -> list[str]:
     """Return region expressions (key patterns that select regions), as few as possible, that cover
-    the part of the queried area for which no service answers. `asked` is the query, and `served`
+    the part of the queried area for which no service answers. `query` is the query, and `served`
     are the region expressions of all services. A query without route and box asks for the whole
     earth.
 
     Raises:
         InputError: the route in the query is too long.
     """
-    if asked.route is not None:
-        ahead = grid.region_of(keys_along(asked.route) // grid.SECTORS)
+    if query.route is not None:
+        ahead = grid.region_of(keys_along(query.route) // grid.SECTORS)
         found = dict.fromkeys(keys.chunks(int(region), grid.REGION_ZOOM) for region in ahead)
         return [region for region in found if not any(covers(wide, region) for wide in served)]
-    return list(_regions_without(asked.bbox, served, (), 0))
+    return list(_regions_without(query.bbox, served, (), 0))
 
 
 def _regions_without(

@@ -227,10 +227,14 @@ ESTIMATES: Final = (
             f"{wheel}{end}",
             F64,
             "-",
-            f"{what} of mu at this wheel; null if there is one mu for all",
+            f"{statistic} of mu at this wheel; null if there is one mu for all",
         )
         for wheel in per_wheel("mu")
-        for end, what in (("", "median"), ("_lower", "5 % quantile"), ("_upper", "95 % quantile"))
+        for end, statistic in (
+            ("", "median"),
+            ("_lower", "5 % quantile"),
+            ("_upper", "95 % quantile"),
+        )
     ),
     Field("mu_utilised", F64, "-", "largest grip that any wheel used in the last second"),
     Field("innovation_nis", F64, "-", "normalised innovation squared over its degrees of freedom"),

@@ -126,8 +126,8 @@ def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
     """
     if isinstance(kernel, NativeKernel):
         return cast(Callable[P, R], kernel)
-    made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
-    return cast(Callable[P, R], made.entry_point)
+    compiled_kernel = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
+    return cast(Callable[P, R], compiled_kernel.entry_point)
 
 
 def _compile(

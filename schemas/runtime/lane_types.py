@@ -97,15 +97,15 @@ def spread_value(builder: Any, value: Any, vector: Any) -> Any:
 
 @lower_cast(types.Float, LanesType)
 @lower_cast(types.Integer, LanesType)
-def cast_number(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
+def cast_number(context: Any, builder: Any, source_type: Any, target_type: Any, value: Any) -> Any:
     """Generate code that copies the number `value` into all lanes of a new vector; return the LLVM
     value of this vector.
     """
-    return spread_value(builder, context.cast(builder, value, given, types.float64), VECTOR)
+    return spread_value(builder, context.cast(builder, value, source_type, types.float64), VECTOR)
 
 
 @lower_cast(types.Boolean, MaskType)
-def cast_truth(context: Any, builder: Any, given: Any, wanted: Any, value: Any) -> Any:
+def cast_truth(context: Any, builder: Any, source_type: Any, target_type: Any, value: Any) -> Any:
     """Generate code that copies the truth value `value` into all lanes of a new mask; return the
     LLVM value of this mask.
     """

@@ -18,34 +18,34 @@ Form = Literal["text", "json"]
 _EVENTS: Final = "gripmap.events."
 
 
-def event_logger(name: str, form: Form, stream: TextIO, **who: object) -> logging.Logger:
+def event_logger(name: str, form: Form, stream: TextIO, **identity: object) -> logging.Logger:
     """Return the logger `name` of the process's events, which writes to `stream`. A second call
     with the same name changes the form and the stream.
 
-    JSON lines contain the values `who`, which identify the process, and those of
+    JSON lines contain the values `identity`, which identify the process, and those of
     `info(text, extra=values(name=value, …))`. Their field `event` is the value of that name, or the
     text before the first colon, or the first word of a text without colon.
     """
     logger = logging.getLogger(_EVENTS + name)
     logger.setLevel(logging.INFO)
     logger.propagate = False
-    logger.handlers = [_make_handler(form, "%(message)s", stream, who)]
+    logger.handlers = [_make_handler(form, "%(message)s", stream, identity)]
     return logger
 
 
-def log_warnings(form: Form, stream: TextIO, **who: object) -> None:
+def log_warnings(form: Form, stream: TextIO, **identity: object) -> None:
     """Write the warnings and errors of the program and its libraries to `stream`. JSON lines
-    contain the values `who`, which identify the process.
+    contain the values `identity`, which identify the process.
     """
-    handler = _make_handler(form, "%(levelname)s: %(message)s", stream, who)
+    handler = _make_handler(form, "%(levelname)s: %(message)s", stream, identity)
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
 
 
-def values(**named: object) -> dict[str, object]:
+def values(**entries: object) -> dict[str, object]:
     """Return the argument `extra` of a logger's method for a line with values by name, which the
     JSON form contains.
     """
-    return {"values": named}
+    return {"values": entries}
 
 
 class _TolerantHandler(logging.StreamHandler[TextIO]):
@@ -54,9 +54,9 @@ class _TolerantHandler(logging.StreamHandler[TextIO]):
 
 
 class _JsonFormatter(logging.Formatter):
-    def __init__(self, who: Mapping[str, object]) -> None:
+    def __init__(self, identity: Mapping[str, object]) -> None:
         super().__init__()
-        self._who = who
+        self._identity = identity
 
     def format(self, record: logging.LogRecord) -> str:
         message = record.getMessage()
@@ -69,7 +69,7 @@ class _JsonFormatter(logging.Formatter):
             "pid": os.getpid(),
             "event": event,
             "message": message,
-            **self._who,
+            **self._identity,
             **getattr(record, "values", {}),
         }
         if record.exc_info:
@@ -78,10 +78,10 @@ class _JsonFormatter(logging.Formatter):
 
 
 def _make_handler(
-    form: Form, text: str, stream: TextIO, who: Mapping[str, object]
+    form: Form, text: str, stream: TextIO, identity: Mapping[str, object]
 ) -> logging.Handler:
     handler = _TolerantHandler(stream)
-    handler.setFormatter(_JsonFormatter(who) if form == "json" else logging.Formatter(text))
+    handler.setFormatter(_JsonFormatter(identity) if form == "json" else logging.Formatter(text))
     return handler
 
 

@@ -231,7 +231,7 @@ class _Adapter:
 
     def __init__(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
         self._words = HEADER
-        self._known: dict[str, Any] = {
+        self._namespace: dict[str, Any] = {
             "kernel": kernel,
             "carray": numba.carray,  # type: ignore[attr-defined]
             "pointer_of": intrinsic(_pointer_of),
@@ -254,16 +254,16 @@ class _Adapter:
         }[result]
         mark = DONE_FLOAT if result == types.float64 else DONE
         text = f"def {ADAPTER}(words):\n    {call}\n    words[0] = {mark}\n"
-        exec(text, self._known)
-        return self._known[ADAPTER]  # type: ignore[no-any-return]
+        exec(text, self._namespace)
+        return self._namespace[ADAPTER]  # type: ignore[no-any-return]
 
     def _next_word(self) -> str:
         self._words += 1
         return f"words[{self._words - 1}]"
 
     def _name_of(self, value: Any) -> str:
-        name = f"known_{len(self._known)}"
-        self._known[name] = value
+        name = f"known_{len(self._namespace)}"
+        self._namespace[name] = value
         return name
 
     def _expression(self, value: Any) -> str:
@@ -293,9 +293,9 @@ def _compile_adapter(kernel: Any, arguments: tuple[Any, ...], symbol: str, resul
     """
     function = _Adapter(kernel, arguments).make_function(result)
     words = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
-    made: Any = numba.cfunc(types.void(words), error_model="numpy")(function)
-    made._library._final_module.get_function(made.native_name).name = symbol
-    return made._library
+    adapter: Any = numba.cfunc(types.void(words), error_model="numpy")(function)
+    adapter._library._final_module.get_function(adapter.native_name).name = symbol
+    return adapter._library
 
 
 def _merge_modules(whole: Any, overload: Any, adapter: Any, symbol: str) -> None:
@@ -366,14 +366,14 @@ def _link_object(code: bytes, path: Path) -> None:
     """Link the object code `code` to a shared library. The file `path` appears only when the
     library is complete.
     """
-    made = path.with_suffix(f".{os.getpid()}")
+    draft = path.with_suffix(f".{os.getpid()}")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "kernels.o"
         source.write_bytes(code)
         try:
-            words = [LINKER, *LINKED, "-o", str(made), str(source), "-lm"]
+            words = [LINKER, *LINKED, "-o", str(draft), str(source), "-lm"]
             subprocess.run(words, check=True, capture_output=True)
-            made.replace(path)
+            draft.replace(path)
         finally:
             with suppress(OSError):
-                made.unlink()
+                draft.unlink()

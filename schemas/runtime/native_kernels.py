@@ -79,7 +79,7 @@ class NativeKernel:
         self._library = library
         self._nogil = nogil
         self._compile = compile_with_numba
-        self._found: dict[str, Callable[[int], None] | None] = {}
+        self._native_functions: dict[str, Callable[[int], None] | None] = {}
 
     @functools.cached_property
     def numba_kernel(self) -> Callable[..., Any]:
@@ -93,10 +93,10 @@ class NativeKernel:
             types = describe_type(arguments, words)
         except OtherTypesError:
             return self._library.call_missing(self, arguments)
-        if types not in self._found:
+        if types not in self._native_functions:
             symbol = symbol_of(self.name, types)
-            self._found[types] = self._library.find_function(symbol, nogil=self._nogil)
-        function = self._found[types]
+            self._native_functions[types] = self._library.find_function(symbol, nogil=self._nogil)
+        function = self._native_functions[types]
         if function is None:
             return self._library.call_missing(self, arguments)
         row = array("q", words)

@@ -58,12 +58,12 @@ def _typeof_native_kernel(kernel: NativeKernel, _: object) -> types.Dispatcher:
 
 
 @typeof_impl.register(NativeIntrinsic)
-def _typeof_native_intrinsic(made: NativeIntrinsic, _: object) -> types.Type:
+def _typeof_native_intrinsic(placeholder: NativeIntrinsic, _: object) -> types.Type:
     """Let functions that Numba compiles call an intrinsic (function whose LLVM code this project
-    generates itself). Numba asks for the type of the placeholder `made`; return that of the
-    intrinsic, which is loaded now if necessary.
+    generates itself). Numba asks for the type of `placeholder`; return that of the intrinsic, which
+    is loaded now if necessary.
     """
-    intrinsic = made.numba_intrinsic
+    intrinsic = placeholder.numba_intrinsic
     for context in (cpu_target.typing_context, cpu_target.target_context):
         context.refresh()
     typing: Any = cpu_target.typing_context

@@ -38,7 +38,7 @@ class PresenceTracker:
 
     def __init__(self) -> None:
         self._guard = Lock()
-        self._here = set[ServiceToken]()
+        self._present = set[ServiceToken]()
         self._withdrawn = set[ServiceToken]()
         self._fell = set[ServiceToken]()
 
@@ -46,7 +46,7 @@ class PresenceTracker:
     def active(self) -> set[ServiceToken]:
         """Return the liveliness tokens of services that are active now."""
         with self._guard:
-            return set(self._here)
+            return set(self._present)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
@@ -78,10 +78,10 @@ class PresenceTracker:
         """
         with self._guard:
             if stands:
-                self._here.add(token)
+                self._present.add(token)
                 self._withdrawn.discard(token)
             else:
-                self._here.discard(token)
+                self._present.discard(token)
                 self._withdrawn.add(token)
                 self._fell.add(token)
 
