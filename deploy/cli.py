@@ -32,8 +32,8 @@ LINE: Final = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command that `argv` names; return the exit code."""
-    given = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
-    chosen = next((word for word in given if not word.startswith("-")), None)
-    progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
-    arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
+    words = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
+    chosen = next((word for word in words if not word.startswith("-")), None)
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(words))
+    arguments = commandline.parser_of(*LINE, chosen).parse_args(words)
     return commandline.run_guarded(lambda: int(arguments.run(arguments)))

@@ -91,15 +91,15 @@ class ListeningTown:
         self.fusion = Fusion(LATENESS_S)
         self.alerts = Alerts(self.fusion)
         self.drivers = WarnedDrivers(self.fleet, 1.0 if listening else 0.0)
-        self.heard = LocalMap()
+        self.received_map = LocalMap()
         self.prior = MapPrior(vehicles)
         self.active: list[tuple[Active, ...]] = [()] * vehicles
         self.drive = Drive()
         self.ice = self.fleet.scenario.events[0]
         self._listening = listening
-        self._asked = -ASKED_S
+        self._last_query = -ASKED_S
         self._lap = np.zeros(vehicles, np.int64)
-        self._on = np.zeros(vehicles, np.bool_)
+        self._was_on_ice = np.zeros(vehicles, np.bool_)
         self._true: dict[int, float] = {}  # friction of each place when it was last driven over
 
     def run(self, duration_s: float) -> Drive:
@@ -151,15 +151,15 @@ class ListeningTown:
         self._true |= dict(
             zip(places.tolist(), true.mu_wheel[-1].mean(axis=1).tolist(), strict=True)
         )
-        on = (np.abs(true.x - patch.x) <= patch.length / 2) & (
+        on_patch = (np.abs(true.x - patch.x) <= patch.length / 2) & (
             np.abs(true.y - patch.y) <= patch.width / 2
         )
-        on &= (now >= patch.start) & (true.mu_wheel.mean(axis=2) < SLIPPERY_MU)
-        here = on.any(axis=0)
-        self._lap += here & ~self._on
-        self._on[:] = here
-        slid = (on & (true.utilisation.max(axis=2) >= LOST)).any(axis=0)
-        self.drive.passed |= {(k, int(self._lap[k])) for k in np.flatnonzero(here).tolist()}
+        on_patch &= (now >= patch.start) & (true.mu_wheel.mean(axis=2) < SLIPPERY_MU)
+        is_on_ice = on_patch.any(axis=0)
+        self._lap += is_on_ice & ~self._was_on_ice
+        self._was_on_ice[:] = is_on_ice
+        slid = (on_patch & (true.utilisation.max(axis=2) >= LOST)).any(axis=0)
+        self.drive.passed |= {(k, int(self._lap[k])) for k in np.flatnonzero(is_on_ice).tolist()}
         self.drive.slid |= {(k, int(self._lap[k])) for k in np.flatnonzero(slid).tolist()}
 
     def _fuse(self, parts: list[dict[str, Any]]) -> None:
@@ -174,7 +174,9 @@ class ListeningTown:
                     self.drive.alert_passes = float(len(self.drive.passed))
                 self.drive.alerts += 1
             key = keys.alert_key(int(grid.tile_of(alert.cell)))
-            self.heard.store_alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
+            self.received_map.store_alert(
+                decode_alert_message(key, wire.encode_alert(alert), now), now
+            )
 
     def _hear(self, second: int) -> None:
         """Pass the active alerts to the listening cars. Every ASKED_S seconds, also pass all map
@@ -182,17 +184,17 @@ class ListeningTown:
         """
         now = self._now()
         for alert in self.alerts.standing_alerts:
-            self.heard.store_alert(alert, now)
-        if second - self._asked < ASKED_S:
+            self.received_map.store_alert(alert, now)
+        if second - self._last_query < ASKED_S:
             return
-        self._asked = second
+        self._last_query = second
         slots = np.arange(self.fusion.size)
         tiles = grid.tile_of(self.fusion.live.key[: self.fusion.size] // grid.SECTORS)
         for tile in np.unique(tiles).tolist():
             payload = arrow_stream(
                 batch_of(view_cells(self.fusion, slots[tiles == tile], now), now)
             )
-            self.heard.store_cells(*decode_cells(keys.map_key(tile), payload, now), now)
+            self.received_map.store_cells(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _look(self) -> None:
         self.drivers.refresh()
@@ -205,7 +207,10 @@ class ListeningTown:
             if path is None:
                 continue
             self.active[k], issued = update_warnings(
-                self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard
+                self.active[k],
+                [look_ahead(path, self.received_map, pose.time)],
+                pose,
+                self.received_map,
             )
             self.drive.warnings += sum(one.state == "raised" for one in issued)
             for warning in issued:
@@ -219,7 +224,7 @@ class ListeningTown:
             return
         key: IntArray = self.pipeline.places
         map_beliefs: dict[int, FloatArray | None] = {
-            k: self.heard.belief_at(int(key[k]), self._now()) if key[k] >= 0 else None
+            k: self.received_map.belief_at(int(key[k]), self._now()) if key[k] >= 0 else None
             for k in self.prior.entered_vehicles(key)
         }
         informed = self.prior.step(key, *beliefs, map_beliefs)
@@ -274,9 +279,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"{len(drive.slid)} of {len(drive.passed)} passes lost grip, alert after "
                 f"{drive.alert_passes:.0f}"
             )
-            more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
+            notes = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
             print(
-                f"  seed {seed} {'listening' if listening else 'not listening'}: {passes}; {more}",
+                f"  seed {seed} {'listening' if listening else 'not listening'}: {passes}; {notes}",
                 flush=True,
             )
     found = measure(with_, without)

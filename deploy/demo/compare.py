@@ -176,10 +176,10 @@ def known_patches(
     for number in range(int(label.max(initial=-1)) + 1):
         own = cells[label == number]
         inside = set(own.tolist())
-        heard = [
+        alert_times = [
             at for at, one in alerts if one.raised and one.cell in inside and at >= ice.since_ns
         ]
-        found.append((own, min(heard, default=NEVER)))
+        found.append((own, min(alert_times, default=NEVER)))
     return found
 
 

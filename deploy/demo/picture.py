@@ -59,13 +59,13 @@ def _mark_passes(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]
     x, y = shapes.mean(axis=1).T
     side = np.ptp(shapes[0, :, 0])
-    for warned, name, mark, beside in (
+    for warned, name, mark, x_offset in (
         (True, "warned", "o", -0.25),
         (False, "not warned", "s", 0.25),
     ):
         for lost, word, fill in ((True, "lost grip", "black"), (False, "kept it", "white")):
             rows = (grip.warned == warned) & (grip.lost == lost)
             label = f"{name}, {word}: {int(rows.sum())}"
-            where = x[rows] + beside * side, y[rows]
+            where = x[rows] + x_offset * side, y[rows]
             axes.scatter(*where, marker=mark, s=30, facecolor=fill, edgecolor="black", label=label)
     axes.legend(loc="lower right", fontsize=7)

@@ -111,16 +111,18 @@ def _place_houses(centres: FloatArray) -> Iterable[FloatArray]:
         wide = rng.uniform(9, 20)
         deep = rng.uniform(8, 13)
         side = rng.choice((-1.0, 1.0))
-        away = CLEAR_M + deep / 2 + rng.choice((1.0, 3.0, 24.0))
-        x = float(centres[k, 0] - side * away * math.sin(angle))
-        y = float(centres[k, 1] + side * away * math.cos(angle))
+        distance = CLEAR_M + deep / 2 + rng.choice((1.0, 3.0, 24.0))
+        x = float(centres[k, 0] - side * distance * math.sin(angle))
+        y = float(centres[k, 1] + side * distance * math.cos(angle))
         reach = math.hypot(wide, deep) / 2
         near = float(np.min(np.hypot(*(centres - (x, y)).T)))
         parked = any(
             ((x - px) / a) ** 2 + ((y - py) / b) ** 2 < 1.3 for px, py, a, b in (*PARKS, LAKE)
         )
-        beside = any(math.hypot(x - px, y - py) < 0.92 * (reach + far) for px, py, far in placed)
-        if near < CLEAR_M + deep / 2 - 1.0 or parked or beside:
+        is_crowded = any(
+            math.hypot(x - px, y - py) < 0.92 * (reach + far) for px, py, far in placed
+        )
+        if near < CLEAR_M + deep / 2 - 1.0 or parked or is_crowded:
             continue
         placed.append((x, y, reach))
         corners = np.array([(-wide, -deep), (wide, -deep), (wide, deep), (-wide, deep)]) / 2
@@ -136,11 +138,11 @@ def _lanes_around(centres: FloatArray) -> list[tuple[str, FloatArray, str]]:
     """
     out = []
     for name, angle in (("E20", 0.55), ("E20", math.pi + 0.35), ("Skogsvägen", 2.2)):
-        away = np.array([math.cos(angle), math.sin(angle)])
-        start = centres[int(np.argmax(centres @ away))]
+        direction = np.array([math.cos(angle), math.sin(angle)])
+        start = centres[int(np.argmax(centres @ direction))]
         run = np.linspace(0.0, 1.0, 40)[:, None]
-        bend = np.array([-away[1], away[0]]) * 60.0
-        line = start + run * away * 700.0 + np.sin(run * 3.0) * bend
+        bend = np.array([-direction[1], direction[0]]) * 60.0
+        line = start + run * direction * 700.0 + np.sin(run * 3.0) * bend
         out.append((name, line, "primary" if name == "E20" else "minor"))
     return out
 

@@ -28,9 +28,9 @@ def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
     hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)
     with_ = hearing.run(40.0)
     without = deaf.run(40.0)
-    assert hearing.heard.alerts
+    assert hearing.received_map.alerts
     assert len(with_.known_error) > 50, "cells that the map knew, and that it told"
-    assert not deaf.heard.cells
+    assert not deaf.received_map.cells
     assert with_.visits == without.visits > 500
     slots = np.arange(hearing.fusion.size)
     one, other = (town.fusion.beliefs(slots, town._now()) for town in (hearing, deaf))
