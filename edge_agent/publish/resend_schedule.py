@@ -140,15 +140,15 @@ class ResendSchedule:
         ]
         keys: list[int] = []
 
-        def take_from(pacer: Pacer, most: int) -> bool:
-            due_keys = pacer.take_due(now, self._random_jitter(), most, self._held)
+        def take_from(pacer: Pacer, most: int, probe_jitter: float = 1.0) -> bool:
+            due_keys = pacer.take_due(now, probe_jitter, most, self._held)
             for key in due_keys:
                 self.mark_in_flight(key, now)
             keys.extend(due_keys)
             return bool(due_keys)
 
         for pacer in pacers:
-            take_from(pacer, 0)  # only probes of silent regions
+            take_from(pacer, 0, self._random_jitter())  # only probes of silent regions
         by_age = [(pacer.oldest, n) for n, pacer in enumerate(pacers) if not pacer.silent]
         heapq.heapify(by_age)
         while by_age and len(keys) < limit:
