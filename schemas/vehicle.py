@@ -232,7 +232,7 @@ def _drop_foreign_names(path: Path) -> bytes:
     try:
         given = json.loads(content)
     except ValueError:
-        return content  # the validation explains what is wrong
+        return content  # the validation then reports invalid JSON
     known = list(Vehicle.model_fields)
     foreign = [
         name

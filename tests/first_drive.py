@@ -11,13 +11,12 @@ from io import StringIO
 from pathlib import Path
 from typing import TypeAlias
 
-from deploy.router import open_router
 from edge_agent.cli import main as edge_agent
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.structure import ROOT
-from tests.test_end_to_end import VEHICLES, System
+from tests.test_end_to_end import VEHICLES, System, run_system
 
 Cells: TypeAlias = list[dict[str, object]]
 
@@ -35,13 +34,8 @@ def map_first_drive(folder: Path) -> tuple[Cells, list[str]]:
     once under each of several vehicle names. Return the cells of the map and the keys of the
     alerts.
     """
-    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
-    with router:
-        system = System(folder, endpoints[0])
-        try:
-            return _publish_drive(system, folder / "drive.parquet")
-        finally:
-            system.stop()
+    with run_system(folder) as system:
+        return _publish_drive(system, folder / "drive.parquet")
 
 
 def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:

@@ -8,6 +8,7 @@ import json
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -118,15 +119,22 @@ class System:
         return cells
 
 
-@pytest.fixture
-def system(tmp_path: Path) -> Iterator[System]:
+@contextmanager
+def run_system(folder: Path) -> Iterator[System]:
+    """Run a new router and service, with their files in `folder`, until the context ends."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     with router:
-        running = System(tmp_path, endpoints[0])
+        running = System(folder, endpoints[0])
         try:
             yield running
         finally:
             running.stop()
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[System]:
+    with run_system(tmp_path) as running:
+        yield running
 
 
 def slippery_cells(system: System) -> list[dict[str, object]]:

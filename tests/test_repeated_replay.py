@@ -16,12 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.router import open_router
 from edge_agent.cli import main as edge_agent
 from edge_agent.cli import replay
 from fleet_service.archive.format import reading
 from schemas.wire import Kind
-from tests.test_end_to_end import ICE, System
+from tests.test_end_to_end import ICE, System, run_system
 
 Output = pytest.CaptureFixture[str]
 DAY_S = 86_400
@@ -57,16 +56,11 @@ main(sys.argv[1:])
 @pytest.fixture
 def system(tmp_path: Path) -> Iterator[System]:
     """Router and service, with a recorded drive of the vehicle anna; a batch has few records."""
-    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
-    with router:
-        running = System(tmp_path, endpoints[0])
-        try:
-            settings = json.loads(running.agent.read_text())
-            running.agent.write_text(json.dumps(settings | {"batch_rows": 3}))
-            running.record_drive("anna", "braking", ICE, 0)
-            yield running
-        finally:
-            running.stop()
+    with run_system(tmp_path) as running:
+        settings = json.loads(running.agent.read_text())
+        running.agent.write_text(json.dumps(settings | {"batch_rows": 3}))
+        running.record_drive("anna", "braking", ICE, 0)
+        yield running
 
 
 def time_text(age_s: float) -> str:

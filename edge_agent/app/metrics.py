@@ -9,7 +9,7 @@ from edge_agent.app.live_loop import Progress
 from edge_agent.publish.ack_settlement import CLOCK_OFF_S, describe_clock
 from edge_agent.publish.publisher import Publisher
 from schemas.runtime.link_watch import link_metrics
-from schemas.runtime.metrics import Metric, gauge
+from schemas.runtime.metrics import Metric, counter, gauge
 from schemas.wire import Kind
 
 BEHIND_S: Final = 1.0  # [s] delay from which the agent is too slow for its vehicles
@@ -32,7 +32,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "acknowledged_records", "records acknowledged by a service", counts.acknowledged
         ),
         _kind_counter("rejected_records", "records rejected by a service", counts.rejected),
-        _counter(
+        counter(
             "dropped_records",
             "records dropped because the outbox was full",
             status.dropped_records,
@@ -40,22 +40,22 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         _kind_counter(
             "late_batches", "batches that came later than the service's lateness", counts.late
         ),
-        _counter(
+        counter(
             "unanswered_records",
             "records given up because only later batches were acknowledged",
             status.unanswered_records,
         ),
-        _counter("resent_batches", "batches sent again", counts.resent_batches),
-        _counter("bad_acks", "acknowledgements that could not be read", counts.bad_acks),
-        _counter(
+        counter("resent_batches", "batches sent again", counts.resent_batches),
+        counter("bad_acks", "acknowledgements that could not be read", counts.bad_acks),
+        counter(
             "damaged_spools", "times that the outbox was found damaged", status.damage_counts[0]
         ),
-        _counter(
+        counter(
             "damaged_records",
             "records lost because the outbox was damaged",
             status.damage_counts[1],
         ),
-        _counter("sender_failures", "failed iterations of the sending thread", counts.failures),
+        counter("sender_failures", "failed iterations of the sending thread", counts.failures),
         gauge(
             "stranded_records",
             "records in the outbox under a previous vehicle name",
@@ -108,10 +108,6 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     if progress.now_s > BEHIND_S:
         found.append(f"{progress.now_s:.1f} s behind real time")
     return found
-
-
-def _counter(name: str, text: str, count: int) -> Metric:
-    return Metric(name, "counter", text, {"": count})
 
 
 def _kind_counter(name: str, text: str, counts: Mapping[Kind, int]) -> Metric:

@@ -10,7 +10,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive.format import segments
 from fleet_service.counts import ServiceCounts
 from schemas.config import ServiceConfig
-from schemas.runtime.metrics import Metric, gauge
+from schemas.runtime.metrics import Metric, counter, gauge
 from schemas.wire import Kind
 
 # [s] A worker whose loop has not passed for this time counts as stalled. A pass takes milliseconds.
@@ -62,10 +62,7 @@ def collect_metrics(
 
 def _counter_metrics(counts: ServiceCounts) -> list[Metric]:
     """Return the counts since the start of the service as metrics."""
-    single = [
-        Metric(name, "counter", text, {"": getattr(counts, name)})
-        for name, text in counts.texts().items()
-    ]
+    single = [counter(name, text, getattr(counts, name)) for name, text in counts.texts().items()]
     failures = {**counts.failures, **({"key": counts.key_failures} if counts.key_failures else {})}
     kinds = {"observation": counts.observations, "state": counts.states}
     return [

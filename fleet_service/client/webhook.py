@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import StretchAlert, format_time
 from schemas.errors import InputError
-from schemas.runtime.metrics import Metric, gauge
+from schemas.runtime.metrics import Metric, counter, gauge
 from schemas.thresholds import SLIPPERY_MU
 
 if TYPE_CHECKING:
@@ -159,12 +159,7 @@ class Webhook:
         alerts = {name: float(self.counts[name]) for name in ("delivered", *LOSSES)}
         return [
             Metric("webhook_alerts", "counter", "Alerts by outcome", alerts, "outcome"),
-            Metric(
-                "webhook_failures",
-                "counter",
-                "Failed deliveries",
-                {"": float(self.counts["failures"])},
-            ),
+            counter("webhook_failures", "Failed deliveries", float(self.counts["failures"])),
             gauge("webhook_waiting", "Alerts in the queue", float(self.waiting_count)),
         ]
 

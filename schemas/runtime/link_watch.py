@@ -15,7 +15,7 @@ from typing import Final
 
 import zenoh
 
-from schemas.runtime.metrics import Metric
+from schemas.runtime.metrics import Metric, counter
 
 # Protocols that the metrics always list, even without a link, so that an alarm rule can name them.
 PROTOCOLS: Final = (
@@ -110,17 +110,11 @@ def link_metrics(watches: Sequence[LinkWatch]) -> list[Metric]:
     found = Counter(protocol for watch in watches for protocol in watch.protocols)
     return [
         Metric("links", "gauge", "links to routers, by transport", _by_protocol(found), "protocol"),
-        Metric(
-            "links_opened",
-            "counter",
-            "connections to a router",
-            {"": sum(watch.epoch for watch in watches)},
-        ),
-        Metric(
+        counter("links_opened", "connections to a router", sum(watch.epoch for watch in watches)),
+        counter(
             "links_lost",
-            "counter",
             "connections to a router that were lost",
-            {"": sum(watch.lost for watch in watches)},
+            sum(watch.lost for watch in watches),
         ),
     ]
 

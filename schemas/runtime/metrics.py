@@ -50,6 +50,11 @@ def gauge(name: str, text: str, value: float) -> Metric:
     return Metric(name, "gauge", text, {"": value})
 
 
+def counter(name: str, text: str, count: float) -> Metric:
+    """Return a metric with a single value that never falls."""
+    return Metric(name, "counter", text, {"": count})
+
+
 Read = Callable[[], Sequence[Metric]]
 Troubles = Callable[[], Sequence[str]]
 
