@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
+from fleet_service.fusion.store.records import NONE
+from fleet_service.fusion.store.table import find_row
 from schemas import grid
+from schemas.numeric import IntArray
 from schemas.runtime.jit import refcount_free_inlined
+from schemas.runtime.records import RecordArray
 
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell number
 _X: Final = 0x5555555555555555 & _WHOLE  # bits of the column number; `_Y`: of the row number
@@ -35,24 +39,61 @@ def next_cell(cell: int, heading: int) -> int:
     return x | y
 
 
-@refcount_free_inlined
-def heading_on(side: int, sector: int) -> int:
-    """Return the heading sector of the neighbours on one side of a cell; `sector` is its own."""
-    return (sector + 2) % grid.SECTORS if side == ACROSS else sector
+class SearchSide(NamedTuple):
+    """One side of a slot (cell and heading sector) on which neighbours are searched for.
 
-
-@refcount_free_inlined
-def step_to(cell: int, previous: int, sector: int, side: int, step: int) -> int:
-    """Return the cell of a neighbour of `cell` on one side. `step` is the number of the neighbour,
-    counted from 1, and `sector` is the heading sector.
-
-    Before and behind the cell, neighbour k is k cells away. It is found from `previous`, the cell
-    of neighbour `step` - 1 (at first `cell` itself). For the opposite direction of the road,
-    neighbour 1 is in `cell` itself, because both directions may share a cell. Neighbours 2 and 3
-    are in the cells to its left and right.
+    Attributes:
+        key: number of the slot, cell · 4 + sector.
+        side: BEFORE, BEHIND or ACROSS.
+        since: time [ns]; a visit after it shows that a road leads through a cell.
     """
-    if side != ACROSS:
-        return next_cell(previous, (sector + 2 * side) % grid.SECTORS)
-    if step == 1:
-        return cell
-    return next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)
+
+    key: int
+    side: int
+    since: int
+
+
+@refcount_free_inlined
+def find_neighbour(
+    table: IntArray, cells: RecordArray, search: SearchSide, previous: int, step: int
+) -> tuple[int, int]:
+    """Return the cell and the row of a neighbour of a slot; the row is NONE if no vehicle visited
+    the neighbour.
+
+    Before and behind, neighbour k is k cells away along the road. It is the cell straight ahead of
+    neighbour k - 1, or, if that one was not visited lately, a cell to its left or right that was.
+    So a road is also followed where it runs diagonally to the grid.
+
+    For the opposite direction of the road, neighbour 1 is in the slot's own cell, because both
+    directions may share a cell. Neighbours 2 and 3 are in the cells to its left and right.
+
+    Args:
+        table: hash table that finds the rows of `cells`.
+        cells: records of the slots.
+        search: the slot and its side.
+        previous: cell of neighbour `step` - 1; at first the slot's own cell.
+        step: number of the neighbour, counted from 1.
+    """
+    cell = search.key // grid.SECTORS
+    sector = search.key % grid.SECTORS
+    opposite = (sector + 2) % grid.SECTORS
+    if search.side == ACROSS:
+        if step > 1:
+            cell = next_cell(cell, (sector + _SIDEWAYS[step - 2]) % grid.SECTORS)
+        return cell, _visited_row(table, cells, cell, opposite)
+    heading = sector if search.side == BEFORE else opposite
+    ahead = next_cell(previous, heading)
+    row = _visited_row(table, cells, ahead, sector)
+    if row == NONE or cells[row].time < search.since:
+        for turn in _SIDEWAYS:
+            beside = next_cell(ahead, (heading + turn) % grid.SECTORS)
+            beside_row = _visited_row(table, cells, beside, sector)
+            if beside_row != NONE and cells[beside_row].time >= search.since:
+                return beside, beside_row
+    return ahead, row
+
+
+@refcount_free_inlined
+def _visited_row(table: IntArray, cells: RecordArray, cell: int, sector: int) -> int:
+    row = find_row(table, cells, cell * grid.SECTORS + sector)
+    return NONE if row == NONE or cells[row].vehicles == 0 else row

@@ -72,15 +72,13 @@ from fleet_service.fusion.adjacent import (
     ACROSS_CELLS,
     BEFORE,
     BEHIND,
-    heading_on,
-    next_cell,
-    step_to,
+    SearchSide,
+    find_neighbour,
 )
 from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road, read_slippery
 from fleet_service.fusion.sources import is_border
 from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
-from fleet_service.fusion.store.table import find_row
 from fleet_service.fusion.votes import ScratchRow
 from fleet_service.fusion.weather import Weather, road_time
 from schemas import grid, mugrid
@@ -92,6 +90,8 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
+# [ns] time for which a visit shows that a road leads through a cell
+_ROAD_NS: Final = int(c.FORGOTTEN_S) * NS
 # number of cells in a tile, and largest number of aged beliefs that one reading keeps
 _TILE_CELLS: Final = 4 ** (grid.CELL_ZOOM - grid.TILE_ZOOM)
 
@@ -270,16 +270,12 @@ def _multiply_side(parts: MapParts, target: Readout, side: int, buffers: Buffers
     direction of the road, it is the first cell that is measured.
     """
     cells = parts.live.cells
-    key = cells[target.slot].key
-    cell = key // grid.SECTORS
-    sector = key % grid.SECTORS
+    search = SearchSide(cells[target.slot].key, side, target.now - _ROAD_NS)
     across = side == ACROSS
-    towards = heading_on(side, sector)
     has_messages = False
-    neighbour = cell
+    neighbour = search.key // grid.SECTORS
     for step in range(1, (ACROSS_CELLS if across else c.HEARD_CELLS) + 1):
-        neighbour = step_to(cell, neighbour, sector, side, step)
-        row = find_row(parts.table, cells, neighbour * grid.SECTORS + towards)
+        neighbour, row = find_neighbour(parts.table, cells, search, neighbour, step)
         measured = row != NONE and _can_combine(parts, target, row, buffers)
         if measured:
             road = buffers.scratch[ScratchRow.BELIEF]
@@ -372,14 +368,11 @@ def _choose_message(
     cells = live.cells
     most = 0.0
     best = NONE
-    key = cells[target.slot].key
-    sector = key % grid.SECTORS
-    towards = heading_on(side, sector)
-    neighbour = key // grid.SECTORS
+    search = SearchSide(cells[target.slot].key, side, target.now - _ROAD_NS)
+    neighbour = search.key // grid.SECTORS
     for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
-        neighbour = step_to(key // grid.SECTORS, neighbour, sector, side, step)
-        row = find_row(parts.table, cells, neighbour * grid.SECTORS + towards)
-        if row == NONE or cells[row].vehicles == 0:
+        neighbour, row = find_neighbour(parts.table, cells, search, neighbour, step)
+        if row == NONE:
             continue
         ended = _stored_slippery(live, row) < c.NEIGHBOUR_GRIP
         if ended or is_border(live, target.slot, row, target.now):
@@ -420,27 +413,18 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
 def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray) -> None:
     for k in range(len(slots)):
         out[k, 0] = slots[k]
-        key = live.cells[slots[k]].key
-        sector = key % grid.SECTORS
-        for side in range(2):
-            neighbour = key // grid.SECTORS
-            for step in range(c.NEIGHBOURS):
-                neighbour = next_cell(neighbour, (sector + 2 * side) % grid.SECTORS)
-                row = find_row(table, live.cells, neighbour * grid.SECTORS + sector)
-                if row == NONE or live.cells[row].vehicles == 0:
+        own = live.cells[slots[k]]
+        for side in (BEFORE, BEHIND, ACROSS):
+            search = SearchSide(own.key, side, own.time - _ROAD_NS)
+            neighbour = search.key // grid.SECTORS
+            for step in range(ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS):
+                neighbour, row = find_neighbour(table, live.cells, search, neighbour, step + 1)
+                if row == NONE:
                     continue
-                if _stored_slippery(live, row) < c.NEIGHBOUR_GRIP:
+                if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
+                    out[k, 1 + side * c.NEIGHBOURS + step] = row
+                elif side != ACROSS:
                     break
-                out[k, 1 + side * c.NEIGHBOURS + step] = row
-        cell = key // grid.SECTORS
-        towards = heading_on(ACROSS, sector)
-        for step in range(ACROSS_CELLS):
-            neighbour = step_to(cell, cell, sector, ACROSS, step + 1)
-            row = find_row(table, live.cells, neighbour * grid.SECTORS + towards)
-            if row == NONE or live.cells[row].vehicles == 0:
-                continue
-            if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
-                out[k, 1 + 2 * c.NEIGHBOURS + step] = row
 
 
 @refcount_free_inlined

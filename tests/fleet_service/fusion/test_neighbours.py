@@ -54,6 +54,14 @@ def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
     return fusion
 
 
+def cell_at(along: int, left: int, sector: int) -> int:
+    """Return the number of the cell that lies `along` cells ahead and `left` cells to the left of
+    the cell CELL, seen in the direction of a heading sector.
+    """
+    dx, dy = DIRECTIONS[sector]
+    return east(along * dx + left * dy, north=left * dx - along * dy)
+
+
 def tell(fusion: Fusion, cell: int, said: FloatArray, sector: int = 0) -> None:
     vehicles = cell % 1000 * 100 + np.arange(len(said))
     o = observations(5.0 * np.arange(len(said)), vehicles, said, cell)
@@ -110,6 +118,23 @@ def test_the_other_direction_of_the_road_tells() -> None:
     across = road({0: UNTESTED})
     tell(across, east(0, north=1), snow(), sector=1)
     assert slippery(belief(across)) < 0.21
+
+
+@pytest.mark.parametrize("sector", range(4))
+@pytest.mark.parametrize("slope", [-1, 1])
+def test_messages_follow_a_road_that_runs_diagonally_to_the_grid(slope: int, sector: int) -> None:
+    fusion = Fusion(120.0)
+    for k in (-2, -1, 1, 2):
+        tell(fusion, cell_at(k, slope * k, sector), snow(), sector)
+    tell(fusion, CELL, UNTESTED, sector)
+    assert slippery(belief(fusion, sector=sector)) > 0.9
+
+
+def test_a_road_that_continues_straight_on_hears_no_cell_beside_it() -> None:
+    fusion = road({0: UNTESTED, 1: dry(), -1: dry()})
+    for along in (-1, 1):
+        tell(fusion, cell_at(along, 1, 0), snow())
+    assert slippery(belief(fusion)) == slippery(belief(road({0: UNTESTED})))
 
 
 @pytest.mark.parametrize("others", [dry(), UNTESTED, at_least([0.02] * 9), np.zeros((3, 32))])

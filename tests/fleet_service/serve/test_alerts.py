@@ -191,16 +191,17 @@ def test_an_alert_ends_with_two_more_sources_of_grip_than_of_ice(icy: int, neede
     assert under == [True] * (needed - 1) + [False] * (7 - needed)
 
 
+@pytest.mark.parametrize("slope", [0, 1])
 @pytest.mark.parametrize(
     ("beside", "grip_used", "alerted"),
     [(0.2, False, [True, True]), (0.85, False, [False, False]), (0.2, True, [False, False])],
 )
 def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
-    beside: float, grip_used: bool, alerted: list[bool]
+    beside: float, grip_used: bool, alerted: list[bool], slope: int
 ) -> None:
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
-    cells = grid.interleave(COLUMN + np.array([0, 2]), np.full(2, ROW))
+    cells = grid.interleave(COLUMN + np.array([0, 2]), ROW + slope * np.array([0, 1]))
     if grip_used:
         for cell in cells.tolist():
             fusion.update(observations([0.0], [9], at_least(np.array([0.8])), cell))
