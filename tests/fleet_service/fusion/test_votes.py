@@ -64,11 +64,21 @@ def test_any_number_of_unexcited_vehicles_keeps_the_priors_upper_end(used: float
     assert slippery(belief(fusion)) < 0.31
 
 
-def test_a_fall_that_senders_disagree_about_is_no_value() -> None:
+def test_fifty_bounds_that_fall_by_half_a_nat_are_noise() -> None:
     fusion = Fusion(120.0)
-    sloping = np.tile(-0.9 * np.linspace(0.0, 1.0, 32), (50, 1))
+    sloping = np.tile(-0.5 * np.linspace(0.0, 1.0, 32), (50, 1))
     fusion.update(observations(np.arange(50.0), np.arange(50), sloping))
     np.testing.assert_allclose(belief(fusion), mugrid.PRIOR, atol=1e-6)
+
+
+def test_a_larger_fall_of_a_bound_is_evidence_against_high_friction_only() -> None:
+    bound = at_least(np.full(5, 0.2))
+    flat, fallen = Fusion(120.0), Fusion(120.0)
+    for fusion, fall in ((flat, 0.0), (fallen, 0.9)):
+        falling = bound - np.where(mugrid.CENTRES > 0.5, fall, 0.0)
+        fusion.update(observations(5.0 * np.arange(5), np.arange(5), falling))
+    assert slippery(belief(fallen)) > slippery(belief(flat)) + 0.1
+    assert interval(belief(fallen))[0] <= interval(belief(flat))[0]
 
 
 def test_ice_is_believed_after_few_passes_of_vehicles_that_had_said_dry() -> None:
@@ -139,7 +149,7 @@ def test_a_sender_that_says_nothing_changes_nothing() -> None:
 
 
 @given(st.lists(st.integers(0, 255), min_size=32, max_size=32), st.floats(0.0, 1.3))
-def test_bound_says_nothing_above_the_grip_used_and_value_is_unchanged(
+def test_bound_excludes_no_friction_just_above_the_grip_used(
     steps: list[int], used: float
 ) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
@@ -147,7 +157,9 @@ def test_bound_says_nothing_above_the_grip_used_and_value_is_unchanged(
     if sent[0, -1] >= c.VALUE_DROP_STEPS:
         np.testing.assert_array_equal(found, sent)
     else:
-        assert not found[0, np.float32(used) <= mugrid.CENTRES].any()
+        above = found[0, np.float32(used) <= mugrid.CENTRES]
+        last = len(above) - int(np.argmin(above[::-1])) if len(above) else 0
+        assert not above[:last].any()
         assert (found <= sent).all()
 
 
