@@ -146,7 +146,7 @@ def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> No
 
 
 @pytest.mark.parametrize(
-    ("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)]
+    ("drivers", "found", "raised"), [(3, 0, False), (3, 1, False), (3, 2, True), (6, 2, False)]
 )
 def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
     drivers: int, found: int, raised: bool
