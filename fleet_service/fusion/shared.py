@@ -12,7 +12,7 @@ computes from p:
     σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²
            where the reading μ_j is lower than the road's μ_i
     σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  elsewhere
-    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff)
+    σ_c² = COMMON_ALWAYS² + (COMMON_MANOEUVRE² + σ_s²)/n_eff
     n_eff = (Σ w_k)²/Σ w_k²
 
 The last term of σ₋² is the error from the tyre's force curve. It is only in σ₋, because a reading
@@ -27,7 +27,6 @@ SHARED_PART·stated² (relative, weighted mean of the cell's values).
 
 Legend
     ū      mean grip used by the vehicles that gave values, weighted
-    a      SHARED_ALWAYS, the part of σ_s² that other manoeuvres do not average out
     n_eff  effective number of kinds of manoeuvre: 1 if all values come from one kind
     w_k    weight of the values of manoeuvre k; newer values replace older ones
     COMMON_…, SHARED_…    parts of the error, see `constants`
@@ -163,11 +162,10 @@ def shared_kernel(
         slope: error of a value per unit of unused grip.
     """
     centres = mugrid.CENTRES
-    always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
-    always += np.square(stated) * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
+    common = c.COMMON_ALWAYS**2 + (c.COMMON_MANOEUVRE**2 + np.square(stated)) / kinds
     unused = c.SHARED_SHARE - np.asarray(used)[..., None] / centres
     shape = np.clip(slope * unused, 0.0, c.SHARED_MOST)
-    relative = np.sqrt(np.asarray(always))[..., None] * centres
+    relative = np.sqrt(np.asarray(common))[..., None] * centres
     low = np.hypot(np.hypot(relative, c.COMMON_ABSOLUTE), shape * centres)
     return _two_sided(low, np.hypot(relative, c.COMMON_HIGH))
 

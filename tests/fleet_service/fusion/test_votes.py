@@ -149,9 +149,7 @@ def test_a_sender_that_says_nothing_changes_nothing() -> None:
 
 
 @given(st.lists(st.integers(0, 255), min_size=32, max_size=32), st.floats(0.0, 1.3))
-def test_bound_excludes_no_friction_just_above_the_grip_used(
-    steps: list[int], used: float
-) -> None:
+def test_bound_excludes_no_friction_just_above_the_grip_used(steps: list[int], used: float) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
     found = level_above_used(sent, np.array([used], np.float32))
     if sent[0, -1] >= c.VALUE_DROP_STEPS:
