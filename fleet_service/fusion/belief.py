@@ -54,8 +54,6 @@ _STEP: Final = 0.25
 # Largest number of diffusion steps: those of one day. After a day, sudden changes have replaced the
 # belief by the prior.
 _STEPS: Final = math.ceil(_DIFFUSION * 24 * 3600 / _STEP)
-# A smaller fall of a lower bound's log-likelihood towards the highest friction is noise, in steps.
-_NOISE_STEPS: Final = c.VALUE_DROP_STEPS // 2
 # likelihood for each number of steps below the maximum
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
@@ -292,14 +290,15 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
                 whole += _TAPS[k, i] * padded[i + k]
             out[i] = whole
     else:
-        last = 0  # last maximum
-        for j in range(_BINS):
-            last = j if evidence[j] <= evidence[last] else last
-        falls = evidence[_BINS - 1] - int(evidence[last]) > _NOISE_STEPS
         steps = np.uint8(255)
         for j in range(_BINS):
-            steps = evidence[j] if falls and j > last else min(steps, evidence[j])
+            steps = min(steps, evidence[j])
             out[j] = _LIKELIHOOD[steps]
+        if evidence[_BINS - 1] - int(steps) > c.NOISE_DROP_STEPS:
+            for j in range(_BINS - 1, -1, -1):
+                if evidence[j] == steps:
+                    break
+                out[j] = _LIKELIHOOD[evidence[j]]
     scale = np.float32(_BINS) / np.float32(sum_bins(out))
     for i in range(_BINS):
         out[i] *= scale

@@ -179,6 +179,8 @@ UNSURE: Final = 0.45
 # (.80).
 EVIDENCE_NATS: Final = VALUE_NATS
 VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
+# Largest fall of a bound's log-likelihood towards the highest friction that is noise, in steps.
+NOISE_DROP_STEPS: Final = VALUE_DROP_STEPS // 2
 # Number of cells on each side that may get a part. A position that is less accurate has no use.
 SPREAD_CELLS: Final = 2
 # A vote counts as a visit to a cell, and is compared with other vehicles there, only if the vehicle

@@ -114,9 +114,10 @@ def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Return likelihoods (n, 32) that claim no more grip than the grip used (n,) supports.
 
     A likelihood that is only a lower bound is made flat from the bin that contains `used` minus
-    half the standard deviation of `used`, up to its last maximum from there on. A hundred such
-    bounds together then raise the lower end of the interval to at most .95·used + .04. A likelihood
-    that also limits μ from above is not changed, nor is a row where `used` is NaN.
+    half the standard deviation of `used`, up to its last maximum from there on, or to the end if
+    it falls by noise only. A hundred such bounds together then raise the lower end of the interval
+    to at most .95·used + .04. A likelihood that also limits μ from above is not changed, nor is a
+    row where `used` is NaN.
     """
     out = steps.copy()
     _level_rows(out, np.asarray(used, np.float64))
@@ -132,14 +133,15 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
         floor = np.uint8(255)
         for i in range(place + 1):
             floor = min(floor, steps[n, i])
-        last = place
+        least = np.uint8(255)
         for i in range(place, mugrid.BINS):
-            last = i if steps[n, i] <= steps[n, last] else last
-        maximum = steps[n, last]
+            least = min(least, steps[n, i])
+        falling = steps[n, mugrid.BINS - 1] - int(least) > c.NOISE_DROP_STEPS
+        for i in range(mugrid.BINS - 1, place - 1, -1):
+            falling = falling and steps[n, i] > least
+            steps[n, i] = steps[n, i] - least if falling else 0
         for i in range(place):
             steps[n, i] = max(steps[n, i], floor) - floor
-        for i in range(place, mugrid.BINS):
-            steps[n, i] = steps[n, i] - maximum if i > last else 0
 
 
 def states_more_grip(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
