@@ -1,8 +1,10 @@
 """Reference archive: a small archive with every kind of file that a service writes, and the map
 that it gave when it was written.
 
-    python -m tests.fleet_service.archive.kept FOLDER      write a new archive and its map with
-                                                           the present code
+    python -m tests.fleet_service.archive.kept FOLDER        write a new archive and its map with
+                                                             the present code
+    python -m tests.fleet_service.archive.kept --map FOLDER  read an existing archive, and write
+                                                             only its map, after the fusion changed
 
 Commit 1f90692 wrote `data/v1.0`, before files had a version. A stored archive is never written
 again, because later code must still be able to read it.
@@ -16,7 +18,9 @@ late. There are also states and a weather report.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -29,6 +33,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive.format import snapshots
 from fleet_service.archive.maintenance import rollup
 from fleet_service.archive.maintenance.compaction import compact
+from fleet_service.archive.maintenance.retention import drop_checkpoints
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.encode import cell_table
@@ -162,12 +167,27 @@ def make(root: Path) -> dict[str, Any]:
         }
 
 
+def read_again(root: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Return the map, alerts and rows `found` of the reference archive in the folder `root`, with
+    the map and the number of alerts that the present code computes from the archive's rows.
+    """
+    with tempfile.TemporaryDirectory() as copy:
+        archive = Path(shutil.copytree(root, Path(copy) / "archive"))
+        drop_checkpoints(archive)
+        with closing(Engine(ServiceConfig(), archive)) as engine:
+            return found | map_of(engine, found["at"]) | {"alerts": engine.alerts.count}
+
+
 def main() -> None:
-    """Create the reference archive in the folder named on the command line."""
-    folder = Path(sys.argv[1])
+    """Create the reference archive in the folder named on the command line, or only its map."""
+    folder = Path(sys.argv[-1])
+    maps = folder / "map.json"
+    if "--map" in sys.argv:
+        maps.write_text(json.dumps(read_again(folder / "archive", json.loads(maps.read_text()))))
+        return
     found = make(folder / "archive")
     (folder / "lock").unlink(missing_ok=True)
-    (folder / "map.json").write_text(json.dumps(found))
+    maps.write_text(json.dumps(found))
 
 
 if __name__ == "__main__":
