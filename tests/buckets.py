@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.ports import free_ports
-from tests.waiting import until
+from tests.waiting import freeze, until
 
 BUCKET = "grip"
 PREFIX = "north/map"
@@ -63,7 +63,7 @@ class BucketServer:
             self.stop()
         else:
             assert self._process is not None
-            self._process.send_signal(signal.SIGSTOP)
+            freeze(self._process)
 
     def bring_back(self, how: str) -> None:
         """Make the server available again after a call of `take_away`. `how` ("stopped" or

@@ -47,7 +47,7 @@ def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals
 @pytest.mark.campaign
 def test_agent_and_service_leave_a_frozen_router_behind_and_lose_nothing(there: Stage) -> None:
     (load,) = there.loads
-    there.router.send_signal(signal.SIGSTOP)
+    there.router.freeze()
     stored = len(read_journals(there.journals).stored)
     until(lambda: len(read_journals(there.journals).stored) > stored + 4)
     for part in (load, there.service):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -24,6 +27,16 @@ def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> No
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {patience_s} s: {condition}")
         pause.wait(0.005)
+
+
+def freeze(process: subprocess.Popen[bytes]) -> None:
+    """Freeze a child process until it receives SIGCONT, and return when all its threads stand.
+
+    The signal alone is not enough: on a busy machine, threads of the process run on for tens of
+    milliseconds, until its main thread has received the signal.
+    """
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
 
 def matched(asker: zenoh.Publisher | zenoh.Querier) -> None:

@@ -178,7 +178,7 @@ def test_replay_with_a_hanging_session_keeps_its_estimates(drive: Path, tmp_path
     router.start()
     try:
         settings = {"zenoh": {"connect": [router.line_with("router: ").split()[1]]}}
-        router.send_signal(signal.SIGSTOP)
+        router.freeze()
         (tmp_path / "agent.json").write_text(
             json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")})
         )

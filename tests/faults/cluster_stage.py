@@ -217,11 +217,11 @@ def _kill_host(host: Host, *_: object) -> None:
 
 
 def _freeze_host(host: Host, *_: object) -> None:
-    host.part.send_signal(signal.SIGSTOP)
+    host.part.freeze()
 
 
 def _pause_host(host: Host, random_: random.Random, lease_s: float) -> None:
-    host.part.send_signal(signal.SIGSTOP)
+    host.part.freeze()
     timer = threading.Timer(
         lease_s * random_.uniform(*FROZEN), lambda: host.part.send_signal(signal.SIGCONT)
     )
@@ -382,7 +382,7 @@ class Machines:
         checkpoints (saved states).
         """
         for part in parts:
-            part.send_signal(signal.SIGSTOP)
+            part.freeze()
         time.sleep(SETTLED_S)
         former = self.hand_over(router)
         mine = self.serving.root / CHECKPOINTS

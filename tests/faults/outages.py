@@ -57,7 +57,7 @@ def freeze_parts(site: Site) -> list[Figure]:
         _load_agents(there, site.choose_amount(3, 1))
         for part in (there.router, there.service):
             time.sleep(site.choose_amount(3, 1))
-            part.send_signal(signal.SIGSTOP)
+            part.freeze()
             began = time.time()
             time.sleep(frozen_s)
             spans.append((began, time.time()))
@@ -90,7 +90,7 @@ def stop_parts(site: Site) -> list[Figure]:
             _load_agents(there, 1)
             time.sleep(site.choose_amount(3, 1))
             if freeze:
-                there.router.send_signal(signal.SIGSTOP)
+                there.router.freeze()
                 time.sleep(site.choose_amount(3, 1))
             for part in (*there.loads, there.service):
                 began = time.monotonic()

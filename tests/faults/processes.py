@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tests.waiting import until
+from tests.waiting import freeze, until
 
 START_S = 120.0  # time for a start; the first one compiles the kernels
 STOP_S = 30.0  # a stopped process needs 3 s on an idle machine
@@ -84,6 +84,11 @@ class Part:
         """Send a signal to the process if it is alive."""
         if self.is_alive:
             os.kill(self.pid, number)
+
+    def freeze(self) -> None:
+        """Freeze the process, if it is alive, until it receives SIGCONT."""
+        if self._process is not None and self.is_alive:
+            freeze(self._process)
 
     def kill(self) -> None:
         """Kill the process with SIGKILL, and wait until it has ended."""

@@ -31,6 +31,7 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, TILE, batch, key
+from tests.waiting import freeze
 
 NEAR = f"{LONGITUDE - 0.1},{LATITUDE - 0.1},{LONGITUDE + 0.1},{LATITUDE + 0.1}"
 
@@ -195,7 +196,7 @@ def test_a_process_that_hangs_is_killed_and_the_asker_gets_an_error(
 ) -> None:
     if was_idle:
         list(asker.ask(question(bbox=NEAR), lambda _: True))
-        begun[0].send_signal(signal.SIGSTOP)
+        freeze(begun[0])
     monkeypatch.setattr(historical_maps, "SILENT_S", 0.1)  # a new process needs a second
     with pytest.raises(InputError, match="at: the past map made no progress"):
         list(asker.ask(question(bbox=NEAR), lambda _: True))

@@ -42,14 +42,10 @@ RESEND_S = 1.0
 LEASE_S = 4.0  # lease time of services in threads; a request may take a quarter of it
 
 
-def freeze_host(host: Host) -> None:
-    host.part.send_signal(signal.SIGSTOP)
-
-
 GONE: dict[str, Callable[[Host], None]] = {
     "killed": lambda host: host.part.kill(),
     "stopped": lambda host: host.part.send_signal(signal.SIGTERM),
-    "frozen": freeze_host,
+    "frozen": lambda host: host.part.freeze(),
     "cut from the bucket": lambda host: host.to_bucket.cut(),
     "cut from the routers": lambda host: host.to_router.cut(),
 }
