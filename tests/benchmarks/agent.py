@@ -245,7 +245,7 @@ def measure_replay(folder: Path) -> list[Figure]:
     two = median_s(lambda: list(estimate_drives(tasks, "aco-fckf", 2)), 3)
     return [
         Figure(
-            "bench.replay.scaling", one / (2 * two), "rate of two jobs over twice one", 0.9, "more"
+            "bench.replay.scaling", one / (2 * two), "rate of two jobs over twice one", 0.93, "more"
         ),
         Figure(
             "bench.replay.efficiency",

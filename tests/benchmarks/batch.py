@@ -36,7 +36,7 @@ def measure_all(folder: Path) -> list[Figure]:
         ),
         Figure("spark.rebuild.difference", spread.rebuild_difference(folder / "rebuild"), "", 1e-6),
         Figure(
-            "spark.replay.scaling", spread.replay_scaling(logs, folder / "scaling"), "", 1.6, "more"
+            "spark.replay.scaling", spread.replay_scaling(logs, folder / "scaling"), "", 1.8, "more"
         ),
     ]
 

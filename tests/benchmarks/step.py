@@ -192,7 +192,7 @@ def bank() -> list[Figure]:
             "bench.bank.vs_simd_c",
             vs_simd(drive, speed),
             "times C in vectors, paper-aco-fckf, N = 1 000, one thread",
-            3,
+            1.6,
         )
     )
     return [
