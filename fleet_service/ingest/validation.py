@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -212,7 +212,7 @@ def check_rows(
         index of the first broken rule of each row, (n,), -1 for a valid row; and the rules to which
         the indices refer.
     """
-    broken, rules = _broken_ranges(kind, columns)
+    broken = _broken_ranges(kind, columns)
     extra = (
         _broken_observation(columns, clock)
         if kind is Kind.OBSERVATION
@@ -227,8 +227,8 @@ def check_rows(
         )
     )
     broken += [rows for rows, _, _ in extra]
-    rules += [Refusal(rule, 0, reason) for _, rule, reason in extra]
-    return _first_broken(broken), tuple(rules)
+    others = (Refusal(rule, 0, reason) for _, rule, reason in extra)
+    return _first_broken(broken), (*_range_rules(kind), *others)
 
 
 ERASED: Final = Refusal(
@@ -251,9 +251,8 @@ def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
     )
 
 
-def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]], list[Refusal]]:
+def _broken_ranges(kind: Kind, columns: Columns) -> list[NDArray[np.bool_]]:
     broken = []
-    rules = []
     for column, least, most, optional in RANGES[kind]:
         values = columns[column]
         broken.append(
@@ -261,12 +260,18 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
             if optional
             else ~((values >= least) & (values <= most))
         )
-        rules.append(
-            Refusal(
-                column, 0, f"{column}: lies outside [{least:g}, {most:g}]; correct it at the source"
-            )
+    return broken
+
+
+@cache
+def _range_rules(kind: Kind) -> tuple[Refusal, ...]:
+    """Return the refusals for the rules of `_broken_ranges`."""
+    return tuple(
+        Refusal(
+            column, 0, f"{column}: lies outside [{least:g}, {most:g}]; correct it at the source"
         )
-    return broken, rules
+        for column, least, most, _ in RANGES[kind]
+    )
 
 
 def _cell_of(columns: Columns) -> IntArray:

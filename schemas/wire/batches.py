@@ -249,8 +249,9 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     owner = np.repeat(np.arange(len(found.sizes)), found.sizes)
 
     def refuse(rows: NDArray[np.bool_], error: WireError) -> None:
-        for at in np.unique(owner[rows]).tolist():
-            bad.setdefault(at, error)
+        if rows.any():
+            for at in np.unique(owner[rows]).tolist():
+                bad.setdefault(at, error)
 
     for name, dtype in column_types(kind).items():
         if dtype.kind == "i" and dtype.itemsize < 8:
