@@ -26,7 +26,7 @@ from fleet_service.app.endpoints import Endpoints
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, archive_jobs
 from fleet_service.app.metrics import Pulse, collect_metrics, health_problems
-from fleet_service.app.publications import publish_acks, publish_alerts, publish_tile
+from fleet_service.app.publications import WaitingAcks, publish_alerts, publish_tile
 from fleet_service.app.status_line import StatusLine
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
@@ -111,6 +111,7 @@ class Service:
         # Exception that ended the worker. Closing the session after it may hang.
         self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
+        self._acks = WaitingAcks()
         self._rounds = TileRounds(
             config.put_s,
             lambda: self.engine.queries.take_changed(self._clock.now()),
@@ -234,14 +235,16 @@ class Service:
             stop.wait(IDLE_S)
         else:
             wait_s = min(IDLE_S, self.engine.settlement.until_early_s(time.monotonic()))
-            self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else wait_s))
+            has_work = self._rounds.waiting or self._acks
+            self._take(session, self.inbox.drain(0.0 if has_work else wait_s))
         now = self._stepped_at = time.monotonic()
-        publish_acks(session, self.engine.settlement.end_flush())
+        self._acks.add(self.engine.settlement.end_flush())
         is_flush_due = now - self._flushed_at >= self._config.segment_s
         if is_flush_due or self.engine.settlement.until_early_s(now) <= 0.0:
             self._flushed_at = now
-            publish_acks(session, self.engine.settlement.begin_flush())
+            self._acks.add(self.engine.settlement.begin_flush())
             self.engine.intake.update_weather(self._clock.now())
+        self._acks.publish_part(session)
         if self._rounds.begin() and (at := self._clock.moment()).sure:
             publish_alerts(session, self.engine.alerts.expire(at.now))
         self._rounds.go_on(SHARE_S if len(self.inbox) < BEHIND else 0.0)
@@ -283,7 +286,8 @@ class Service:
             if not messages:
                 break
             self._take(session, messages)
-        publish_acks(session, self.engine.settlement.flush())
+        self._acks.add(self.engine.settlement.flush())
+        self._acks.publish_all(session)
         if not leaves:  # after a hand-over, the next owner publishes all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status_line.write_line(time.monotonic())

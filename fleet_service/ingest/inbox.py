@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from itertools import compress
 from threading import Lock
-from time import sleep
+from time import monotonic, sleep
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,10 +44,9 @@ from schemas.wire.batches import Decoded, Head, Heads, head_of
 # only briefly. The cost is mainly per record; 160 bytes count as one record.
 STEP_MESSAGES: Final = 4096
 STEP_BYTES: Final = 768 * 1024
-# [s] Time for which the worker waits for further messages after the first of a step, unless
-# GATHERED are waiting. A step costs as much as a hundred records even for one message. At 2,000
-# messages per second, steps then take a fifth of the processor time.
-GATHER_S: Final = 0.01
+# [s] Shortest time between the beginnings of two steps, unless GATHERED messages are waiting. Even
+# a step with one message costs as much as a hundred records.
+STEP_S: Final = 0.01
 GATHERED: Final = 64
 # Largest size of all waiting messages. They take half a minute of work, however many they are.
 QUEUE_BYTES: Final = 64 << 20
@@ -84,6 +83,7 @@ class Inbox:
         self._limits = limits
         self._bytes = 0
         self._guard = Lock()
+        self._drained_at = 0.0
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
         """Return the function to be called for each message, for a Zenoh subscriber that receives
@@ -118,8 +118,8 @@ class Inbox:
 
     def drain(self, wait_s: float) -> list[Message]:
         """Return the messages in the queue, at most as many as one processing step handles. Wait up
-        to `wait_s` [s] for the first message, then a few milliseconds for more. A call of `wake`
-        ends the wait.
+        to `wait_s` [s] for the first message, and until STEP_S after the previous call for more. A
+        call of `wake` ends the first wait.
         """
         out: list[Message] = []
         size = 0
@@ -128,8 +128,10 @@ class Inbox:
                 first = self._queue.get(timeout=wait_s)
                 if first is not None:
                     out.append(first)
-                    if self._queue.qsize() < GATHERED:
-                        sleep(GATHER_S)
+                    early_s = self._drained_at + STEP_S - monotonic()
+                    if early_s > 0 and self._queue.qsize() < GATHERED:
+                        sleep(early_s)
+                    self._drained_at = monotonic()
             while len(out) < STEP_MESSAGES and size < STEP_BYTES:
                 message = self._queue.get_nowait()
                 if message is not None:
