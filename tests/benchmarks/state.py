@@ -57,12 +57,8 @@ def state() -> list[Figure]:
             cells = engine.state.fusion.size
         restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
     return [
-        Figure(
-            "bench.state.snapshot_s", took, f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells", 1
-        ),
-        Figure(
-            "bench.state.snapshot_pause_ms", 1e3 * held, "ms that ingest waited at most meanwhile", 50
-        ),
+        Figure("bench.state.snapshot_s", took, f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells", 1),
+        Figure("bench.state.snapshot_pause_ms", 1e3 * held, "ms, longest wait of ingest", 50),
         Figure(
             "bench.state.restart_s",
             restart,
