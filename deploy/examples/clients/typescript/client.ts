@@ -18,6 +18,8 @@ const VISITS = 6;
 const ZOOM = 14;
 const FIRST_RETRY_S = 2;
 const LAST_RETRY_S = 6;
+// Longest wait for the router. The default of half a second is too short for a slow network.
+const RESPONSE_S = 10;
 
 interface SeqRange {
     first: string;
@@ -97,7 +99,7 @@ async function main(words: string[]): Promise<number> {
     let settled: string | undefined;
     let alertMu: number | undefined;
 
-    const session = await Session.open(new Config(locator));
+    const session = await Session.open(new Config(locator, 1000 * RESPONSE_S));
     await session.declareSubscriber(`gripmap/v1/ack/${vehicle}`, {
         handler: (sample: Sample) => (settled ||= readAck(ackType, sample.payload().toBytes(), boot) || undefined),
     });
