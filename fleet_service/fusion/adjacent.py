@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from fleet_service.fusion import constants as c
 from fleet_service.fusion.store.records import NONE
 from fleet_service.fusion.store.table import find_row
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.runtime.jit import refcount_free_inlined
 from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
 
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell number
 _X: Final = 0x5555555555555555 & _WHOLE  # bits of the column number; `_Y`: of the row number
@@ -21,6 +23,8 @@ BEFORE, BEHIND, ACROSS = range(3)
 _SIDEWAYS: Final = (1, 3)
 # Number of cells in which the other direction of the road may lie: the same cell, left and right.
 ACROSS_CELLS: Final = 1 + len(_SIDEWAYS)
+# [ns] time for which a visit shows that a road leads through a cell
+_ROAD_NS: Final = int(c.FORGOTTEN_S) * NS
 
 
 @refcount_free_inlined
@@ -45,12 +49,13 @@ class SearchSide(NamedTuple):
     Attributes:
         key: number of the slot, cell · 4 + sector.
         side: BEFORE, BEHIND or ACROSS.
-        since: time [ns]; a visit after it shows that a road leads through a cell.
+        now: time of the search [ns]; a visit in the last _ROAD_NS shows that a road leads through a
+            cell.
     """
 
     key: int
     side: int
-    since: int
+    now: int
 
 
 @refcount_free_inlined
@@ -84,11 +89,12 @@ def find_neighbour(
     heading = sector if search.side == BEFORE else opposite
     ahead = next_cell(previous, heading)
     row = _visited_row(table, cells, ahead, sector)
-    if row == NONE or cells[row].time < search.since:
+    since = search.now - _ROAD_NS
+    if row == NONE or cells[row].time < since:
         for turn in _SIDEWAYS:
             beside = next_cell(ahead, (heading + turn) % grid.SECTORS)
             beside_row = _visited_row(table, cells, beside, sector)
-            if beside_row != NONE and cells[beside_row].time >= search.since:
+            if beside_row != NONE and cells[beside_row].time >= since:
                 return beside, beside_row
     return ahead, row
 

@@ -90,8 +90,6 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
-# [ns] time for which a visit shows that a road leads through a cell
-_ROAD_NS: Final = int(c.FORGOTTEN_S) * NS
 # number of cells in a tile, and largest number of aged beliefs that one reading keeps
 _TILE_CELLS: Final = 4 ** (grid.CELL_ZOOM - grid.TILE_ZOOM)
 
@@ -270,7 +268,7 @@ def _multiply_side(parts: MapParts, target: Readout, side: int, buffers: Buffers
     direction of the road, it is the first cell that is measured.
     """
     cells = parts.live.cells
-    search = SearchSide(cells[target.slot].key, side, target.now - _ROAD_NS)
+    search = SearchSide(cells[target.slot].key, side, target.now)
     across = side == ACROSS
     has_messages = False
     neighbour = search.key // grid.SECTORS
@@ -368,7 +366,7 @@ def _choose_message(
     cells = live.cells
     most = 0.0
     best = NONE
-    search = SearchSide(cells[target.slot].key, side, target.now - _ROAD_NS)
+    search = SearchSide(cells[target.slot].key, side, target.now)
     neighbour = search.key // grid.SECTORS
     for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
         neighbour, row = find_neighbour(parts.table, cells, search, neighbour, step)
@@ -415,7 +413,7 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
         out[k, 0] = slots[k]
         own = live.cells[slots[k]]
         for side in (BEFORE, BEHIND, ACROSS):
-            search = SearchSide(own.key, side, own.time - _ROAD_NS)
+            search = SearchSide(own.key, side, own.time)
             neighbour = search.key // grid.SECTORS
             for step in range(ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS):
                 neighbour, row = find_neighbour(table, live.cells, search, neighbour, step + 1)
