@@ -92,8 +92,9 @@ class MapState:
         return parts[0].astype(np.int64)
 
     def count(self, tile: int) -> int:
-        """Return the number of slots of a tile."""
-        return sum(map(len, self._slots.get(tile, ())))
+        """Return the number of slots of a tile. The caller needs no lock."""
+        # Another thread may join the parts meanwhile; the copy of the list stays as it is.
+        return sum(map(len, tuple(self._slots.get(tile, ()))))
 
     def rebuild(self) -> None:
         """Discard the index from tiles to cells, so that it is built again. Call this after the

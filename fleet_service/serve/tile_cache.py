@@ -117,10 +117,7 @@ class TileCache:
         """Return the first of the given tiles that should be made in one step: at least one, and
         more only if they have few cells together.
         """
-        if len(tiles) == 1:  # most queries: no need to wait for the lock
-            return tiles
-        with self.guard:
-            counts = [self.state.count(tile) for tile in tiles[:TILES_TOGETHER]]
+        counts = [self.state.count(tile) for tile in tiles[:TILES_TOGETHER]]
         return tiles[: max(int((np.cumsum(counts) <= CELLS_TOGETHER).sum()), 1)]
 
     def make(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
