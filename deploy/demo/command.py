@@ -7,11 +7,15 @@ All files are written to `.demo/` in the current folder.
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
+from typing import Final
 
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.installing import install_command
+
+PAGE_HOST: Final = "127.0.0.1"  # listen address of `fleet-service page` without --host
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo with the parsed options; return the exit code.
 
     Raises:
-        InputError: an optional package is missing, or a process of the demo did not start.
+        InputError: an option is out of range, an optional package is missing, or a process of the
+            demo did not start.
     """
     try:
         from deploy.demo import processes, story
@@ -67,7 +72,34 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             "demo", f"the package {error.name} is missing", install_command("demo,page")
         ) from error
+    _check_options(args)
     try:
         return story.run(args)
     except processes.DemoError as error:
         raise InputError("demo", str(error), "correct the reason, or read the whole log") from error
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Check the options, so that a wrong one is reported before a process starts.
+
+    Raises:
+        InputError: an option is out of range, the page's port is in use, or the screenshot cannot
+            be taken.
+    """
+    from deploy.demo.screenshot import check_screenshot
+    from edge_agent.lab.simulation.counter_rng import checked_seed
+    from edge_agent.lab.simulation.fleet import check_live_fleet
+    from edge_agent.lab.simulation.listeners import warned_ones
+    from fleet_service.page.server import open_socket
+
+    check_live_fleet(args.vehicles)
+    checked_seed(args.seed)
+    warned_ones(args.vehicles, args.warned)
+    if math.isinf(args.duration):
+        raise InputError("duration", "a drive of inf s never ends", "give seconds, e.g. 150")
+    try:
+        open_socket(PAGE_HOST, args.page_port).close()
+    except InputError as error:
+        raise InputError("page-port", error.problem, "give another, or 0 for a free one") from error
+    if args.screenshot is not None:
+        check_screenshot(args.screenshot)

@@ -22,6 +22,7 @@ from edge_agent.lab.simulation.scenarios import scenario_named
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli.common import stop_on_signals
 from schemas.config import ZenohSettings
+from schemas.errors import InputError
 from schemas.runtime import commandline, figures
 from schemas.runtime.zenoh_session import open_session
 
@@ -101,10 +102,18 @@ def run(args: argparse.Namespace) -> int:
 
     Missed targets for the delay of the first alert, the number of passes and the duration are
     reported, but do not make the demo fail.
+
+    Raises:
+        InputError: the folder of the demo cannot be made.
+        DemoError: a process of the demo failed.
     """
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
-    FOLDER.mkdir()
+    try:
+        FOLDER.mkdir()
+    except OSError as error:
+        problem = f"cannot make the folder {FOLDER} ({error.strerror})"
+        raise InputError("demo", problem, "start it in a folder that you may write to") from error
     scenario = scenario_named(processes.SCENARIO)
     appears_s = scenario.events[0].start
     print(

@@ -74,9 +74,11 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.cli.live import LookoutPart, warm_up_simulation, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
+    from edge_agent.lab.simulation.fleet import check_live_fleet
     from edge_agent.lab.simulation.listeners import WarnedDrivers
     from edge_agent.lab.truth_file import TruthRecorder
 
+    check_live_fleet(args.vehicles)
     config = config_of(args)
     if args.truth:
         prepare_path("truth", args.truth)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import socket
+from pathlib import Path
+
 import pytest
 
 from deploy import cli
+from deploy.demo import processes, screenshot
 
 
 @pytest.mark.parametrize(
@@ -16,3 +20,71 @@ def test_a_number_out_of_range_is_refused_before_anything_starts(
     with pytest.raises(SystemExit, match="2"):
         cli.main(["demo", option, value])
     assert capsys.readouterr().err.startswith(f"error: argument {option}: '{value}' is not a p")
+
+
+def _refuse_start(*_: object) -> None:
+    raise AssertionError("a process was started")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--vehicles", "0"),
+        ("--vehicles", "-1"),
+        ("--vehicles", "1000"),
+        ("--seed", "-1"),
+        ("--warned", "1.5"),
+        ("--warned", "nan"),
+        ("--duration", "inf"),
+        ("--screenshot", "none/page.png"),
+        ("--screenshot", "page.docx"),
+    ],
+)
+def test_wrong_option_is_named_before_a_process_starts(
+    option: str,
+    value: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
+    assert cli.main(["demo", option, value, "--page-port", "0"]) == 2
+    _assert_one_error(capsys, option.removeprefix("--"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_port_in_use_is_named_before_a_process_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        assert cli.main(["demo", "--page-port", str(other.getsockname()[1])]) == 2
+    _assert_one_error(capsys, "page-port")
+
+
+def test_missing_chromium_is_named_before_a_process_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
+    monkeypatch.setattr(screenshot.shutil, "which", lambda _: None)
+    assert cli.main(["demo", "--page-port", "0", "--screenshot", "page.png"]) == 2
+    _assert_one_error(capsys, "screenshot")
+
+
+def test_demo_names_the_folder_that_it_cannot_make(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
+    (tmp_path / ".demo").write_text("a file, and no folder")
+    assert cli.main(["demo", "--page-port", "0"]) == 2
+    _assert_one_error(capsys, "demo")
+
+
+def _assert_one_error(capsys: pytest.CaptureFixture[str], field: str) -> None:
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {field}: ")
+    assert "; " in line

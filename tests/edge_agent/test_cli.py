@@ -418,6 +418,7 @@ BAD_COMMANDS = {
     "unknown manoeuvre": (["simulate", "moonwalk", "--out", "x"], "^error: manoeuvre: "),
     "no output": (["simulate", next(iter(MANOEUVRES))], "^error: out: is not given; "),
     "no vehicles": (["fleet", "--vehicles", "0"], "^error: vehicles: "),
+    "too many vehicles": (["fleet", "--vehicles", "1000"], "^error: vehicles: .* from 1 to 999"),
     "unknown scenario": (["fleet", "--scenario", "moon"], "^error: scenario: "),
     "truth into nowhere": (
         ["fleet", "--truth", "/dev/null/truth"],

@@ -55,6 +55,9 @@ ORDINARY = "mems-patchy"  # sensors of accurate vehicles, a key of SENSORS
 TURN_OVER_M = 6.0  # [m] length over which the crossfall of a road changes its sign
 VEHICLE_STREAM = 0
 WINTER_STREAM = 4
+# Largest fleet of one process in real time. Each vehicle has a session, which needs an open file,
+# and systems allow 1024 by default.
+LIVE_VEHICLES = 999
 # Share of the windows of 7 s in which the driver of a rough (inaccurate) vehicle stops: two or
 # three stops per minute.
 STOPS = 0.3
@@ -161,6 +164,20 @@ def run(
 def vehicle_names(vehicles: int) -> list[str]:
     """Return the names of the vehicles of a simulated fleet: sim-001, sim-002 and so on."""
     return [f"sim-{k + 1:03d}" for k in range(vehicles)]
+
+
+def check_live_fleet(vehicles: int) -> None:
+    """Check that one process can run a fleet of this number of vehicles in real time.
+
+    Raises:
+        InputError: the number is not from 1 to LIVE_VEHICLES.
+    """
+    if not 1 <= vehicles <= LIVE_VEHICLES:
+        raise InputError(
+            "vehicles",
+            f"{vehicles} vehicles cannot drive on one machine",
+            f"give a number from 1 to {LIVE_VEHICLES}",
+        )
 
 
 class SimulatedFleet:
