@@ -3,6 +3,7 @@
 import sys
 
 from deploy.cli import main
+from schemas.runtime.process import force_exit
 
 if __name__ == "__main__":
-    sys.exit(main(["demo", *sys.argv[1:]]))
+    force_exit(main(["demo", *sys.argv[1:]]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -46,8 +47,12 @@ def drive_fleet(
     def print_progress() -> None:
         print(f"  {time.monotonic() - began:4.0f} s  {listener.progress()}", flush=True)
 
+    try:
+        code = fleet.wait(REPORT_S, print_progress)
+    finally:
+        fleet.stop()
     # Records without acknowledgement, for which the exit code is 1, are a figure of the demo.
-    if fleet.wait(REPORT_S, print_progress) not in (0, commandline.FAILED):
+    if code not in (0, commandline.FAILED):
         raise processes.DemoError(f"the simulated fleet failed; see {fleet.log}")
     return listener, fleet.report()
 
@@ -107,6 +112,8 @@ def run(args: argparse.Namespace) -> int:
         InputError: the folder of the demo cannot be made.
         DemoError: a process of the demo failed.
     """
+    # End by SIGTERM as by Ctrl-C: an exception, so that the processes of the demo are stopped.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     try:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from deploy import cli
 from deploy.demo import processes, screenshot
+from tests.waiting import PATIENCE_S, until
 
 
 @pytest.mark.parametrize(
@@ -82,6 +88,36 @@ def test_demo_names_the_folder_that_it_cannot_make(
     (tmp_path / ".demo").write_text("a file, and no folder")
     assert cli.main(["demo", "--page-port", "0"]) == 2
     _assert_one_error(capsys, "demo")
+
+
+def test_signal_ends_all_processes_of_the_demo(tmp_path: Path) -> None:
+    words = ["--vehicles", "1", "--warned", "0", "--page-port", "0"]
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "deploy.demo", *words],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        until((tmp_path / ".demo" / "fleet.log").exists)
+        assert len(_processes_in(tmp_path)) > 1
+        demo.terminate()
+        assert demo.wait(PATIENCE_S) == 130
+        assert not _processes_in(tmp_path)
+    finally:
+        for number in _processes_in(tmp_path):
+            os.kill(number, signal.SIGKILL)
+        demo.wait()
+
+
+def _processes_in(folder: Path) -> list[int]:
+    """Return the numbers of the processes whose current folder is `folder`."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if (entry / "cwd").readlink() == folder:
+                found.append(int(entry.name))
+    return found
 
 
 def _assert_one_error(capsys: pytest.CaptureFixture[str], field: str) -> None:
