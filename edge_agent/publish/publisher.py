@@ -3,7 +3,7 @@ batches, stores and sends them, and sends them again until a service has answere
 
 The loop only calls `offer`, which never blocks. Only the sender thread uses disk and network. Every
 batch is on disk before it is sent, and stays there until the service has settled it (stored or
-refused it for good). A second thread opens the Zenoh sessions and waits for the routers as long as
+refused it for good). Other threads open the Zenoh sessions and wait for the routers as long as
 necessary.
 """
 
@@ -85,7 +85,9 @@ class Publisher:
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
 
     def start(self) -> None:
-        """Start two threads: one opens the Zenoh sessions, the other stores and sends batches."""
+        """Start the threads that open the Zenoh sessions, and the one that stores and sends
+        batches.
+        """
         self._links.start()
         self._sender.start()
 

@@ -1,11 +1,14 @@
-"""Zenoh sessions of all vehicles of a publisher, with their connections to a router. A separate
-thread opens the sessions.
+"""Zenoh sessions of all vehicles of a publisher, with their connections to a router. Separate
+threads open the sessions.
 """
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Final
 
 import zenoh
 
@@ -13,13 +16,20 @@ from edge_agent.publish.outbox import StoredBatch
 from edge_agent.publish.zenoh_link import Link
 from schemas.config import ZenohSettings
 from schemas.runtime.link_watch import LinkWatch
+from schemas.runtime.zenoh_session import ReasonLog
+
+# Largest number of sessions that are opened at a time. An unreachable router delays each of them by
+# its time limit [s], and a vehicle whose certificate is refused waits for ever. More threads would
+# cost the estimator time while there is no router, because each attempt takes 1 ms.
+OPENERS: Final = 32
 
 
 class SessionLinks:
     """Set of Zenoh sessions, one per vehicle.
 
-    `on_open(name, session)` is called when the session of the vehicle `name` is open, and
-    `on_ack(name, payload)` for each acknowledgement that the vehicle receives.
+    `on_open(name, session)` is called when the session of the vehicle `name` is open, on one of
+    several threads. `on_ack(name, payload)` is called for each acknowledgement that the vehicle
+    receives.
     """
 
     def __init__(
@@ -30,7 +40,9 @@ class SessionLinks:
         on_ack: Callable[[str, bytes], None],
         stop: threading.Event,
     ) -> None:
-        self._names = names
+        self._unopened: queue.SimpleQueue[str] = queue.SimpleQueue()
+        for name in names:
+            self._unopened.put(name)
         self._settings = settings
         self._on_open = on_open
         self._on_ack = on_ack
@@ -38,19 +50,25 @@ class SessionLinks:
         self._links: dict[str, Link] = {}
         self._epochs: dict[str, int] = {}
         self._connected: dict[str, bool] = {}
-        self._opener = threading.Thread(target=self._open_all, name="connector", daemon=True)
+        self._reasons = ReasonLog()
+        self._openers = [
+            threading.Thread(target=self._open_links, name="connector", daemon=True)
+            for _ in range(min(OPENERS, self._unopened.qsize()))
+        ]
 
     def start(self) -> None:
-        """Start the thread that opens the sessions. For each session it waits for a router as long
-        as necessary.
+        """Start the threads that open the sessions. For each session, a thread waits for a router
+        as long as necessary.
         """
-        self._opener.start()
+        for opener in self._openers:
+            opener.start()
 
     def close(self) -> None:
         """Close all Zenoh sessions. The caller must set the event `stop` first, because the method
-        waits for the thread that opens the sessions.
+        waits for the threads that open the sessions.
         """
-        self._opener.join()
+        for opener in self._openers:
+            opener.join()
         for link in self._links.values():
             link.close()
 
@@ -96,10 +114,13 @@ class SessionLinks:
             self._connected[name] = link.is_connected
         return replaced
 
-    def _open_all(self) -> None:
-        for name in self._names:
-            link = Link.open(self._settings, name, self._on_ack, self._stop)
-            if link is None:
-                return
+    def _open_links(self) -> None:
+        with suppress(queue.Empty):
+            while not self._stop.is_set():
+                self._open_link(self._unopened.get_nowait())
+
+    def _open_link(self, name: str) -> None:
+        link = Link.open(self._settings, name, self._on_ack, self._stop, self._reasons)
+        if link is not None:
             self._links[name] = link
             self._on_open(name, link.session)

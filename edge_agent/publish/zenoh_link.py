@@ -16,7 +16,7 @@ from edge_agent.publish.outbox import StoredBatch
 from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.link_watch import LinkWatch
-from schemas.runtime.zenoh_session import open_session, quality_of
+from schemas.runtime.zenoh_session import ReasonLog, open_session, quality_of
 from schemas.wire import ENCODING, MESSAGES_PER_S, Kind
 
 # [s] pause between two messages: twice the limit of a router, because networks may delay messages
@@ -64,11 +64,12 @@ class Link:
         vehicle: str,
         on_ack: Callable[[str, bytes], None],
         stop: threading.Event,
+        reasons: ReasonLog,
     ) -> Link | None:
         """Wait for a router, open the vehicle's session and return the link. Return None if the
-        event `stop` is set before a router answers.
+        event `stop` is set before a router answers. The reasons for waiting go to `reasons`.
         """
-        session = open_session(settings, stop, vehicle)
+        session = open_session(settings, stop, vehicle, reasons)
         return None if session is None else Link(session, vehicle, on_ack)
 
     @property

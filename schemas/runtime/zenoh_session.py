@@ -100,18 +100,39 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
     return {"priority": priority, "congestion_control": congestion, "express": topic.express}
 
 
+class ReasonLog:
+    """Log of the reasons why no session could be opened. Each reason is logged once, even if
+    several threads that open sessions share the object.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._logged = set[str]()
+
+    def log_once(self, settings: ZenohSettings, reason: str) -> None:
+        """Log a reason with the endpoints that were tried, unless it was logged before."""
+        with self._lock:
+            if reason in self._logged:
+                return
+            self._logged.add(reason)
+        log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)
+
+
 def open_session(
-    settings: ZenohSettings, stop: threading.Event | None = None, name: str = ""
+    settings: ZenohSettings,
+    stop: threading.Event | None = None,
+    name: str = "",
+    reasons: ReasonLog | None = None,
 ) -> zenoh.Session | None:
     """Open a Zenoh session and return it as soon as a router answers. Return None if the event
     `stop` is set before.
 
     A session that loses its router reconnects by itself. Each reason why no session could be opened
-    is logged once. If no router answers in time, the next attempt waits twice as long, so that a
-    slow network is not mistaken for a blocked one.
+    is logged once, by `reasons` if it is given. If no router answers in time, the next attempt
+    waits twice as long, so that a slow network is not mistaken for a blocked one.
     """
     stop = stop or threading.Event()
-    logged = set[str]()
+    reasons = reasons or ReasonLog()
     open_ms = settings.config.get(_OPEN, CLIENT[_OPEN])
     while not stop.is_set():
         patient = settings.model_copy(update={"config": {**settings.config, _OPEN: open_ms}})
@@ -119,10 +140,7 @@ def open_session(
             return zenoh.open(configuration(patient, name))
         except zenoh.ZError as error:
             # Zenoh's message ends with a path of the machine that built it. The path is cut off.
-            reason = str(error).partition(" at /")[0].strip()
-            if reason not in logged:
-                logged.add(reason)
-                log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)
+            reasons.log_once(settings, str(error).partition(" at /")[0].strip())
             open_ms = max(open_ms, min(2 * open_ms, LONGEST_OPEN_MS))
             stop.wait(RETRY_S)
     return None
