@@ -4,8 +4,8 @@ upload journal (list of uploaded files) records each file that both have.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from fleet_service.archive.format.files import sync_tree
@@ -91,7 +91,7 @@ class FileTransfer:
             return not was_deleted_here and not is_incomplete
 
         missing = [name for name in remote_sizes if is_wanted(name)]
-        list(self._pool.map(self._download_file, missing))  # raises if a download failed
+        self._download_files(missing)
         paths = [self._files.path_of(name) for name in missing]
         sync_tree(self._files.root, {path.parent for path in paths})
         # Record the files only now. After a power loss, recorded but missing files would count as
@@ -100,6 +100,17 @@ class FileTransfer:
             self._journal.add(name, stamp_of(path))
             self._files.set_aside_path(name).unlink(missing_ok=True)
         return len(missing)
+
+    def _download_files(self, names: Sequence[str]) -> None:
+        """Download files, several at once. After a failure, start no further download, and wait for
+        the running ones: they would write the same drafts as those of the next attempt.
+        """
+        downloads = [self._pool.submit(self._download_file, name) for name in names]
+        wait(downloads, return_when=FIRST_EXCEPTION)
+        started = [download for download in downloads if not download.cancel()]
+        wait(started)
+        for download in started:
+            download.result()
 
     def _download_file(self, name: str) -> None:
         path = self._files.path_of(name)

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ALL_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing
 from datetime import date
 from pathlib import Path
@@ -22,7 +23,7 @@ from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import retire_rows
 from fleet_service.archive.segment_log import SegmentLog
-from fleet_service.replication import replica, upload_journal
+from fleet_service.replication import file_transfer, replica, upload_journal
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.replica import OWNER, BucketReplica
 from fleet_service.replication.upload_journal import Stamp, UploadJournal, last_copy_url
@@ -392,3 +393,38 @@ def test_a_journal_of_a_long_run_is_rewritten_and_loses_no_entry(
 
 def fail_to_open(_: Path) -> BinaryIO:
     raise OSError("disk is full")
+
+
+def test_failed_download_leaves_no_other_running(
+    bucket: BucketServer, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A running download would write the draft of the same file as the next attempt."""
+    fill_log(tmp_path / "archive", make(tmp_path / "archive"), range(1)).close()
+    goes_on = threading.Event()
+    begun: list[str] = []
+    ended: list[str] = []
+    parts_of = ObjectBucket.read_parts
+
+    def read_parts(store: ObjectBucket, name: str) -> Iterator[bytes]:
+        if name.startswith("keys/"):
+            until(lambda: len(begun) == len(Kind))
+            raise CopyError("the connection was reset")
+        begun.append(name)
+        goes_on.wait()
+        yield from parts_of(store, name)
+        ended.append(name)
+
+    def wait_for_others(downloads: list[Future[None]], return_when: str = ALL_COMPLETED) -> None:
+        if return_when == ALL_COMPLETED:
+            goes_on.set()
+        wait(downloads, return_when=return_when)
+
+    monkeypatch.setattr(ObjectBucket, "read_parts", read_parts)
+    monkeypatch.setattr(file_transfer, "wait", wait_for_others)
+    (tmp_path / "new").mkdir()
+    with (
+        closing(BucketReplica(tmp_path / "new", bucket.url, bucket.store)) as new,
+        pytest.raises(CopyError, match="reset"),
+    ):
+        new.prefetch()
+    assert sorted(ended) == sorted(begun)
