@@ -70,6 +70,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import secrets
 import threading
 import time
@@ -144,13 +145,14 @@ class Standby(NamedTuple):
             now.
         has_token: returns True if the service with the given name has a liveliness token.
         notify_alive: called at each check of the lease.
-        prefetch: downloads new objects from the bucket in advance.
+        prefetch: downloads new objects from the bucket in advance. It returns the problem if this
+            disk does not accept them, else an empty text.
     """
 
     can_serve: Callable[[], bool]
     has_token: Callable[[str], bool]
     notify_alive: Callable[[], None]
-    prefetch: Callable[[], None]
+    prefetch: Callable[[], str]
 
 
 class Lease:
@@ -165,6 +167,8 @@ class Lease:
 
     Attributes:
         lost: True if another service has taken over.
+        problem: reason why this standby must not take over, such as a full disk; "" if none. It is
+            that of the last prefetch, which is repeated every PREFETCH_S.
         service: name of the service.
         serves: function that returns True if the service works; a service that reaches no router
             must be replaced.
@@ -182,6 +186,7 @@ class Lease:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.lost = False
+        self.problem = ""
         self.succeeds = False
         self.serves: Callable[[], bool] = lambda: True
 
@@ -257,7 +262,7 @@ class Lease:
             CopyError: the bucket cannot be reached, and this service is no standby.
         """
         watch = _HolderWatch(self._lease_s)
-        prefetched_at = 0.0
+        prefetched_at = time.monotonic() if self.problem else -math.inf
         logged = ""
         while not stop.is_set():
             line = ""
@@ -265,15 +270,20 @@ class Lease:
                 standby.notify_alive()
             try:
                 found = _read_newest_record(self._bucket)
-                if self._can_take(found, watch, standby):
+                can_take = self._can_take(found, watch, standby)
+                if standby is not None and found is not None and (self.problem or not can_take):
+                    if time.monotonic() - prefetched_at > PREFETCH_S:
+                        prefetched_at = time.monotonic()
+                        self.problem = standby.prefetch()
+                    line = (
+                        f"standby: {self.problem}; trying again"
+                        if self.problem
+                        else f"standby: {found.service} is served under lease {found.number}"
+                    )
+                if can_take and not self.problem:
                     can_serve = standby is None or standby.can_serve()
                     if can_serve and self._create_next(found, epoch, stop):
                         return True
-                elif standby is not None and found is not None:
-                    line = f"standby: {found.service} is served under lease {found.number}"
-                    if time.monotonic() - prefetched_at > PREFETCH_S:
-                        prefetched_at = time.monotonic()
-                        standby.prefetch()
             except CopyError as error:
                 if standby is None:
                     raise

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, TypeVar
 
 from fleet_service.archive.format import layout
 from fleet_service.archive.format.files import lock_archive
@@ -25,6 +25,7 @@ from schemas.errors import InputError
 
 AGAIN_S: Final = 1.0  # [s] pause between attempts to reach the bucket
 REQUESTS: Final = 4  # number of requests that fit into one lease time
+T = TypeVar("T")
 
 
 class Ownership:
@@ -182,9 +183,20 @@ def _acquire_under_lease(
     lease = Lease(holder, bucket, config.name, config.lease_s)
     copy = BucketReplica(root, url, options)
     mirrors = empty or known
-    standby = None
-    if signs is not None:
-        standby = Standby(*signs, copy.prefetch if mirrors else lambda: None)
+
+    def prefetch() -> None:
+        if mirrors:
+            copy.prefetch()
+            save_holder(root, url, holder)  # shows that the disk has space, which a take-over needs
+
+    def join() -> bool:
+        is_joined = _sync_folder(config, root, copy, lease, stop, log_line)
+        if is_joined:
+            save_holder(root, url, lease.holder)
+            layout.write_epoch(root, lease.term.epoch)
+        return is_joined
+
+    standby = None if signs is None else Standby(*signs, lambda: _try_on_disk(prefetch)[1])
     try:
         while lease.wait(stop, log_line, copy.largest_epoch, standby):
             lease.start_renewal()
@@ -195,14 +207,14 @@ def _acquire_under_lease(
                     "give the service an empty folder",
                 )
             copy.bucket.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
-            if _sync_folder(config, root, copy, lease, stop, log_line):
-                save_holder(root, url, lease.holder)
-                layout.write_epoch(root, lease.term.epoch)
+            is_joined, problem = (join(), "") if standby is None else _try_on_disk(join)
+            if is_joined:
                 return Ownership(lock_file, copy, lease)
             lease.release()
-            if not lease.lost:
+            if not (lease.lost or problem):
                 break
             lease = lease.make_new_lease()
+            lease.problem = problem
     except CopyError as error:
         _release_and_close(lease, copy)
         fix = (
@@ -215,6 +227,22 @@ def _acquire_under_lease(
         raise
     _release_and_close(lease, copy)
     return None
+
+
+def _try_on_disk(work: Callable[[], T]) -> tuple[T | None, str]:
+    """Let a standby (waiting service) do work that writes to its disk. Return the result of the
+    work and an empty text, or None and the problem if the disk does not accept the files.
+
+    Raises:
+        CopyError: the bucket does not answer.
+    """
+    try:
+        return work(), ""
+    except CopyError:
+        raise
+    except OSError as error:
+        reason = error.strerror or error
+        return None, f"cannot store the files of the archive on this disk ({reason})"
 
 
 def _may_acknowledge(lease: Lease) -> bool:

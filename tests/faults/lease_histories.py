@@ -351,7 +351,7 @@ class ServiceHistory:
         holder = self._holders[name]
         lease = Lease(holder, cast(ObjectBucket, self._bucket), name, process.lease_s)
         stop = VirtualStop(self._world)
-        standby = Standby(lambda: True, self._has_token, lambda: None, lambda: None)
+        standby = Standby(lambda: True, self._has_token, lambda: None, lambda: "")
         try:
             lease.wait(cast(threading.Event, stop), lambda _: None, lambda: 0, standby)
             lease._stop = cast(threading.Event, stop)

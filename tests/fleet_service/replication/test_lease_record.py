@@ -15,6 +15,7 @@ from typing import cast
 import pytest
 
 from fleet_service.archive.format.version import Version, parse_version
+from fleet_service.replication import lease as lease_module
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.fence import fence_of
 from fleet_service.replication.lease import UNKNOWN, Lease, Standby
@@ -54,7 +55,7 @@ def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
         can_serve=lambda: True,
         has_token=lambda _: False,
         notify_alive=lambda: None,
-        prefetch=lambda: None,
+        prefetch=lambda: "",
     )
     lease = lease_on(bucket, name, lease_s)
     assert lease.wait(threading.Event(), print, lambda: 0, standby)
@@ -201,7 +202,7 @@ def test_former_holder_stops_before_the_successor_starts(
 ) -> None:
     stop = VirtualStop(monkeypatch)
     bucket = LateRenewalBucket(is_cut=is_cut)
-    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: None)
+    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: "")
     assert lease_on(bucket, "two", 4.0).wait(stop, print, lambda: 0, standby)
     assert not bucket.holder.may_acknowledge
 
@@ -211,7 +212,7 @@ def test_take_over_stopped_before_its_check_releases_nothing(
 ) -> None:
     stop = VirtualStop(monkeypatch, long_s=4.0)
     bucket = LateRenewalBucket(is_cut=False)
-    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: None)
+    standby = Standby(lambda: True, lambda _: False, lambda: None, lambda: "")
     lease = lease_on(bucket, "two", 4.0)
     assert not lease.wait(stop, print, lambda: 0, standby)
     lease.release()
@@ -231,3 +232,28 @@ def test_malformed_version_is_an_input_error(text: str) -> None:
     with pytest.raises(InputError, match="archive: version .* is not MAJOR.MINOR"):
         parse_version(text)
     assert parse_version("10.2") == Version(10, 2)
+
+
+def test_standby_takes_over_only_when_its_disk_accepts_files(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The holder leaves at the second of three attempts that the standby's full disk refuses."""
+    monkeypatch.setattr(lease_module, "PREFETCH_S", 0.0)
+    bucket = MemoryBucket()
+    holder = lease_on(bucket, "one", 60.0)
+    assert holder._create_next(None, lambda: 0, threading.Event())
+    attempts: list[int] = []
+    lines: list[str] = []
+
+    def prefetch() -> str:
+        attempts.append(1)
+        if len(attempts) == 2:
+            holder.release()
+        return "cannot store files" if len(attempts) < 4 else ""
+
+    standby = Standby(lambda: True, lambda _: False, lambda: None, prefetch)
+    lease = lease_on(bucket, "two", 60.0)
+    assert lease.wait(threading.Event(), lines.append, lambda: 0, standby)
+    assert len(attempts) == 4
+    assert lines == ["standby: cannot store files; trying again"]
+    assert lease.former_holders == ("one",)
