@@ -22,6 +22,7 @@ from schemas.runtime import commandline
 from schemas.runtime.link_watch import router_metrics
 from schemas.runtime.metrics import serve_metrics
 from schemas.runtime.process import force_exit
+from schemas.runtime.zenoh_session import error_reason
 
 CLOSE_S = 2.0
 ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -41,7 +42,9 @@ def load_configuration(
         settings = zenoh.Config.from_file(str(config))
     except zenoh.ZError as error:
         raise InputError(
-            "config", f"cannot use {config} ({error})", "give a Zenoh configuration file"
+            "config",
+            f"cannot use {config} ({error_reason(error)})",
+            "give a Zenoh configuration file",
         ) from error
     if listen is not None:
         endpoints = [listen] if isinstance(listen, str) else list(listen)
@@ -72,7 +75,9 @@ def open_router(
         session = zenoh.open(settings)
     except zenoh.ZError as error:
         raise InputError(
-            "listen", f"the router cannot start ({error})", "free the port or choose another"
+            "listen",
+            f"the router cannot start ({error_reason(error)})",
+            "free the port or choose another",
         ) from error
     if listen is None:
         return session, list(json.loads(settings.get_json("listen/endpoints")))

@@ -100,6 +100,13 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
     return {"priority": priority, "congestion_control": congestion, "express": topic.express}
 
 
+def error_reason(error: zenoh.ZError) -> str:
+    """Return the message of an error of Zenoh without its end, which is a path of the machine that
+    built Zenoh.
+    """
+    return str(error).partition(" at /")[0].strip()
+
+
 class ReasonLog:
     """Log of the reasons why no session could be opened. Each reason is logged once, even if
     several threads that open sessions share the object.
@@ -139,8 +146,7 @@ def open_session(
         try:
             return zenoh.open(configuration(patient, name))
         except zenoh.ZError as error:
-            # Zenoh's message ends with a path of the machine that built it. The path is cut off.
-            reasons.log_once(settings, str(error).partition(" at /")[0].strip())
+            reasons.log_once(settings, error_reason(error))
             open_ms = max(open_ms, min(2 * open_ms, LONGEST_OPEN_MS))
             stop.wait(RETRY_S)
     return None

@@ -1,4 +1,4 @@
-"""Tests of the command `gripmap demo`."""
+"""Tests of the commands `gripmap demo` and `gripmap router`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from deploy import cli
-from deploy.demo import processes, screenshot
+from deploy.demo import processes
 from tests.waiting import PATIENCE_S, until
 
 
@@ -75,7 +75,7 @@ def test_missing_chromium_is_named_before_a_process_starts(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
-    monkeypatch.setattr(screenshot.shutil, "which", lambda _: None)
+    monkeypatch.setattr("shutil.which", lambda _: None)
     assert cli.main(["demo", "--page-port", "0", "--screenshot", "page.png"]) == 2
     _assert_one_error(capsys, "screenshot")
 
@@ -118,6 +118,19 @@ def _processes_in(folder: Path) -> list[int]:
             if (entry / "cwd").readlink() == folder:
                 found.append(int(entry.name))
     return found
+
+
+@pytest.mark.parametrize("file", ["none.json5", "folder", "empty"])
+def test_router_names_a_wrong_file_without_build_paths(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "empty").touch()
+    assert cli.main(["router", "--config", file]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: config: cannot use {file} (")
+    assert "/" not in line
 
 
 def _assert_one_error(capsys: pytest.CaptureFixture[str], field: str) -> None:
