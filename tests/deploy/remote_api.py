@@ -45,6 +45,9 @@ PRIORITIES: Final = (  # priorities in the order of their numbers, from 1
     zenoh.Priority.BACKGROUND,
 )
 CUSTOM: Final = 0xFFFF  # encoding of which the schema gives the whole name
+# [s] The bridge answers no earlier, like a router behind a slow link or on a busy machine. By
+# default, zenoh-ts waits only for half a second.
+SLOW_S: Final = 0.7
 
 
 class SerializedReader:
@@ -204,9 +207,12 @@ class RemoteClient:
 
 @contextmanager
 def serve_remote_api(endpoint: str) -> Iterator[str]:
-    """Serve clients of a router over WebSocket. Yield the locator to which zenoh-ts connects."""
+    """Serve clients of a router over WebSocket, slowly. Yield the locator to which zenoh-ts
+    connects.
+    """
 
     def answer(link: ServerConnection) -> None:
+        threading.Event().wait(SLOW_S)
         session = open_session(ZenohSettings(connect=[endpoint]))
         assert session is not None
         with session:
