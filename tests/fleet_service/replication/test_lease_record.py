@@ -63,10 +63,12 @@ def standby_of(bucket: MemoryBucket, name: str, lease_s: float) -> Lease:
 
 
 @pytest.mark.parametrize(("holder_s", "standby_s"), [(60.0, 5.0), (5.0, 60.0), (0.5, 0.6)])
-def test_service_with_another_lease_time_does_not_start(holder_s: float, standby_s: float) -> None:
+def test_service_with_another_lease_time_does_not_start(
+    monkeypatch: pytest.MonkeyPatch, holder_s: float, standby_s: float
+) -> None:
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", holder_s)
-    assert holder._create_next(None, lambda: 0, threading.Event())
+    assert holder._create_next(None, lambda: 0, VirtualStop(monkeypatch))
     with pytest.raises(
         InputError, match=rf"archive.lease_s: is {standby_s:g}, and one, .* uses {holder_s:g}"
     ):
@@ -113,10 +115,10 @@ def test_damaged_lease_is_waited_for_and_then_taken(content: bytes) -> None:
     assert (standby.term.number, standby.former_holders) == (3, ("one", UNKNOWN))
 
 
-def test_holder_repairs_a_damaged_lease_and_keeps_it() -> None:
+def test_holder_repairs_a_damaged_lease_and_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
     bucket = MemoryBucket()
     holder = lease_on(bucket, "one", 0.5)
-    assert holder._create_next(None, lambda: 0, threading.Event())
+    assert holder._create_next(None, lambda: 0, VirtualStop(monkeypatch))
     name = "lease/0000000001.json"
     bucket.put(name, bucket.objects[name][:20])
     holder.renew()

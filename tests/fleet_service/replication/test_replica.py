@@ -13,6 +13,7 @@ from concurrent.futures import ALL_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing
 from datetime import date
 from pathlib import Path
+from types import SimpleNamespace
 from typing import BinaryIO
 
 import pytest
@@ -23,7 +24,7 @@ from fleet_service.archive.identity.pseudonyms import Pseudonyms
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import retire_rows
 from fleet_service.archive.segment_log import SegmentLog
-from fleet_service.replication import file_transfer, replica, upload_journal
+from fleet_service.replication import file_transfer, replica, upload_backoff, upload_journal
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.replica import OWNER, BucketReplica
 from fleet_service.replication.upload_journal import Stamp, UploadJournal, last_copy_url
@@ -32,7 +33,6 @@ from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.buckets import SECRET, BucketServer, list_copied_files
 from tests.fleet_service.archive.rows import identities, rows_of
-from tests.waiting import until
 
 NAME = "shard-0"
 Make = Callable[[Path], BucketReplica]
@@ -83,8 +83,11 @@ def test_what_is_settled_is_in_the_bucket_byte_for_byte(
 
 
 def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
-    bucket: BucketServer, make: Make, tmp_path: Path
+    bucket: BucketServer, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr(upload_backoff, "time", clock)
     root = tmp_path / "archive"
     copy = make(root)
     with closing(fill_log(root, copy)) as log:
@@ -92,6 +95,7 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
         log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 7), [7])
         with pytest.raises(CopyError):
             log.flush()
+        now[0] += 0.9 * upload_backoff.BACK_OFF_S
         log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 8), [8])
         # The error comes at once, without a request to the network.
         with pytest.raises(CopyError, match="is tried again"):
@@ -101,17 +105,8 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
         assert "nothing is acknowledged" in str(copy.backoff.trouble)
         assert SECRET not in str(copy.backoff.trouble)
         bucket.start()
-        done: list[int] = []
-
-        def has_settled() -> bool:
-            try:
-                done.extend(log.flush())
-            except CopyError:
-                return False
-            return True
-
-        until(has_settled)
-        assert done == [7, 8]
+        now[0] += 0.2 * upload_backoff.BACK_OFF_S
+        assert log.flush() == [7, 8]
         assert copy.backoff.trouble is None
         assert there(bucket) == list_copied_files(root)
     assert len(identities(root, Kind.OBSERVATION)) == 5 * 5

@@ -5,13 +5,16 @@ empty map.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pyarrow as pa
 import pytest
 import zenoh
 
 from fleet_service.counts import ServiceCounts
+from fleet_service.serve import queryable as scheduling
 from fleet_service.serve.query import AnswerSize
 from fleet_service.serve.queryable import (
     COST,
@@ -204,13 +207,20 @@ def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half:
     assert [reply.ok.payload.to_string() for reply in large if reply.ok] == ["last"]
 
 
-def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
+def test_light_questions_beyond_their_share_are_still_answered(
+    half: Half, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A client sends more small queries than its share of the service allows. They may wait behind
-    heavy queries, but the service must refuse none.
+    heavy queries, but the service must refuse none. The service's clock stands still, so that the
+    share does not refill.
     """
-    for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
+    now = time.monotonic()
+    clock = SimpleNamespace(monotonic=lambda: now, sleep=time.sleep)
+    monkeypatch.setattr(scheduling, "time", clock)
+    share = int(LIGHT_PER_S / LIGHT)
+    for _ in range(2 * share):
         assert half.ask(4) == ["last"]
-    assert half.counts.queries > half.counts.heavy_queries > 0
+    assert half.counts.queries - half.counts.heavy_queries == share
     assert not half.counts.refused_queries
 
 
