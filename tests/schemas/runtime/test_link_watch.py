@@ -5,6 +5,7 @@ router starts and stops.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -82,14 +83,14 @@ def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) 
 @pytest.mark.parametrize("capped", [True, False])
 def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: bool) -> None:
     sent = 200
-    heard = dict.fromkeys(VEHICLES, 0)
+    heard: Counter[tuple[str, bytes]] = Counter()  # messages by vehicle and payload
 
     def count_message(sample: zenoh.Sample) -> None:
-        heard[str(sample.key_expr).rpartition("/")[2]] += 1
+        heard[str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes()] += 1
 
-    def has_reached(session: zenoh.Session, name: str) -> bool:
-        session.put(key(name), b"")
-        return bool(heard[name])
+    def has_reached(payload: bytes, session: zenoh.Session, name: str) -> bool:
+        session.put(key(name), payload)
+        return bool(heard[name, payload])
 
     with (
         open_network(tmp_path, protocol="quic", capped=capped) as there,
@@ -99,12 +100,11 @@ def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: 
     ):
         service.declare_subscriber("gripmap/v1/obs/**", count_message)
         for session, name in ((car, VEHICLES[0]), (other, VEHICLES[1])):
-            until(partial(has_reached, session, name))
-        heard.update(dict.fromkeys(VEHICLES, 0))
+            until(partial(has_reached, b"before", session, name))
         for _ in range(sent):
-            car.put(key(VEHICLES[0]), b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        until(partial(has_reached, other, VEHICLES[1]))
+            car.put(key(VEHICLES[0]), b"flood", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(partial(has_reached, b"after", other, VEHICLES[1]))
         if capped:
-            assert heard[VEHICLES[0]] < sent / 2
+            assert heard[VEHICLES[0], b"flood"] < sent / 2
         else:
-            until(lambda: heard[VEHICLES[0]] == sent)
+            until(lambda: heard[VEHICLES[0], b"flood"] == sent)
