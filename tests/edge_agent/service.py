@@ -109,5 +109,11 @@ class Service:
                 f"{len(self.batches)} batches"
             )
 
+    def count_records(self) -> int:
+        """Return the number of received records. A batch that the agent sent again counts once."""
+        return sum(
+            dict(zip(self.identities(), (b.rows for b in self.batches), strict=True)).values()
+        )
+
     def identities(self) -> list[tuple[str, int, Kind, int, int]]:
         return [(b.vehicle, b.boot, b.kind, b.region, b.seq) for b in self.batches]

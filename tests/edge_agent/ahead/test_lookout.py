@@ -75,13 +75,12 @@ class Driving:
         return seen
 
     def next_warning(self) -> GripWarning:
-        for _ in range(600):
+        def has_warning() -> bool:
             self.report_pose()
-            try:
-                return self.told.get(timeout=0.05)
-            except queue.Empty:
-                continue
-        raise TimeoutError("no warning")
+            return not self.told.empty()
+
+        until(has_warning)
+        return self.told.get()
 
 
 @contextmanager
@@ -175,16 +174,17 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(
     town.standing = [alert(int(ICE[0]), time=NOW)]
     owner = open_session(router.settings)
     assert owner is not None
-    heard: queue.Queue[zenoh.Sample] = queue.Queue()
+    heard: list[zenoh.Sample] = []
+
+    def find_warnings() -> list[zenoh.Sample]:
+        return [sample for sample in heard if decode_ahead(sample.payload.to_bytes()).warnings]
+
     with owner:
-        owner.declare_subscriber(keys.ahead_key(CAR), heard.put)
+        owner.declare_subscriber(keys.ahead_key(CAR), heard.append)
         with driving(router) as car:
             assert car.next_warning().state == "raised"
-            car.drive_until(lambda seen: seen.warnings)
-            sample = heard.get(timeout=10.0)
-            while not decode_ahead(sample.payload.to_bytes()).warnings:
-                car.report_pose()
-                sample = heard.get(timeout=10.0)
+            car.drive_until(lambda _: find_warnings())
+    sample = find_warnings()[0]
     assert str(sample.encoding) == AHEAD_ENCODING
     told = decode_ahead(sample.payload.to_bytes())
     assert told.vehicle == CAR

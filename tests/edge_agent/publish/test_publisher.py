@@ -25,7 +25,7 @@ from schemas.thresholds import NS
 from schemas.wire import Batch, Kind, StreamAck, encode_ack
 from tests.edge_agent.fakes import Watch, estimates, wanderers
 from tests.edge_agent.service import Router, Service
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 NAMES = ("car-a", "car-b", "car-c")
 Make = Callable[..., Publisher]
@@ -70,7 +70,7 @@ def test_every_record_arrives_once_under_its_vehicles_key_and_is_settled(
     observations, states = drive()
     publisher.offer(observations, states)
     until(lambda: publisher.counts.acknowledged[Kind.STATE] == len(states.vehicle))
-    assert publisher.close(within_s=5.0)
+    assert publisher.close(within_s=PATIENCE_S)
     assert publisher.count_unsettled() == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     assert rows(service.batches, Kind.STATE) == len(states.vehicle)
@@ -90,7 +90,7 @@ def test_columns_arrive_as_they_were_observed(
     publisher = publisher_of(settings(router, tmp_path))
     observations, _ = drive()
     publisher.offer(observations)
-    assert publisher.close(within_s=10.0)
+    assert publisher.close(within_s=PATIENCE_S)
     for n, name in enumerate(NAMES):
         mine = sorted(
             (b for b in service.batches if b.vehicle == name), key=lambda b: (b.region, b.seq)
@@ -112,7 +112,7 @@ def test_what_the_service_does_not_answer_is_sent_again_until_it_does(
     publisher.offer(observations)
     service.wait(lambda batches: len(batches) > len({b.seq for b in batches}) + 6)
     service.answer = True
-    assert publisher.close(within_s=20.0)
+    assert publisher.close(within_s=PATIENCE_S)
     assert publisher.count_unsettled() == 0
     assert publisher.counts.resent_batches >= 3
     assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle)
@@ -176,14 +176,15 @@ def test_batches_of_an_earlier_start_are_sent_under_their_old_identity(
     service.answer = False
     config = settings(router, tmp_path)
     first = publisher_of(config)
-    first.offer(drive()[0])
-    service.wait(lambda batches: len(batches) >= 3)
+    observations, _ = drive()
+    first.offer(observations)
+    service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
     first.close(within_s=0.1)
     earlier = set(service.identities())
     service.batches.clear()
     service.answer = True
     second = publisher_of(config)
-    assert second.close(within_s=20.0)
+    assert second.close(within_s=PATIENCE_S)
     assert set(service.identities()) == earlier
     assert second.count_unsettled() == 0
 
@@ -197,7 +198,7 @@ def test_a_rejected_batch_is_settled_counted_and_logged(
     theirs = int((observations.vehicle == 1).sum())
     with caplog.at_level(logging.WARNING):
         publisher.offer(observations)
-        assert publisher.close(within_s=20.0)
+        assert publisher.close(within_s=PATIENCE_S)
     assert publisher.count_unsettled() == 0
     assert publisher.counts.rejected[Kind.OBSERVATION] == theirs
     assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle) - theirs
@@ -270,7 +271,7 @@ def test_a_full_disk_is_waited_for(
     until(lambda: "the outbox refuses" in caplog.text)
     assert publisher.count_unsettled() == len(observations.vehicle) + len(states.vehicle)
     database.execute("PRAGMA max_page_count = 1000000")
-    assert publisher.close(within_s=20.0)
+    assert publisher.close(within_s=PATIENCE_S)
     assert publisher.count_unsettled() == publisher.status.dropped_records == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
     for stream in {(b.vehicle, b.kind, b.region) for b in service.batches}:
