@@ -23,7 +23,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
 from tests.event_lines import logger_into
-from tests.waiting import matched, until
+from tests.waiting import PATIENCE_S, matched, until
 
 VEHICLES = ("anna", "bert", "cleo")
 ICE = 0.25
@@ -60,7 +60,7 @@ class System:
     def stop(self) -> None:
         """Stop the service. Before it ends, it stores and acknowledges the received reports."""
         self._stop.set()
-        self._thread.join(30)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
 
     def publish_drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:

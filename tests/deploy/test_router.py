@@ -17,7 +17,7 @@ from schemas import config
 from schemas.config import AgentConfig, ServiceConfig, ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime.zenoh_session import open_session
-from tests.waiting import matched
+from tests.waiting import PATIENCE_S, matched
 
 
 def test_clients_of_a_router_hear_each_other() -> None:
@@ -44,7 +44,7 @@ def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("router: tcp/127.0.0.1:")
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_wrong_configuration_names_the_field_and_the_fix(

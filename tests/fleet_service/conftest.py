@@ -17,7 +17,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.buckets import BucketServer, bucket_server
 from tests.event_lines import logger_into
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 PUT_S = 0.1
 
@@ -33,7 +33,7 @@ class Running:
 
     def end(self) -> None:
         self.stop.set()
-        self.thread.join(10.0)
+        self.thread.join(PATIENCE_S)
         assert not self.thread.is_alive(), "the service does not leave"
 
 

@@ -34,7 +34,7 @@ from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
 from tests.ports import free_ports
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 # Column and row of cells near Gothenburg.
 X = 1_118_000
@@ -250,10 +250,12 @@ def test_watch_says_stretches_as_json_and_sends_them(
             )
             line = json.loads(watching.stdout.readline())
             until(lambda: heard)
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
+            with urllib.request.urlopen(
+                f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S
+            ) as answer:
                 assert json.load(answer)["status"] == "ok"
             watching.terminate()
-            assert watching.wait(20) == 0
+            assert watching.wait(PATIENCE_S) == 0
     assert (line["event"], line["state"], line["cells"]) == ("alert", "raised", 1)
     assert heard[0]["alerts"][0]["labels"]["id"] == line["id"]
 

@@ -33,7 +33,7 @@ from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import CELL, SECOND, batch, key
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 COMMAND = [sys.executable, "-m", "fleet_service.cli"]
 
@@ -180,7 +180,7 @@ def test_run_and_watch_as_processes_from_start_to_signal(
         assert not awaited
         for process in (run, watch):
             process.send_signal(signal.SIGTERM)
-            assert process.wait(10) == 0
+            assert process.wait(PATIENCE_S) == 0
             assert process.stderr is not None
             assert process.stderr.read() == ""
         said = run.stdout.read()

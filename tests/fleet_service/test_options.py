@@ -38,6 +38,7 @@ from tests.fleet_service.archive.kept import DATA, PLACES
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, batch
 from tests.secured import make_enrolment
+from tests.waiting import PATIENCE_S
 
 Capture = pytest.CaptureFixture[str]
 ARCHIVE: Final = ["--archive", "{a}"]
@@ -499,7 +500,7 @@ def test_box_selects_watched_tiles_and_both_options_name_the_router(
         assert tiles["here"] != tiles["far"]
         for name, part in watching.items():
             part.send_signal(signal.SIGTERM)
-            part.wait(30.0)
+            part.wait(PATIENCE_S)
             assert {line.split()[1] for line in part.read_lines() if line.startswith("tile ")} == {
                 tiles[name]
             }

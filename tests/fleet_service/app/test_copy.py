@@ -263,7 +263,7 @@ def service(
 
 def health(address: str) -> str:
     try:
-        with urllib.request.urlopen(f"{address}/healthz", timeout=10) as reply:
+        with urllib.request.urlopen(f"{address}/healthz", timeout=PATIENCE_S) as reply:
             return str(reply.read().decode())
     except urllib.error.HTTPError as error:
         return error.read().decode()
@@ -300,7 +300,7 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
         bucket.bring_back(kind)
         until(lambda: drive(fleet, during), PATIENCE_S)
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
     found = list_archived(tmp_path)
     assert len(found) == len(set(found)) == 3 * len(before + during)
     _same_in_the_bucket(bucket, root)
@@ -329,7 +329,7 @@ def test_service_killed_between_disk_and_bucket_loses_nothing(
     with service(router, tmp_path, bucket) as (process, _):
         until(lambda: drive(fleet, during), PATIENCE_S)
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
     found = list_archived(tmp_path)
     assert len(found) == len(set(found)) == 3 * len(before + during)
     assert all(one in found for one in identities(fleet, tmp_path))
@@ -355,7 +355,7 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
         if beside:
             assert main(words) == 0
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
     if not beside:
         assert main(words) == 2  # the archive has a copy, but the service does not know its address
         assert main([*words, "--config", str(tmp_path / "service.json")]) == 0

@@ -23,7 +23,7 @@ from schemas.config import ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import SECOND, batch
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 VEHICLES = 6
 BATCHES = 60
@@ -74,7 +74,7 @@ def test_killed_service_keeps_acknowledged_reports_and_doubles_none(
                 fleet.publish(one)
             if turn == KILLS:
                 process.terminate()
-                assert process.wait(10) == 0
+                assert process.wait(PATIENCE_S) == 0
         held = list_archived(tmp_path)
         assert all(one in held for one in identities(fleet, tmp_path))
     assert len(held) == len(set(held)) == 3 * len(sent)

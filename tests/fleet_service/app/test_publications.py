@@ -8,6 +8,7 @@ import zenoh
 
 from fleet_service.app.publications import WaitingAcks
 from schemas import keys
+from tests.waiting import PATIENCE_S
 
 
 def test_acknowledgements_are_published_in_parts_in_their_order(session: zenoh.Session) -> None:
@@ -24,7 +25,7 @@ def test_acknowledgements_are_published_in_parts_in_their_order(session: zenoh.S
         left.append(len(waiting))
     assert left[0] == 750, "a quarter of many"
     assert left[-3] - left[-2] == 64, "at least 64 of few"
-    assert [received.get(timeout=10.0) for _ in sent] == sent
+    assert [received.get(timeout=PATIENCE_S) for _ in sent] == sent
 
 
 def test_all_waiting_acknowledgements_are_published_at_the_end(session: zenoh.Session) -> None:
@@ -37,4 +38,4 @@ def test_all_waiting_acknowledgements_are_published_at_the_end(session: zenoh.Se
     waiting.add([("car-002", b"last")])
     waiting.publish_all(session)
     assert not waiting
-    assert [received.get(timeout=10.0) for _ in range(301)][-1] == b"last"
+    assert [received.get(timeout=PATIENCE_S) for _ in range(301)][-1] == b"last"

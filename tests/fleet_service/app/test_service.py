@@ -34,7 +34,7 @@ from tests.fleet_service.examples import (
     key,
     send,
 )
-from tests.waiting import matched, until
+from tests.waiting import PATIENCE_S, matched, until
 
 VEHICLES = ("sim-001", "sim-002", "sim-003")
 
@@ -174,7 +174,7 @@ def test_what_is_acknowledged_lies_in_a_segment_and_on_the_map(
 
 def test_a_changed_tile_is_put_on_its_own_key(fleet: Fleet) -> None:
     fleet.settle(batch("sim-001", 1, now(), [0.8]))
-    name, table = fleet.tiles.get(timeout=10.0)
+    name, table = fleet.tiles.get(timeout=PATIENCE_S)
     assert name == keys.map_key(TILE)
     assert table["cell"].to_pylist() == [CELL]
 
@@ -247,13 +247,13 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
         fleet.settle(batch(f"sim-{passes:03}", 2, next(moments), [0.2]))
         if not fleet.alerts.empty():
             break
-    alert = fleet.alerts.get(timeout=10.0)
+    alert = fleet.alerts.get(timeout=PATIENCE_S)
     assert passes <= 4
     assert (alert.cell, alert.raised) == (CELL, True)
     assert alert.p_slippery > 0.9
     for k in range(10):
         fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
-    cleared = fleet.alerts.get(timeout=10.0)
+    cleared = fleet.alerts.get(timeout=PATIENCE_S)
     assert (cleared.cell, cleared.raised, cleared.reason) == (
         CELL,
         False,
@@ -274,12 +274,12 @@ def test_who_comes_late_asks_for_the_alerts_that_stand(fleet: Fleet) -> None:
     assert not standing(fleet.session)
     moments = seconds()
     fleet.settle(*(batch(f"sim-{k:03}", 1, next(moments), [0.2]) for k in range(3)))
-    raised = fleet.alerts.get(timeout=10.0)
+    raised = fleet.alerts.get(timeout=PATIENCE_S)
     assert standing(fleet.session) == [raised]
     assert not [reply for reply in fleet.session.get(keys.alert_key(TILE + 1)) if reply.ok]
     for k in range(10):
         fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
-    fleet.alerts.get(timeout=10.0)
+    fleet.alerts.get(timeout=PATIENCE_S)
     assert not standing(fleet.session)
 
 

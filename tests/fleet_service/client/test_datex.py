@@ -33,6 +33,7 @@ from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
 from tests.fleet_service.test_alerts import alert
 from tests.structure import ROOT
+from tests.waiting import PATIENCE_S
 
 SCHEMA = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
 OURS = Supplier("se", "GripMap test")
@@ -201,7 +202,7 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
             )
             assert following.stdout.readline() == f"0 slippery stretches in {out}\n"
             following.terminate()
-            assert following.wait(20) == 0
+            assert following.wait(PATIENCE_S) == 0
     (ended,) = records(out.read_bytes())
     assert text(ended, ".//com:overallEndTime")
     assert ended.get("version") == "2"

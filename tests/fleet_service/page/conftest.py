@@ -16,7 +16,7 @@ from fleet_service.page.server import PageSettings, run
 from schemas.config import ZenohSettings
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.page import street
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
 @dataclass
@@ -43,7 +43,7 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
         yield lines[-1].removeprefix("page: ")
     finally:
         stop.set()
-        thread.join(10.0)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive(), "the page does not leave"
 
 

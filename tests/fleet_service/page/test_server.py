@@ -38,7 +38,7 @@ from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import START, TILE, observations, value
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
 
@@ -47,7 +47,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
     """Request `path` from the page at `address` with the given headers. Return status, headers and
     body of the answer.
     """
-    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     try:
@@ -64,7 +64,7 @@ def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], b
 @contextmanager
 def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
     """Open an event stream of the page at `address`, and yield an iterator over its events."""
-    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
     connection.request("GET", path)
     answer = connection.getresponse()
 
@@ -209,7 +209,7 @@ def ask_briefly(address: str) -> int:
     """Open an event stream of the page at `address`, close it at once, and return the HTTP status
     of the page's answer.
     """
-    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
     connection.request("GET", "/events")
     answer = connection.getresponse()
     answer.close()
@@ -372,7 +372,7 @@ def test_every_option_of_the_command_does_what_it_says(
         until(lambda: ask(address, "/datex2/situation.xml")[0] == 503)  # no service is running
         assert "img-src 'self' data: https://t.example;" in headers["content-security-policy"]
         page.send_signal(signal.SIGTERM)
-        page.wait(30.0)
+        page.wait(PATIENCE_S)
     finally:
         page.kill()
 

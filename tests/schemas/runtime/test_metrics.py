@@ -17,6 +17,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from schemas.errors import InputError
 from schemas.runtime import metrics
 from schemas.runtime.metrics import Metric, gauge, serve_metrics
+from tests.waiting import PATIENCE_S
 
 HOSTILE = 'a"b\\c\nd<script>'
 
@@ -32,7 +33,7 @@ def read_metrics() -> Sequence[Metric]:
 
 def fetch_page(address: str) -> tuple[int, str, str]:
     try:
-        with urllib.request.urlopen(address, timeout=10) as reply:
+        with urllib.request.urlopen(address, timeout=PATIENCE_S) as reply:
             return reply.status, reply.headers["Content-Type"], reply.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -64,7 +65,7 @@ def test_health_follows_the_troubles() -> None:
         assert fetch_page(f"{address}/elsewhere")[0] == 404
         request = urllib.request.Request(f"{address}/metrics", data=b"x", method="POST")
         with pytest.raises(urllib.error.HTTPError, match="501") as refused:
-            urllib.request.urlopen(request, timeout=10)
+            urllib.request.urlopen(request, timeout=PATIENCE_S)
         refused.value.close()
 
 
