@@ -45,6 +45,7 @@ from tests.fleet_service.examples import batch, key
 from tests.outboxes import read_batches
 
 SIZE_MB: Final = 24
+BALLAST: Final = "ballast"  # file that fills the disk
 VEHICLES: Final = 5
 CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
 RESERVE_MB: Final = 2  # [MB] the same share of this small disk as 64 MB of a real one
@@ -76,18 +77,24 @@ def fill_disk(folder: Path, mounted: bool) -> Iterator[None]:
     system calls that write fail as on a full disk.
     """
     if mounted:
-        ballast = folder / "ballast"
-        with suppress(OSError), ballast.open("wb", buffering=0) as file:
-            while True:
-                file.write(bytes(1 << 12))
-        assert not os.statvfs(folder).f_bavail
+        _fill_up(folder)
         try:
             yield
         finally:
-            ballast.unlink()
+            (folder / BALLAST).unlink()
         return
     with _refuse_writes("open", "fsync", "rename", "mkdir"):
         yield
+
+
+def _fill_up(folder: Path) -> None:
+    """Fill the mounted file system with a file. Repeat this in the room that background jobs make
+    meanwhile by removing files.
+    """
+    while os.statvfs(folder).f_bavail:
+        with suppress(OSError), (folder / BALLAST).open("ab", buffering=0) as file:
+            while True:
+                file.write(bytes(1 << 12))
 
 
 @contextmanager
@@ -131,10 +138,11 @@ def run(site: Site) -> list[Figure]:
                     seq += 3
                     failures = engine.counts.failures["segment"]
                     with fill_disk(site.folder / "disk", mounted):
-                        acknowledged += _drive(engine, seq, 6)
-                        seq += 6
-                        # A job may remove files meanwhile, so that a later segment finds room and
-                        # is written.
+                        for _ in range(6):
+                            acknowledged += _drive(engine, seq, 1)
+                            seq += 1
+                            if mounted:  # a job may have removed files
+                                _fill_up(site.folder / "disk")
                         refused += engine.counts.failures["segment"] > failures
                         false += acknowledged > _count_rows(root)
                     acknowledged += _until_settled(engine)
