@@ -61,7 +61,7 @@ coverage: $(PAPERS)  #= branch coverage of each package by the tests that take s
 	mkdir -p .coverage
 	$(BIN)/python -m coverage erase
 	find tests -name 'test_*.py' | sort | xargs -P $$(getconf _NPROCESSORS_ONLN) -n 12 \
-	  $(BIN)/python -m coverage run -m pytest -q -m 'not long and not campaign' -o timeout=900 --continue-on-collection-errors \
+	  $(BIN)/python -m coverage run -m pytest -q -m 'not long and not campaign' --continue-on-collection-errors \
 	  || echo 'coverage: some tests failed; tracing makes them slow'
 	$(BIN)/python -m coverage combine --quiet
 	rm -f .coverage/data.*

@@ -187,7 +187,6 @@ busiest = their_plugin:busiest
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # time to compile the default estimator's kernels
 def test_estimator_source_and_question_of_another_distribution_are_found(tmp_path: Path) -> None:
     from tests.fleet_service.archive.kept import DATA
 

@@ -18,7 +18,6 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 
-@pytest.mark.timeout(900)  # time to compile the kernels of agent and service
 def test_the_real_minute_comes_onto_the_map_under_three_names(
     minute: tuple[Cells, list[str]],
 ) -> None:
@@ -27,7 +26,6 @@ def test_the_real_minute_comes_onto_the_map_under_three_names(
     assert max(int(str(cell["vehicles"])) for cell in cells) == len(VEHICLES)
 
 
-@pytest.mark.timeout(900)
 def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:
     assert not minute[1]
 

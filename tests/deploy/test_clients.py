@@ -11,8 +11,7 @@ import pytest
 
 from tests.deploy.clients import PLACES, build_client, missing_tool, run_client, served_map
 
-# A service that must compile its kernels takes minutes to start.
-pytestmark = [pytest.mark.campaign, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.campaign
 
 
 @pytest.fixture(scope="module")

@@ -268,7 +268,6 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
     )
 
 
-@pytest.mark.timeout(400)
 @pytest.mark.campaign
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
     """Two routers, a service, the live page and an agent must work together, and a client must be

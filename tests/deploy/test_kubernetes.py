@@ -183,7 +183,6 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_what_the_pods_start_works_together_and_leaves_in_time(
     overlay: str, tmp_path: Path

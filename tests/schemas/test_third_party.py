@@ -14,9 +14,6 @@ import pytest
 
 from deploy.router import open_router
 
-# A service that must compile its kernels takes minutes to start.
-pytestmark = pytest.mark.timeout(400)
-
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:

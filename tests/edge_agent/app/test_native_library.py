@@ -85,7 +85,6 @@ def run_python(code: str, *words: str) -> list[str]:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_agent_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """The shared library and Numba must give the same estimates, records and beliefs of a drive,
     bit by bit. The process that uses the library must not import the modules in HEAVY.

@@ -245,7 +245,6 @@ def write(path: Path, drive: Recorded) -> str:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # time to compile the kernels
 def test_a_calibrated_file_is_written_read_and_heeded(
     smooth: Recorded, tmp_path: Path, capsys: Output
 ) -> None:

@@ -313,7 +313,6 @@ def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
     assert not passed
 
 
-@pytest.mark.timeout(600)  # time to compile the default estimator's kernels
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
     """Run the commands of the tutorial `first-drive.md` on its recording, one minute of real
     driving. Every command must succeed.
@@ -373,7 +372,6 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # starts processes, and may have to compile kernels
 def test_evaluation_of_the_inputs_writes_its_figures(tmp_path: Path) -> None:
     words = ["--quick", "--recorded", str(BLF), "--out", str(tmp_path)]
     assert evaluate_inputs(words) in (0, 1)

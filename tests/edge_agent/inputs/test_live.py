@@ -217,7 +217,6 @@ def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # time to compile the kernels
 def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
     (bus, can) = peer_addresses("can")
     (receiver, gpsd) = peer_addresses("gpsd")

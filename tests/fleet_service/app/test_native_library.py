@@ -82,7 +82,6 @@ def run_python(code: str, folder: Path) -> list[str]:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(600)  # Numba compiles the kernels if its cache is empty
 def test_a_native_service_gives_the_same_bits_without_numba(tmp_path: Path) -> None:
     """A service that takes its kernels from the shared library must publish the same tiles and
     answers, and hold the same beliefs, as one whose kernels Numba compiles, bit by bit. This
