@@ -16,6 +16,7 @@ from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import ACK_ENCODING, Batch, Kind, StreamAck, decode, encode_ack
+from tests.ports import free_ports
 
 DEADLINE_S = 120.0  # time for the first start after a change, which compiles the kernels
 
@@ -24,7 +25,7 @@ class Router:
     """Zenoh router in this process. After `stop` and `start` it has the same address."""
 
     def __init__(self) -> None:
-        self.endpoint = "tcp/127.0.0.1:0"
+        self.endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self.start()
 
     def start(self) -> None:
@@ -35,16 +36,11 @@ class Router:
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "scouting/delay": 0,
-            "adminspace/enabled": True,
             "transport/shared_memory/enabled": False,
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         self._session = zenoh.open(config)
-        if self.endpoint.endswith(":0"):
-            answer = next(iter(self._session.get(f"@/{self._session.zid()}/router")))
-            assert answer.ok is not None
-            self.endpoint = json.loads(answer.ok.payload.to_string())["locators"][0]
 
     def stop(self) -> None:
         self._session.close()

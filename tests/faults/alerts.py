@@ -28,6 +28,7 @@ from tests.faults.frame import Site
 from tests.faults.processes import Part, Stage, open_stage
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, batch
+from tests.ports import free_ports
 from tests.waiting import until
 
 SOON_S: Final = 5.0
@@ -94,9 +95,9 @@ def _make_second_router(there: Stage) -> Part:
     settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))
     config.write_text(str(settings))
     command = [sys.executable, "-m", "deploy.router", "--config", str(config), "--listen"]
-    part = Part("router-b", [*command, "tcp/127.0.0.1:0"], there.folder)
+    part = Part("router-b", [*command, f"tcp/127.0.0.1:{free_ports(1)[0]}"], there.folder)
     part.start()
-    part.command = [*command, part.line_with("router: ").split()[1]]
+    part.line_with("router: ")
     return part
 
 

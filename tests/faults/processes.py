@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from tests.ports import free_ports
 from tests.waiting import freeze, until
 
 START_S = 120.0  # time for a start; the first one compiles the kernels
@@ -130,20 +131,17 @@ class Stage:
         self.folder = folder
         self.archive = folder / "archive"
         folder.mkdir(parents=True, exist_ok=True)
-        self.router = Part("router", self._router_command("tcp/127.0.0.1:0"), folder)
+        self.endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        command = [sys.executable, "-m", "deploy.router", "--listen", self.endpoint]
+        self.router = Part("router", command, folder)
         self.router.start()
-        self.endpoint = self.router.line_with("router: ").split()[1]
-        self.router.command = self._router_command(self.endpoint)
+        self.router.line_with("router: ")
         config = folder / "service.json"
         config.write_text(json.dumps({"zenoh": {"connect": [self.endpoint]}, **service}))
         words = ["run", "--config", str(config), "--archive", str(self.archive)]
         self.service = Part("service", [sys.executable, "-m", "fleet_service.cli", *words], folder)
         self.service.start()
         self.loads: list[Part] = []
-
-    @staticmethod
-    def _router_command(endpoint: str) -> list[str]:
-        return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
 
     def make_load(self, names: Sequence[str], rate: float, **more: object) -> Part:
         """Return a load generator, not yet started, that sends `rate` observations per second for

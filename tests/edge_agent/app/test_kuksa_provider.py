@@ -18,6 +18,7 @@ from schemas.errors import InputError
 from schemas.thresholds import NS
 from tests.benchmarks.inputs.databroker import Databroker
 from tests.edge_agent.service import Router, Service
+from tests.ports import free_ports
 from tests.waiting import until
 
 TIME = 1_800_000_000 * NS + 5
@@ -56,8 +57,7 @@ def test_signal_that_the_broker_does_not_know_is_logged_once(
 def test_broker_that_comes_later_gets_the_latest_values(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with Databroker("127.0.0.1:0", [*FRICTION, CONDITION]) as broker:
-        address = f"127.0.0.1:{broker.port}"
+    address = f"127.0.0.1:{free_ports(1)[0]}"
     with closing(KuksaProvider(address)) as provider:
         provider.write(ICE, TIME)
         until(lambda: provider.refused)

@@ -17,6 +17,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.link_watch import LinkWatch, link_metrics, router_metrics
 from schemas.runtime.zenoh_session import configuration
 from tests.fleet_service.examples import key
+from tests.ports import free_ports
 from tests.secured import READER, ROUTERS, VEHICLES, open_network
 from tests.waiting import until
 
@@ -27,7 +28,7 @@ RETRY = {
 
 def test_a_lost_router_is_noticed_and_logged_at_once(caplog: pytest.LogCaptureFixture) -> None:
     changes = list[bool]()
-    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    router, endpoints = open_router(listen=f"tcp/127.0.0.1:{free_ports(1)[0]}")
     with (
         caplog.at_level(logging.INFO),
         zenoh.open(configuration(ZenohSettings(connect=endpoints, config=RETRY))) as car,
