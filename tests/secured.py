@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -32,6 +32,7 @@ VEHICLES = ("sim-000", "sim-001")
 ROUTERS = ("router-a", "router-b")
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = f"{keys.ROOT}/shard/probe"
+TRIES = 3  # attempts to open a session
 RETRY = {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1.0}
 
 
@@ -105,14 +106,17 @@ class Network:
     between: dict[str, str] = field(default_factory=dict)
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
-        """Open a session under an enrolled name.
+        """Open a session under an enrolled name. On a busy machine a handshake may fail, so only
+        several failures count as a refusal.
 
         Raises:
             zenoh.ZError: the router refuses the session.
         """
-        return zenoh.open(
-            configuration(settings(self.endpoints[router], self.folder, **changed), name)
-        )
+        where = settings(self.endpoints[router], self.folder, **changed)
+        for _ in range(TRIES - 1):
+            with suppress(zenoh.ZError):
+                return zenoh.open(configuration(where, name))
+        return zenoh.open(configuration(where, name))
 
     def session_at(self, name: str, endpoints: Sequence[str]) -> zenoh.Session:
         """Return a session under an enrolled name that tries several endpoints in turn."""
