@@ -110,7 +110,7 @@ class System:
         session = open_session(ZenohSettings(connect=[self.endpoint]))
         assert session is not None
         with session:
-            replies = list(session.get(f"gripmap/v1/map/**?{parameters}"))
+            replies = list(session.get(f"gripmap/v1/map/**?{parameters}", timeout=PATIENCE_S))
         cells: list[dict[str, object]] = []
         for reply in replies:
             assert reply.ok is not None, reply.err and reply.err.payload.to_string()
@@ -236,7 +236,7 @@ def test_garbage_is_refused_and_the_service_goes_on(system: System) -> None:
         publisher.put(b"\xff\x00garbage", encoding=zenoh.Encoding("application/protobuf"))
         errors = [
             r.err.payload.to_string()
-            for r in session.get("gripmap/v1/map/**?bbox=1,2,3")
+            for r in session.get("gripmap/v1/map/**?bbox=1,2,3", timeout=PATIENCE_S)
             if r.err is not None
         ]
         assert errors

@@ -69,7 +69,7 @@ def count_shown(session: zenoh.Session) -> dict[int, int]:
     number.
     """
     found: dict[int, int] = {}
-    for reply in session.get(keys.map_key(TILE)):
+    for reply in session.get(keys.map_key(TILE), timeout=PATIENCE_S):
         if reply.ok is not None:
             table = pa.ipc.open_stream(BytesIO(reply.ok.payload.to_bytes())).read_all()
             found |= zip(

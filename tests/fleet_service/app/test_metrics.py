@@ -23,7 +23,7 @@ from schemas.wire import Kind
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.schemas.runtime.test_metrics import fetch_page
-from tests.waiting import matched, until
+from tests.waiting import PATIENCE_S, matched, until
 
 
 def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
@@ -37,7 +37,7 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
         for seq, speed in ((1, 15.0), (2, 999.0)):
             sent = batch("sim-001", seq, time.time_ns() - SECOND, [0.8], speed=[speed])
             session.put(key("sim-001"), wire.encode(sent), encoding=wire.ENCODING[Kind.OBSERVATION])
-        list(session.get("gripmap/v1/map/**?colour=red"))
+        list(session.get("gripmap/v1/map/**?colour=red", timeout=PATIENCE_S))
 
         def read_metrics() -> dict[str, float]:
             families = text_string_to_metric_families(fetch_page(f"{address}/metrics")[2])

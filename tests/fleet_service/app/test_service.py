@@ -122,9 +122,8 @@ def ask(
     """Query the map, and return (key, encoding, payload) of every reply. The test fails on an error
     reply.
     """
-    replies = list(
-        session.get(f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else ""))
-    )
+    selector = f"{keys.ROOT}/map/{where}" + (f"?{parameters}" if parameters else "")
+    replies = list(session.get(selector, timeout=PATIENCE_S))
     assert all(reply.ok for reply in replies), [
         reply.err.payload.to_string() for reply in replies if reply.err
     ]
@@ -265,7 +264,8 @@ def standing(session: zenoh.Session) -> list[wire.Alert]:
     """Query the service for all active alerts, as a client does that connects after they were
     raised. Return the alerts.
     """
-    replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
+    asked = session.get(f"{keys.ROOT}/alert/**", timeout=PATIENCE_S)
+    replies = [reply.ok for reply in asked if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
@@ -431,7 +431,7 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
 def test_a_bad_query_gets_an_error_that_names_the_field(
     fleet: Fleet, parameters: str, start: str
 ) -> None:
-    (reply,) = fleet.session.get(f"{keys.ROOT}/map/**?{parameters}")
+    (reply,) = fleet.session.get(f"{keys.ROOT}/map/**?{parameters}", timeout=PATIENCE_S)
     assert reply.err is not None
     assert reply.err.payload.to_string().startswith(start)
     assert "; " in reply.err.payload.to_string()

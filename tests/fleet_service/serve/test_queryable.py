@@ -29,7 +29,7 @@ from fleet_service.serve.queryable import (
 from schemas import keys
 from schemas.query import Format, MapQuery
 from tests.fleet_service.examples import TILE
-from tests.waiting import matched, until
+from tests.waiting import PATIENCE_S, matched, until
 
 FAILURES = (
     pa.ArrowInvalid("a file is no Parquet"),
@@ -44,7 +44,7 @@ def texts(session: zenoh.Session, selector: str) -> list[str]:
     """
     return sorted(
         part.payload.to_string()
-        for reply in session.get(selector)
+        for reply in session.get(selector, timeout=PATIENCE_S)
         if (part := reply.ok or reply.err)
     )
 
