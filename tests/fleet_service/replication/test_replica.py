@@ -33,6 +33,7 @@ from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.buckets import SECRET, BucketServer, list_copied_files
 from tests.fleet_service.archive.rows import identities, rows_of
+from tests.waiting import until
 
 NAME = "shard-0"
 Make = Callable[[Path], BucketReplica]
