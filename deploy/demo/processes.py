@@ -31,14 +31,35 @@ class DemoError(RuntimeError):
     """
 
 
+@contextmanager
+def _hold_signals() -> Iterator[list[int]]:
+    """Collect the numbers of arriving SIGINT and SIGTERM in the yielded list, instead of raising
+    KeyboardInterrupt. Raised within `subprocess.Popen`, it would leave behind a process that
+    `ManagedProcess` does not know.
+    """
+    arrived: list[int] = []
+    usual = {
+        number: signal.signal(number, lambda number, _: arrived.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield arrived
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+
+
 class ManagedProcess:
     """One process of the demo; its output is written to `folder/NAME.log`."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
         self.name = name
         self.log = folder / f"{name}.log"
-        with self.log.open("w") as out:
+        with self.log.open("w") as out, _hold_signals() as arrived:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
+        if arrived:
+            self.stop()
+            raise KeyboardInterrupt
 
     def lines(self) -> list[str]:
         """Return the lines that this process of the demo has printed so far."""

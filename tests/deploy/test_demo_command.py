@@ -9,6 +9,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -108,6 +109,25 @@ def test_signal_ends_all_processes_of_the_demo(tmp_path: Path) -> None:
         for number in _processes_in(tmp_path):
             os.kill(number, signal.SIGKILL)
         demo.wait()
+
+
+def test_signal_during_the_start_of_a_process_leaves_none_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    usual = subprocess.Popen
+
+    def start_interrupted(
+        words: list[str], *, stdout: IO[str], stderr: int
+    ) -> subprocess.Popen[bytes]:
+        started.append(usual(words, stdout=stdout, stderr=stderr))
+        signal.raise_signal(signal.SIGINT)
+        return started[0]
+
+    monkeypatch.setattr(subprocess, "Popen", start_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        processes.ManagedProcess("sleep", ["sleep", "100"], tmp_path)
+    assert started[0].poll() == -signal.SIGTERM
 
 
 def _processes_in(folder: Path) -> list[int]:
