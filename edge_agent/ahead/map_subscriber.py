@@ -22,7 +22,7 @@ from edge_agent.ahead.path import Path, Pose
 from edge_agent.ahead.request_log import Box, RequestLog, Tiles, keys_of
 from schemas import grid, keys
 from schemas.errors import WireError
-from schemas.runtime.zenoh_session import quality_of
+from schemas.runtime.zenoh_session import connected_routers, quality_of
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING
 
@@ -117,7 +117,7 @@ class MapSubscriber:
         some part of its first `within` metres was not requested recently. The queries then cover
         every part of the whole path that was not requested recently.
         """
-        routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
+        routers = connected_routers(self._session)
         is_reconnected = bool(routers - self._routers)
         self._routers = routers
         tiles, dropped = self._tiles.update_subscriptions(

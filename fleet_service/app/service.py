@@ -208,7 +208,9 @@ class Service:
         session = self._session
         turn_age_s = time.monotonic() - self._stepped_at
         return (
-            session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
+            session is not None
+            and turn_age_s < STUCK_S
+            and bool(zenoh_session.connected_routers(session))
         )
 
     def _serve_monitoring(self) -> AbstractContextManager[str | None]:
@@ -218,7 +220,8 @@ class Service:
         root = self._root
 
         def pulse() -> Pulse:
-            routers = len(list(self._session.info.routers_zid())) if self._session else 0
+            session = self._session
+            routers = len(zenoh_session.connected_routers(session)) if session else 0
             lag_s = self._clock.lag() * 1e-9
             turn_s = time.monotonic() - self._stepped_at
             return Pulse(turn_s, len(self.inbox), routers, lag_s, self._replies.hangs_s)

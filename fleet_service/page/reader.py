@@ -87,7 +87,7 @@ class Reader:
     def is_connected(self) -> bool:
         """Return True if the page's Zenoh session is connected to a router."""
         session = self._session
-        return session is not None and bool(list(session.info.routers_zid()))
+        return session is not None and bool(zenoh_session.connected_routers(session))
 
     @property
     def is_served(self) -> bool:

@@ -158,7 +158,7 @@ def standby_signs(
         _hold_tokens(_declare_tokens(session, waits, WAITS)),
     ):
         yield (
-            lambda: bool(list(session.info.routers_zid())),
+            lambda: bool(zenoh_session.connected_routers(session)),
             lambda name: any(one.service == name for one in services.active),
             alive,
         )

@@ -107,6 +107,17 @@ def error_reason(error: zenoh.ZError) -> str:
     return str(error).partition(" at /")[0].strip()
 
 
+def connected_routers(session: zenoh.Session) -> frozenset[str]:
+    """Return the ids of the routers to which a session is connected. The result is empty if the
+    session is closed, or if another thread is closing it.
+    """
+    try:
+        return frozenset(str(zid) for zid in session.info.routers_zid())
+    # While a thread closes the session, Zenoh lends it to no other: "Already mutably borrowed".
+    except (RuntimeError, zenoh.ZError):
+        return frozenset()
+
+
 class ReasonLog:
     """Log of the reasons why no session could be opened. Each reason is logged once, even if
     several threads that open sessions share the object.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+from typing import Any
 
 import pytest
 import zenoh
@@ -57,3 +58,16 @@ def test_waiting_for_a_router_is_reported_once_without_build_paths(
     assert len(tries) == 3
     assert said.startswith(f"no session at {endpoint} yet: ")
     assert "/" not in said.replace("tcp/127.0.0.1", "")
+
+
+class LentSession:
+    """Session that another thread is closing, as Zenoh shows it to other threads."""
+
+    @property
+    def info(self) -> zenoh.SessionInfo:
+        raise RuntimeError("Already mutably borrowed")
+
+
+def test_session_that_another_thread_closes_has_no_routers() -> None:
+    closing: Any = LentSession()
+    assert zenoh_session.connected_routers(closing) == set()
