@@ -9,13 +9,10 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import Final
 
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.runtime.installing import install_command
-
-PAGE_HOST: Final = "127.0.0.1"  # listen address of `fleet-service page` without --host
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +87,7 @@ def _check_options(args: argparse.Namespace) -> None:
     from edge_agent.lab.simulation.counter_rng import checked_seed
     from edge_agent.lab.simulation.fleet import check_live_fleet
     from edge_agent.lab.simulation.listeners import warned_ones
-    from fleet_service.page.server import open_socket
+    from fleet_service.page.server import LOOPBACK, open_socket
 
     check_live_fleet(args.vehicles)
     checked_seed(args.seed)
@@ -98,7 +95,7 @@ def _check_options(args: argparse.Namespace) -> None:
     if math.isinf(args.duration):
         raise InputError("duration", "a drive of inf s never ends", "give seconds, e.g. 150")
     try:
-        open_socket(PAGE_HOST, args.page_port).close()
+        open_socket(LOOPBACK[0], args.page_port).close()
     except InputError as error:
         raise InputError("page-port", error.problem, "give another, or 0 for a free one") from error
     if args.screenshot is not None:

@@ -29,8 +29,16 @@ def test_a_number_out_of_range_is_refused_before_anything_starts(
     assert capsys.readouterr().err.startswith(f"error: argument {option}: '{value}' is not a p")
 
 
-def _refuse_start(*_: object) -> None:
-    raise AssertionError("a process was started")
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the current folder of a demo that must not start a process."""
+
+    def refuse_start(*_: object) -> None:
+        raise AssertionError("a process was started")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(processes, "ManagedProcess", refuse_start)
+    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -50,43 +58,34 @@ def _refuse_start(*_: object) -> None:
 def test_wrong_option_is_named_before_a_process_starts(
     option: str,
     value: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
     assert cli.main(["demo", option, value, "--page-port", "0"]) == 2
     _assert_one_error(capsys, option.removeprefix("--"))
-    assert not list(tmp_path.iterdir())
+    assert not list(folder.iterdir())
 
 
-def test_port_in_use_is_named_before_a_process_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
+@pytest.mark.usefixtures("folder")
+def test_port_in_use_is_named_before_a_process_starts(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         assert cli.main(["demo", "--page-port", str(other.getsockname()[1])]) == 2
     _assert_one_error(capsys, "page-port")
 
 
+@pytest.mark.usefixtures("folder")
 def test_missing_chromium_is_named_before_a_process_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
     monkeypatch.setattr("shutil.which", lambda _: None)
     assert cli.main(["demo", "--page-port", "0", "--screenshot", "page.png"]) == 2
     _assert_one_error(capsys, "screenshot")
 
 
 def test_demo_names_the_folder_that_it_cannot_make(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "ManagedProcess", _refuse_start)
-    (tmp_path / ".demo").write_text("a file, and no folder")
+    (folder / ".demo").write_text("a file, and no folder")
     assert cli.main(["demo", "--page-port", "0"]) == 2
     _assert_one_error(capsys, "demo")
 
