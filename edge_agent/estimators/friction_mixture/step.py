@@ -135,10 +135,12 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
     process[NodeState.VY] = (constants.physical.drift**2 + unsure**2 + block.missing_y) * duration
     forgets = memory.trust.distrust / constants.chosen.distrust_forget
     speed = scratch.features.speed
+    turning = abs(scratch.features.yaw_rate)
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         pace = 1.0 / nominal.time[i] + forgets
         if i in (NodeState.SLOPE, NodeState.BANK):
-            pace += speed / constants.physical.slope_length
+            # A road has another slope after `slope_length`; so has a car that turned by 1 rad.
+            pace += max(speed / constants.physical.slope_length, turning)
         if i in (NodeState.BIAS_X, NodeState.BIAS_Y, NodeState.SLOPE, NodeState.BANK):
             pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)

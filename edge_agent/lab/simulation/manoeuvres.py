@@ -296,6 +296,14 @@ def stop_and_go(now: Moment) -> tuple[float, float]:
     return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
 
 
+def street_corners(now: Moment) -> tuple[float, float]:
+    """Return the controls (road-wheel angle, acceleration) for turns by 90 degrees to the left at
+    street corners with a radius of 6 m, one every eight seconds.
+    """
+    turn = now.t % 8.0 - 3.0
+    return 0.45 * (smooth_step(turn / 1.2) - smooth_step((turn - 2.6) / 1.2)), hold(now)
+
+
 def throttle(_now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) for 3 m/s^2 from the first sample on,
     with straight wheels: the "throttle opening of 0.3" of paper 003.
@@ -364,6 +372,9 @@ MANOEUVRES: Final = {
     ),
     "stop-and-go": Manoeuvre(
         stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, wait, start again"
+    ),
+    "street-corners": Manoeuvre(
+        street_corners, 5.0, 24.0, 0.85, "turns by 90 degrees with a radius of 6 m"
     ),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

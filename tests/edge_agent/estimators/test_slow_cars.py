@@ -80,3 +80,30 @@ def test_nothing_is_charged_below_the_speed_at_which_slip_has_a_meaning(
     bank.advance(lane_changes.t[:slow], lane_changes.signals[:slow])
     assert lane_changes.truth["true_vx"][:slow].max() < 1.5
     assert not bank.memory("penalty").any()
+
+
+def turn_at_corners(mu: float, sensors: str, slope: float, seed: int) -> tuple[Estimates, float]:
+    """Simulate turns at street corners. Return the estimates, and the largest error of v_y
+    [m/s].
+    """
+    setup = DriveSetup(sensors=sensors, slope=slope)
+    log, known = simulate_manoeuvre("street-corners", mu=mu, seed=seed, setup=setup)
+    estimates = bank_of("aco-fckf", [known]).advance(
+        log["t"].to_numpy()[:, None], signals_of(log)[:, None]
+    )
+    return estimates, float(np.abs(estimates.vy[:, 0] - log["true_vy"].to_numpy()).max())
+
+
+@pytest.mark.parametrize("sensors", ["mems", "rough"])
+@pytest.mark.parametrize("slope", [0.08, -0.08])
+def test_a_turn_at_a_street_corner_on_a_hill_is_slippery_only_on_ice(
+    slope: float, sensors: str
+) -> None:
+    for seed in range(4):
+        estimates, error = turn_at_corners(0.85, sensors, slope, seed)
+        # In the turn the slope becomes a bank. If the filter assumes the same bank as before, v_y
+        # is wrong by up to .48.
+        assert error < 0.15
+        assert estimates.p_slippery.max() < 0.9
+        estimates, _ = turn_at_corners(0.15, sensors, slope, seed)
+        assert estimates.p_slippery.max() > 0.95

@@ -116,7 +116,8 @@ class PhysicalConstants(NamedTuple):
     # .96 on logs of real cars), and of the gravity due to slope and bank of the road (a grade of
     # 3 %, a crossfall of 1 to 3 %)
     offset_std: float = 0.25
-    # [m] distance over which slope and bank change: road waves are 100 to 400 m long
+    # [m] distance over which slope and bank change: road waves are 100 to 400 m long. They also
+    # change with the direction of the car: once per radian (`prepare_prediction`).
     slope_length: float = 120.0
 
     # --- Steering ---
