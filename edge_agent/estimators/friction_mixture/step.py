@@ -30,6 +30,7 @@ from edge_agent.estimators.friction_mixture.block.block_features import block_fe
 from edge_agent.estimators.friction_mixture.block.drive_split import learn_drive
 from edge_agent.estimators.friction_mixture.block.grip_guard import lower_while_sliding
 from edge_agent.estimators.friction_mixture.block.intake import begin_block, take_sample
+from edge_agent.estimators.friction_mixture.block.relaxation import relax_slips
 from edge_agent.estimators.friction_mixture.block.used_grip import used_grip
 from edge_agent.estimators.friction_mixture.block.wheel_slip import update_slip
 from edge_agent.estimators.friction_mixture.mixture.ice_patch import grow_patches
@@ -99,6 +100,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     learn_drive(memory, design.constants, features)
     update_slip(memory, design.constants, features)
     vx, vy = turned_velocity(memory, features.gain, features.cos, features.sin)
+    relax_slips(memory, design.constants, features, (vx, vy))
     update_novelty(memory, design, features, vx, vy)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)

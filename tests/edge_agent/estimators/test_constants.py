@@ -107,8 +107,10 @@ MOVES = {
     # The axle of this car does not yield as much as the larger mean expects.
     "compliance_mean": Move("strain", "constant-radius", 1.1),
     "compliance_std": Move("std COMPLIANCE", "stopping", 2.5),
-    # Learned values are forgotten sooner.
-    "steer_time": Move("std COMPLIANCE", "constant-radius", 1.02, LESS),
+    # Force follows slip later.
+    "relaxation_length": Move("nis", "pulses", 1.1),
+    # More of the slip acts at once.
+    "direct_slip": Move("nis", "pulses", 0.99),
     # Group: sliding wheels.
     # After the start of a slide, other friction values become possible sooner.
     "slip_change": Move("least probabilities", "acceleration", 1.1),
@@ -137,15 +139,15 @@ MOVES = {
     "force_share": Move("nis", "split-braking", 0.85),
     "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "constant-radius", 0.95),
-    "lag": Move("nis", "pulses", 0.85),
+    "lag": Move("nis", "pulses", 0.9),
     # Group: wheels that show the velocity without a tyre model.
     "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
     "following_most": Move("v_y told by an axle", "slalom", 2.0),
     # Group: contradiction between the car and the vehicle model.
     "strain_prior": Move("strain", "turn and straight", 1.1),  # the strain is learned more slowly
-    "strain_usual": Move("vy_std", "turn and straight", 0.99),  # the axles are trusted more
+    "strain_usual": Move("vy_std", "turn and straight", 0.997),  # the axles are trusted more
     # Axles of a car with little strain are trusted less.
-    "strain_power": Move("vy_std", "braking", 1.1, LESS),
+    "strain_power": Move("vy_std", "braking", 1.08, LESS),
     "strain_least": Move("vy_std", "gaining-slalom", 1.12),
     "strain_most": Move("vy_std", "rough acceleration", 0.92, LESS),
     # The contradiction is accepted later.

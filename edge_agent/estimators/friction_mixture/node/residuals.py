@@ -178,14 +178,16 @@ def find_slips(
             per_speed = inverse_of(max(abs(along), SLOWEST_M_S))
             if is_measured(features, wheel):
                 faster = lanes_at(node.rolling, wheel) - along
-                put_lanes(slip.along, wheel, slope_x * faster * per_speed)
+                built = faster * per_speed + features.late_along[wheel]
+                put_lanes(slip.along, wheel, slope_x * built)
             else:
                 put_lanes(slip.along, wheel, features.force[wheel])
             if blind:
                 put_lanes(slip.across, wheel, 0.0)
             else:
                 offset = lanes_at(node.steering, 0) if axle == 0 else 0.0
-                put_lanes(slip.across, wheel, slope_y * (offset - across * per_speed))
+                built = offset - across * per_speed + features.late_across[wheel]
+                put_lanes(slip.across, wheel, slope_y * built)
 
 
 @compiled

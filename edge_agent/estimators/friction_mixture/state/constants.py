@@ -132,9 +132,6 @@ class PhysicalConstants(NamedTuple):
     compliance_mean: float = 0.005
     # [rad] standard deviation of the compliance
     compliance_std: float = 0.01
-    # [s] time in which steering gain and compliance return to their prior. It is long because they
-    # are properties of the car.
-    steer_time: float = 600.0
 
     # --- Wheel radii and delays ---
     # [1] standard deviation of one wheel's radius relative to the others: pressure, wear, and
@@ -151,12 +148,12 @@ class PhysicalConstants(NamedTuple):
 
     # --- Noise of accelerometers, wheel speeds and steering ---
     # [m/s/s^.5] white noise of a_x and a_y, and random walk of their offsets (vehicle)
-    drift: float = 0.02
+    drift: float = 0.025
     # [rad/s] error of wheel speeds: noise, undetected resolution steps, teeth, wobbling tyres
     omega_noise: float = 0.06
-    # [1] share of a sudden change of slip that counts as noise. A tyre builds up force over .3 m,
-    # and a bump changes the rolling radius.
-    abrupt_share: float = 0.5
+    # [1] share of a sudden change of slip that counts as noise: a bump changes the rolling radius,
+    # and the relaxation of a tyre is known roughly.
+    abrupt_share: float = 0.4
     # [s] time in which a change of wheel speed stops being sudden. A bump lasts .05 s; a wheel
     # locks or spins up in .1 to .3 s. The forces are smoothed over the same time before they count
     # as grip in use.
@@ -181,9 +178,15 @@ class PhysicalConstants(NamedTuple):
     # [1] error of the tyre curve's shape, per squared lateral force over load. Without it a racing
     # car that uses all its grip contradicts the model for a third of a drive.
     shape_share: float = 0.05
-    # [s] delay of lateral force behind slip (relaxation, roll). The error is this time multiplied
-    # by the rate of the force.
-    lag: float = 0.015
+    # [m] distance over which a tyre builds up its force after a change of slip (`relaxation.py`):
+    # .1 to .3 along and .3 to .6 across for tyres of passenger cars
+    relaxation_length: float = 0.15
+    # [1] share of the slip that acts at once. With 0, wheels that spin under traction control were
+    # noticed late.
+    direct_slip: float = 0.2
+    # [s] delay of lateral force behind slip that relaxation does not explain (roll). The error is
+    # this time multiplied by the rate of the force.
+    lag: float = 0.01
     # [1] relative error of the force that accelerates a wheel's rotation. Torque and wheel speed
     # are sampled at different times, and ABS acts at 8 Hz. Without it, snow was reported as wet
     # road between pulses of the brake.
@@ -263,7 +266,7 @@ class DesignConstants(NamedTuple):
     strain_prior: float = 2.0
     # [1] strain at which R of the axles has its stated value: .2 to .5 on level drives, .5 to 2 on
     # rough ones
-    strain_usual: float = 0.95
+    strain_usual: float = 0.99
     # [1] exponent of strain over `strain_usual` in the factor on R of the axles: how much known
     # errors say about unknown ones. With 1, a car with late steering was not contradicted, and
     # called ice.

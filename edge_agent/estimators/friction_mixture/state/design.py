@@ -87,8 +87,6 @@ def nominal_states(constants: Constants) -> Nominal:
     ):
         std[state] = spread
         time[state] = p.return_time
-    time[x.COMPLIANCE] = p.steer_time
-    time[x.STEER_GAIN] = p.steer_time
     mean[x.LEAK_Y] = p.leak
     mean[x.COMPLIANCE] = p.compliance_mean
     return Nominal(mean, std, time)

@@ -184,6 +184,9 @@ class MixtureMemory:
     factor: Annotated[FloatArray, 2]  # [1] adapted over nominal R: wheels, axles
     last_side: Annotated[FloatArray, 2]  # [1] axles' lateral force over load in the previous block
     usual_rolling: Annotated[FloatArray, 4]  # [m/s] smoothed forward speed according to each wheel
+    # [1] slips of the wheels, along and across, that belong to the tyres' force (`relaxation.py`)
+    built_along: Annotated[FloatArray, 4]
+    built_across: Annotated[FloatArray, 4]
     usual_force: Annotated[FloatArray, 6]  # [1] smoothed force over load of wheels and axles
     # [1] smoothed slip of wheels (longitudinal) and axles (lateral), as force over load of a linear
     # tyre

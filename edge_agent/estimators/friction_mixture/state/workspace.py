@@ -49,6 +49,9 @@ class BlockFeatures:
     loads: Annotated[FloatArray, 4]  # [N]
     spin: Annotated[FloatArray, 4]  # [rad/s^2] acceleration of a wheel's rotation
     rolling: Annotated[FloatArray, 4]  # [m/s] mean of R*omega; NaN without a reading
+    # [1] slips that belong to the tyres' force, minus slips of the wheels (`relaxation.py`)
+    late_along: Annotated[FloatArray, 4]
+    late_across: Annotated[FloatArray, 4]
     force: Annotated[FloatArray, 4]  # [1] F_x/F_z
     force_unit: Annotated[FloatArray, 4]  # [s^2/m] its derivative by a_x; 0 if torque is known
     load_share: Annotated[FloatArray, 4]  # [1] wheel load over axle load
