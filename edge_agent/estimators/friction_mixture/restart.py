@@ -137,6 +137,8 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
         memory.factor[group] = 1.0
     put_split_to_sleep(memory)
     clear_vector(memory.patch)
+    clear_vector(memory.built_along)
+    clear_vector(memory.built_across)
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
     return flags.RESET

@@ -14,15 +14,15 @@ from edge_agent.estimators.friction_mixture.restart import reset_to_wheel_speed
 from edge_agent.estimators.friction_mixture.state.constants import NodeState
 from edge_agent.estimators.friction_mixture.state.design import design_of
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
-from schemas.runtime.records import records
+from schemas.runtime.records import RecordArray, records
 
 DESIGN = design_of(Memberships(), adaptive=True)
 SPEED = 10.0  # [m/s]
 
 
-def reset_after(vx: float, vy: float, vy_std: float) -> int:
-    """Return the health flags of a test for a reset. The wheels roll at SPEED and the rear axle
-    follows. The filter estimates the velocity (vx, vy) [m/s], with standard deviation `vy_std`.
+def filter_at(vx: float, vy: float, vy_std: float) -> RecordArray:
+    """Return the record of a filter that estimates the velocity (vx, vy) [m/s], with standard
+    deviation `vy_std`. The wheels roll at SPEED and the rear axle follows.
     """
     memory = records(MixtureMemory, 1)
     memory["nominal"]["std"] = 1.0
@@ -31,11 +31,16 @@ def reset_after(vx: float, vy: float, vy_std: float) -> int:
     memory["overall_mean"][0, NodeState.VX] = vx
     memory["overall_mean"][0, NodeState.VY] = vy
     memory["overall_covariance"][0, NodeState.VY, NodeState.VY] = vy_std**2
+    return memory
+
+
+def reset(memory: RecordArray) -> int:
+    """Return the health flags of a test for a reset, which changes `memory`."""
     return reset_to_wheel_speed(cast(MixtureMemory, memory[0]), DESIGN)
 
 
 @pytest.mark.parametrize(
-    ("vx", "vy", "vy_std", "reset"),
+    ("vx", "vy", "vy_std", "expected"),
     [
         (SPEED, 0.0, 0.4, False),  # estimate and wheels agree
         (SPEED, -2.5, 0.4, True),  # the lateral velocity has drifted away, and the filter knows it
@@ -44,6 +49,14 @@ def reset_after(vx: float, vy: float, vy_std: float) -> int:
     ],
 )
 def test_motion_is_reset_where_the_filter_is_unsure(
-    vx: float, vy: float, vy_std: float, reset: bool
+    vx: float, vy: float, vy_std: float, expected: bool
 ) -> None:
-    assert reset_after(vx, vy, vy_std) == (flags.RESET if reset else 0)
+    assert reset(filter_at(vx, vy, vy_std)) == (flags.RESET if expected else 0)
+
+
+def test_reset_forgets_the_slips_that_a_wrong_velocity_gave() -> None:
+    memory = filter_at(SPEED + 3.0, 0.0, 0.1)
+    memory["built_along"], memory["built_across"] = -0.3, 0.2
+    reset(memory)
+    assert not memory["built_along"].any()
+    assert not memory["built_across"].any()
