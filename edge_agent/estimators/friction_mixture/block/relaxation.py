@@ -35,8 +35,8 @@ def relax_slips(
     along and across, and advance the slips s' in `memory` to the end of the block. The differences
     are written to `features`.
 
-    The slips are computed with `velocity`, the mean velocity (v_x, v_y) [m/s] of the mixture at the
-    block's end. The friction hypotheses have almost the same velocity, so they share the
+    The slips are computed with `velocity`, the velocity (v_x, v_y) [m/s] of the whole mixture, mean
+    over the block. The friction hypotheses have almost the same velocity, so they share the
     differences.
     """
     vx, vy = velocity
@@ -54,7 +54,7 @@ def relax_slips(
             ((rolling - along) / speed, memory.built_along, features.late_along),
             (-across / speed, memory.built_across, features.late_across),
         ):
-            if math.isnan(slip):  # an unknown slip counts as built up
+            if math.isnan(slip):  # an unknown slip is not delayed
                 built[wheel] = late[wheel] = 0.0
                 continue
             before = built[wheel] - slip
