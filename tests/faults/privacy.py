@@ -166,7 +166,8 @@ class Town:
         return the alerts that they raise.
         """
         self._sent += 1
-        seen = float(np.clip(mu + self._random.normal(0.0, 0.02), 0.05, 1.0))
+        # The interval of a report begins .1 below its value, and must not be negative.
+        seen = float(np.clip(mu + self._random.normal(0.0, 0.02), 0.11, 1.0))
         alerts = self.engine.intake.ingest(
             _visit(name, self._sent, when, trip, at, seen), when + SECOND // 2
         )
