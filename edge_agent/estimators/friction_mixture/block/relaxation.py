@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.slip import SLOWEST_M_S
+from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_slips
 from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.state.workspace import BlockFeatures
@@ -46,13 +46,14 @@ def relax_slips(
         sin = features.steer_sin[wheel]
         along = cos * vx + sin * vy + features.turn_along[wheel]
         across = cos * vy - sin * vx + features.turn_across[wheel]
+        slip_x, slip_y = wheel_slips(1.0, rolling, along, across)
         speed = max(abs(along), SLOWEST_M_S)
         fastest = speed if math.isnan(rolling) else max(speed, abs(rolling))
         rolled = fastest * features.duration / constants.physical.relaxation_length
         delayed = (1.0 - constants.physical.direct_slip) / rolled
         for slip, built, late in (
-            ((rolling - along) / speed, memory.built_along, features.late_along),
-            (-across / speed, memory.built_across, features.late_across),
+            (slip_x, memory.built_along, features.late_along),
+            (slip_y, memory.built_across, features.late_across),
         ):
             if math.isnan(slip):  # an unknown slip is not delayed
                 built[wheel] = late[wheel] = 0.0
