@@ -57,6 +57,10 @@ _ENROLLED_AGREEMENT: Final = 1.0 - c.CONTAMINATION_LEAST
 _AGREEMENT: Final = 1.0 - c.CONTAMINATION
 # Relative; no vehicle measures μ more exactly than the rounding to bins allows, 1 % on dry road.
 _LEAST_VARIANCE: Final = c.BIAS_ABSOLUTE**2
+# Places of a vehicle's record among which another vehicle may have its place. Twice the number that
+# makes a vehicle known, so the first meetings of a vehicle displace each other only if more than
+# this many fall into one group.
+_GROUP: Final = 2 * int(c.ESTABLISHED_PEERS)
 
 
 @refcount_free
@@ -208,9 +212,9 @@ def _pair_rank(vehicle: int, other: int) -> int:
     It depends only on the permanent numbers of the two vehicles, so the order in which the vehicles
     report has no influence.
 
-    A vehicle's record has only PEERS places for other vehicles. If two other vehicles need the same
-    place, the one with the lower number gets it. Without this rule, the vehicles that report most
-    often would displace the rarely met ones.
+    A vehicle's record has only PEERS places for other vehicles, in groups of _GROUP places. If more
+    vehicles need a place in a group, those with the lowest numbers get one. Without this rule, the
+    vehicles that report most often would displace the rarely met ones.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(
         0xBF58476D1CE4E5B9
@@ -224,7 +228,14 @@ def _record_meeting(
     peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float
 ) -> None:
     this = peers[vehicle]
-    place = rank % c.PEERS
+    first = rank % c.PEERS // _GROUP * _GROUP
+    place = first
+    for k in range(first, first + _GROUP):
+        if this.other[k] == other:
+            place = k
+            break
+        if this.other[place] != NONE and (this.other[k] == NONE or this.rank[k] > this.rank[place]):
+            place = k  # empty, or the vehicle with the highest number so far
     known = this.other[place]
     if known != other:
         if known != NONE and this.rank[place] < rank:

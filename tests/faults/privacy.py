@@ -48,7 +48,6 @@ STREETS: Final = (4, 3, 3, 2, 1)  # households in each side street
 LENGTH: Final = 30  # cells of a side street
 PART: Final = 40  # visits in a batch
 MAIN: Final = 60  # cells of the main road
-SERVICES: Final = 5  # services with which the delay of an alert is measured
 NEAR_M: Final = 25.0
 EAST: Final = 0
 SOUTH: Final = 3
@@ -261,14 +260,6 @@ def _name_street(found: list[int], street: int) -> float:
     return float(street in best) / len(best)
 
 
-def _median_slippery_delay(folder: Path, public: int) -> float:
-    """Return the median of `_slippery_delay` over SERVICES services. Each gives the vehicles other
-    secret numbers, which decide which meetings of two vehicles it remembers. One service of thirty
-    remembers too few to raise an alert in this town.
-    """
-    return float(np.median([_slippery_delay(folder / str(k), public) for k in range(SERVICES)]))
-
-
 def _slippery_delay(folder: Path, public: int) -> float:
     """Return the time [s] until both the map and an alert show ice that two cars have measured.
     `public` is the number of vehicles that must visit a cell before it is shown.
@@ -311,8 +302,8 @@ def run(site: Site) -> list[Figure]:
             )
     named = float(np.mean(streets))
     control = _control(site.folder / "control")
-    public = _median_slippery_delay(site.folder / "open", 1)
-    delay = _median_slippery_delay(site.folder / "ice", PUBLIC) - public
+    public = _slippery_delay(site.folder / "open", 1)
+    delay = _slippery_delay(site.folder / "ice", PUBLIC) - public
     return [
         make_figure("faults.privacy.position_over_chance", float(np.mean(over))),
         make_figure("faults.privacy.street_over_chance", round(named - 1.0 / len(STREETS), 9)),

@@ -296,9 +296,9 @@ class PeersRecord:
 
     Attributes:
         other: index of the other vehicle in each place.
-        rank: pseudo-random number of the vehicle and the other vehicle. If two other vehicles would
-            need the same place, the one with the lower number gets it, so that frequent reporters
-            have no advantage (`trust._pair_rank`).
+        rank: pseudo-random number of the vehicle and the other vehicle. If a group of places is
+            full, the vehicles with the lowest numbers keep theirs, so that frequent reporters have
+            no advantage (`trust._pair_rank`).
         agreed, met: summed agreement, and number of comparisons, for each other vehicle.
         used_squares, used_products: sums from which `trust.shape_of` estimates by how much friction
             values are too low per unit of unused grip. Each term compares two visits of the vehicle

@@ -86,6 +86,28 @@ def test_enrolled_liars_still_lose_their_vote() -> None:
     assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
 
 
+def test_whoever_agreed_with_enough_known_vehicles_is_no_newcomer() -> None:
+    """The record of a vehicle's meetings has few places. Meetings with the first few vehicles must
+    not displace each other, or the vehicle stays a newcomer and supports no alert.
+    """
+    fusion = Fusion(120.0)
+    for minute in range(10):
+        seconds = 60.0 * minute + np.arange(len(HONEST))
+        fusion.update(observations(seconds, HONEST, value(np.full(len(HONEST), 0.8))))
+    met = int(c.ESTABLISHED_PEERS)
+    new = np.arange(1000, 1100)
+    who = np.concatenate([np.tile(HONEST[:met], (len(new), 1)), new[:, None]], axis=1).ravel()
+    cells = np.repeat(50 + np.arange(len(new)), met + 1)
+    for begin in (600.0, 900.0):  # the second time is later than the next epoch
+        fusion.update(
+            observations(
+                begin + 0.1 * np.arange(len(who)), who, value(np.full(len(who), 0.8)), cell=cells
+            )
+        )
+    assert fusion.trust(999) == pytest.approx(c.NEWCOMER)
+    assert min(fusion.trust(int(v)) for v in new) >= c.SOURCE_TRUST
+
+
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
     fusion = drive_liars()
     n = 200
