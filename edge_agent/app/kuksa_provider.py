@@ -66,6 +66,7 @@ class KuksaProvider:
         self.refused = 0
         self._connection = BrokerConnection(text, f"{host}:{port or PORT}", files)
         self._unknown_paths: set[str] = set()
+        self._rejecting_paths: set[str] = set()  # paths of which the broker rejected a value
         self._problem = ""
         self._latest: tuple[Mapping[str, float], int] | None = None
         self._changed = threading.Condition()
@@ -121,8 +122,9 @@ class KuksaProvider:
                 return
 
     def _write_one(self, publish: Any, path: str, value: Any, time_ns: int) -> bool:  # noqa: ANN401
-        """Write one value to the databroker at the VSS path `path`. Return False only if the broker
-        is unavailable.
+        """Write one value to the databroker at the VSS path `path`. If the broker rejects the
+        value, write that it is unknown, so that the broker does not keep the previous value. Return
+        False only if the broker is unavailable.
         """
         messages = self._connection.messages
         point = messages.Datapoint(value=value)
@@ -135,13 +137,19 @@ class KuksaProvider:
             publish(request, timeout=WRITE_S, metadata=self._connection.metadata)
         except grpc.RpcError as error:
             code = error.code()
-            if code in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT):
+            is_rejected = code == grpc.StatusCode.INVALID_ARGUMENT
+            if code == grpc.StatusCode.NOT_FOUND:
                 self._unknown_paths.add(path)
-                log.warning("the databroker rejects %s: %s", path, error.details())
-            else:
+                log.warning("the databroker does not know %s: %s", path, error.details())
+            elif not is_rejected:
                 self._log_problem(f"{code.name}: {error.details()}")
+            elif path not in self._rejecting_paths:
+                self._rejecting_paths.add(path)
+                log.warning("the databroker rejects a value of %s: %s", path, error.details())
             # Count after writing the log line, so that the line exists when the count is visible.
             self.refused += 1
+            if is_rejected and value is not None:
+                return self._write_one(publish, path, None, time_ns)
             return code not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
         self._log_problem("")
         self.written += 1

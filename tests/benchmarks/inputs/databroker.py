@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self
 
@@ -23,10 +23,12 @@ LONGEST_BUFFER = 1000
 
 class Databroker:
     """gRPC server of signals at the address host:port. It knows the given signal paths, which have
-    no values at the start.
+    no values at the start. Values that are one of the words `rejected` get an error, as words do
+    that a signal does not allow.
     """
 
-    def __init__(self, address: str, paths: Sequence[str]) -> None:
+    def __init__(self, address: str, paths: Sequence[str], rejected: Collection[str] = ()) -> None:
+        self._rejected = rejected
         self._grpc = import_optional("grpc")
         self._values = {path: messages.Datapoint() for path in paths}
         self._changed = threading.Condition()
@@ -103,6 +105,8 @@ class Databroker:
         path = request.signal_id.path
         if path not in self._values:
             context.abort(self._grpc.StatusCode.NOT_FOUND, path)
+        if request.data_point.value.string in self._rejected:
+            context.abort(self._grpc.StatusCode.INVALID_ARGUMENT, "not an allowed word")
         self._tell({path: request.data_point})
         return messages.PublishValueResponse()
 

@@ -51,7 +51,22 @@ def test_signal_that_the_broker_does_not_know_is_logged_once(
             until(lambda k=k: provider.written == 3 * (k + 1))  # type: ignore[misc]
         provider.close()
         assert provider.refused == 1
-    assert caplog.text.count(f"rejects {CONDITION}") == 1
+    assert caplog.text.count(f"does not know {CONDITION}") == 1
+
+
+def test_rejected_value_does_not_leave_the_previous_one_at_the_broker(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    dry = road_friction(0.9, 0.85, 1.0, 0.0)
+    with Databroker("127.0.0.1:0", [*FRICTION, CONDITION], rejected={"ICE"}) as broker:
+        provider = KuksaProvider(f"127.0.0.1:{broker.port}")
+        for k, (signals, word) in enumerate([(dry, "DRY"), (ICE, ""), (ICE, ""), (dry, "DRY")]):
+            provider.write(signals, TIME + k)
+            until(lambda k=k: provider.written == 4 * (k + 1))  # type: ignore[misc]
+            assert broker.value(CONDITION).value.string == word
+        provider.close()
+        assert provider.refused == 2
+    assert caplog.text.count(f"rejects a value of {CONDITION}") == 1
 
 
 def test_broker_that_comes_later_gets_the_latest_values(
