@@ -7,7 +7,8 @@ cost instead:
 - The next tile belongs to the query that would have ended first on an idle service
   (`_QueuedQuery.rank`). So a small query overtakes a large earlier one, but a stream of small
   queries cannot starve a large one.
-- If too many queries wait, the most expensive one gets an error that asks the client to retry.
+- If too many queries wait, the one that would have ended last gets an error that asks the client to
+  retry.
 - Cheap answers together may cost at most LIGHT_PER_S per second. Further cheap queries are queued
   as expensive ones, smallest first.
 - After each tile of an expensive answer, the thread rests as long as the tile took.
@@ -158,26 +159,16 @@ class MapQueryable:
     def __call__(self, request: zenoh.Query) -> None:
         """Handle one map query: answer it at once, queue it, or refuse it."""
         self._counts.queries += 1
-        try:
+        with self._reply_to(request) as answered:
             # `zenoh.Parameters` is iterable, but its type stub does not declare this.
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
             # Names that begin with "_" are Zenoh's own parameters.
             map_query = query.parse(
                 {name: value for name, value in pairs if not name.startswith("_")}
             )
-            if map_query.at is None:
-                size = self._answering.size(map_query, *_key_filter(request))
-                cost = size.cells * COST[map_query.format]
-                if cost > MOST:
-                    fix = (
-                        "use a smaller bbox, or format=arrow"
-                        if COST[map_query.format] > 1
-                        else "use a smaller bbox"
-                    )
-                    raise InputError("bbox", "the answer would be too large", fix)
-                cost += size.tiles * TILE_COST
-        except InputError as error:
-            self._refuse(request, error)
+            cost = self._estimate_cost(request, map_query) if map_query.at is None else 0.0
+            answered.is_complete = False
+        if answered.is_complete:  # refused
             return
         if map_query.at is not None:
             self._ask_past(request, map_query)
@@ -185,6 +176,23 @@ class MapQueryable:
             self._reply(request, map_query)
         else:
             self._queue(request, map_query, cost)
+
+    def _estimate_cost(self, request: zenoh.Query, map_query: MapQuery) -> float:
+        """Return the estimated cost of the answer to a query about the present map.
+
+        Raises:
+            InputError: the answer would be too large.
+        """
+        size = self._answering.size(map_query, *_key_filter(request))
+        cost = size.cells * COST[map_query.format]
+        if cost > MOST:
+            fix = (
+                "use a smaller bbox, or format=arrow"
+                if COST[map_query.format] > 1
+                else "use a smaller bbox"
+            )
+            raise InputError("bbox", "the answer would be too large", fix)
+        return cost + size.tiles * TILE_COST
 
     def _ask_past(self, request: zenoh.Query, map_query: MapQuery) -> None:
         if self._past_waiting.acquire(blocking=False):
@@ -200,7 +208,10 @@ class MapQueryable:
         """
         try:
             if self._past.acquire(timeout=PAST_WAIT_S):
-                self._answer_past(request, map_query)
+                try:
+                    self._reply(request, map_query)
+                finally:
+                    self._past.release()
             else:
                 self._refuse(request, _past_is_busy())
         finally:
@@ -259,12 +270,6 @@ class MapQueryable:
                 break
         return not answered.is_complete
 
-    def _answer_past(self, request: zenoh.Query, map_query: MapQuery) -> None:
-        try:
-            self._reply(request, map_query)
-        finally:
-            self._past.release()
-
     def _reply(self, request: zenoh.Query, map_query: MapQuery) -> None:
         with self._reply_to(request):
             for tile, payload in self._answering.answer(map_query, *_key_filter(request)):
@@ -300,7 +305,7 @@ class MapQueryable:
         # Other field names are free text of the client, which must not become names of counters.
         field = error.field if error.field in MapQuery.model_fields else "query"
         self._counts.bad_queries[field] += 1
-        with request:
+        with suppress(zenoh.ZError), request:  # the session may have been closed
             request.reply_err(str(error), encoding=TEXT)
 
 
