@@ -9,6 +9,7 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.signals import S, per_wheel
+from schemas.vehicle import Vehicle
 
 GROUND: Final = "gnss_speed"  # column in addition to the channels; only the signal doctor reads it
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
@@ -30,6 +31,22 @@ def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
     for wheel in (2, 3):
         if missing[wheel]:
             signals[:, S.DELTA + wheel] = 0.0
+
+
+def split_front_angle(signals: FloatArray, vehicle: Vehicle) -> None:
+    """Replace the front wheels' steering angles in `signals` (T, 18) by those of two wheels, if
+    both columns contain the same measured angle, the mean of the two wheels.
+
+    The axes of the wheels meet at one point on the line of the rear axle (Ackermann geometry), so
+    the inner wheel turns more than the outer one. In a turn of 6 m radius the two angles differ by
+    0.1 rad, more than the slip angle of the tyres.
+    """
+    per_metre = np.tan(signals[:, S.DELTA]) / (vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle)
+    nearer = 0.5 * vehicle.track_front * per_metre
+    for wheel, side in ((0, 1.0), (1, -1.0)):
+        signals[:, S.DELTA + wheel] = np.arctan2(
+            np.tan(signals[:, S.DELTA + wheel]), 1.0 - side * nearer
+        )
 
 
 def remove_null_positions(signals: FloatArray) -> None:

@@ -106,12 +106,6 @@ def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
         plain = split_words(signal if field in ("", "data") else field)
         if (channel := _channel_of(plain, signal)) and channel not in channels:
             channels[channel] = _make_channel(channel, signal, unit, plain)
-    if (
-        "delta_fl" in channels
-        and "delta_fr" not in channels
-        and channels["delta_fl"].at == "steering wheel"
-    ):
-        channels["delta_fr"] = channels["delta_fl"]
     about = (
         "Drafted from names: check every signal, unit and sign by hand, then with `edge-agent "
         "check`."

@@ -56,6 +56,8 @@ class SignalLog:
     ground: FloatArray | None = None
     # context signals (T, len(CONTEXT)), if the log has a column of them
     context: FloatArray | None = None
+    # True if both front columns contain the one angle that was measured, the mean of both wheels
+    has_one_front_angle: bool = False
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
         """Yield the samples of the signal log in order, in blocks of at most `rows` samples.
@@ -94,7 +96,8 @@ def read_log(path: Path) -> SignalLog:
     )
     remove_null_positions(signals)
     ground = _float_column(table, GROUND) if GROUND in table.column_names else None
-    return SignalLog(t, signals, start_ns, ground, _read_context(table))
+    fronts = [name for name in FRONT_STEERING if name in table.column_names]
+    return SignalLog(t, signals, start_ns, ground, _read_context(table), len(fronts) == 1)
 
 
 def require_log(path: Path) -> None:

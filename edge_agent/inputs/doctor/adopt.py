@@ -25,11 +25,12 @@ from edge_agent.inputs.correct import correct_log, free_rear_wheels
 from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.doctor.fix import OF_DEVICE, apply_findings
+from edge_agent.inputs.log_columns import fill_steering, split_front_angle
 from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, S
+from schemas.signals import CHANNELS, S, per_wheel
 from schemas.vehicle import Vehicle
 
 
@@ -46,9 +47,16 @@ class Adopted(NamedTuple):
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Return `log`, corrected for use by the estimator: first by the vehicle's calibration, then by
-    the measurements of the signal doctor.
+    the measurements of the signal doctor. If only one front angle was measured, the angles of the
+    two wheels are computed from it.
     """
-    return adopt_measured(replace(log, signals=correct_log(log.t, log.signals, vehicle)), vehicle)
+    corrected = correct_log(log.t, log.signals, vehicle)
+    adopted = adopt_measured(replace(log, signals=corrected), vehicle)
+    if not log.has_one_front_angle:
+        return adopted
+    signals = adopted.log.signals.copy()
+    split_front_angle(signals, vehicle)
+    return adopted._replace(log=replace(adopted.log, signals=signals, has_one_front_angle=False))
 
 
 def adopt_measured(log: SignalLog, vehicle: Vehicle) -> Adopted:
@@ -109,6 +117,7 @@ def align_import(
     for index, name in enumerate(CHANNELS):
         if name in merged.columns:
             signals[:, index] = merged.columns[name]
+    fill_steering(signals, [name not in merged.columns for name in per_wheel("delta")])
     found = [
         fault for fault in diagnose(merged.t, signals, vehicle).findings if fault.kind == "clock"
     ]

@@ -24,7 +24,12 @@ from edge_agent.inputs.block import Block
 from edge_agent.inputs.channel_readings import make_channel, select_signals
 from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
-from edge_agent.inputs.log_columns import GROUND, fill_steering, remove_null_positions
+from edge_agent.inputs.log_columns import (
+    GROUND,
+    fill_steering,
+    remove_null_positions,
+    split_front_angle,
+)
 from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, sample_at_rows
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
@@ -75,7 +80,7 @@ class LiveRows:
         self._profile = profile
         self._clock = clock
         self._wait = wait
-        self._radius = vehicle.wheel_radius
+        self._vehicle = vehicle
         self._ratio = vehicle.steering_ratio or profile.steering_ratio
         if self._ratio is None and any(
             channel.at == "steering wheel" for channel in profile.channels.values()
@@ -157,7 +162,7 @@ class LiveRows:
                     name,
                     channel,
                     replace(recordings[place], rows=sparse),
-                    self._radius,
+                    self._vehicle.wheel_radius,
                     self._ratio,
                 )
             except InputError:  # the signal that gives the sign has not arrived yet
@@ -231,11 +236,14 @@ class LiveRows:
                 signals[rows, CHANNELS.index(name)] = values
 
     def _fill_steering(self, signals: FloatArray) -> None:
-        """Fill missing steering angles in the same way as the importer of recorded logs. A front
-        wheel without a channel in the profile gets the angle of the other front wheel, and rear
-        wheels get zero.
+        """Fill missing steering angles in the same way as the reader of recorded logs. If the
+        profile has only one front angle, the angles of the two front wheels are computed from it.
+        Rear wheels get zero.
         """
-        fill_steering(signals, [name not in self._profile.channels for name in STEERING])
+        missing = [name not in self._profile.channels for name in STEERING]
+        fill_steering(signals, missing)
+        if missing[0] != missing[1]:
+            split_front_angle(signals, self._vehicle)
 
     def _start_ns(self) -> int:
         """Return the date [ns UTC] at which the host's clock started. The first position fix

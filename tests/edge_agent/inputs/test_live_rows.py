@@ -64,7 +64,7 @@ def clock() -> Steered:
 
 def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None = None) -> LiveRows:
     profile = Profile(
-        name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl")}
+        name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl", "delta_fl")}
     )
     return LiveRows(feeds, profile, CAR, clock, wait=wait or clock.move)
 
@@ -108,7 +108,7 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
         until_then = clock.now() + seconds
         while due and due[0] <= until_then:
             clock.move(due[0] - clock.now())
-            feed.tell(due[0], ax=5.0 * due[0], omega_fl=7.0)
+            feed.tell(due[0], ax=5.0 * due[0], omega_fl=7.0, delta_fl=0.4)
             due[:] = [tick for tick in [next(ticks, None)] if tick is not None]
         clock.move(until_then - clock.now())
 
@@ -123,6 +123,9 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     assert np.isnan(signals[~told, S.AX]).all()
     assert (~told).sum() > 100
     assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
+    left, right = signals[told, S.DELTA : S.DELTA + 2].T
+    assert np.all(left > right + 0.08), "the inner wheel turns more"
+    assert np.allclose(0.5 * (left + right), 0.4, atol=0.01)
     assert np.allclose(np.diff(t), 0.01)
     assert (got[0].time[0] - clock.start_ns) / NS == pytest.approx(t[0], abs=1e-8)
     assert rows.health_problems() == ["bus has sent nothing for 2 s"]
