@@ -338,11 +338,11 @@ def explain(error: ValidationError, where: str, model: type[BaseModel]) -> Input
     secret = "store" in first["loc"]
     given = "…" if secret else json.dumps(first["input"], default=str)
     shown = given if len(given) <= 60 else given[:57] + "..."
-    problem = (
-        "is missing"
-        if first["type"] == "missing"
-        else f"{first['msg'][0].lower()}{first['msg'][1:]} (got {shown})"
-    )
+    problem = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+    if first["type"] == "missing":
+        problem = "is missing"
+    elif first["type"] != "json_invalid":  # there the input is the whole file
+        problem += f" (got {shown})"
     return InputError(field, problem, f"correct it in the {where}")
 
 

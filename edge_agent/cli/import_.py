@@ -5,6 +5,7 @@ signals to channels). Without a profile, write a draft profile for the user to c
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
@@ -87,9 +88,9 @@ def run(args: argparse.Namespace) -> int:
     with bounded_memory(args.source[0]):  # a clock that jumps by years gives too many rows
         merged, profile = _merge(recordings, profile, vehicle, shifts)
     write_log(out, merged, profile, [source.name for source in args.source])
-    for note in merged.notes:
-        print(f"note: {note}")
     lacking = _lacking_channels(merged.columns)
+    for note in [*merged.notes, *_missing_signals(lacking, profile, recordings)]:
+        print(f"note: {note}")
     if lacking:
         print(
             f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
@@ -187,6 +188,23 @@ def _lacking_channels(columns: Collection[str]) -> list[str]:
     lacking = [name for name in NEEDED if name not in columns]
     is_steered = any(name in columns for name in FRONT_STEERING)
     return lacking if is_steered else [*lacking, FRONT_STEERING[0]]
+
+
+def _missing_signals(
+    channels: Iterable[str], profile: Profile, recordings: Sequence[Recording]
+) -> list[str]:
+    """Return a note for each of the `channels` whose signals the profile names although no
+    recording has them. For a misspelt signal it proposes the most similar one.
+    """
+    recorded = sorted({name for recording in recordings for name in recording.signals})
+    notes = []
+    for name in channels:
+        wanted = profile.channels[name].needed_signals() if name in profile.channels else []
+        for signal in [signal for signal in wanted if signal not in recorded]:
+            similar = difflib.get_close_matches(signal, recorded, 1)
+            guess = f"; did you mean {similar[0]}?" if similar else ""
+            notes.append(f"{name}: no recording has the signal {signal}{guess}")
+    return notes
 
 
 def _parse_shifts(texts: list[str]) -> dict[str, float]:

@@ -145,6 +145,13 @@ def test_a_wrong_vehicle_field_is_named(
         load_vehicle(path)
 
 
+def test_a_file_that_is_no_json_is_an_error_without_its_content(tmp_path: Path) -> None:
+    path = tmp_path / "vehicle.json"
+    path.write_text('{"mass": 1500.0,}')
+    with pytest.raises(InputError, match="^content: invalid JSON: [^{]*; correct it in the"):
+        load_vehicle(path)
+
+
 def test_a_foreign_name_in_a_vehicle_file_is_ignored_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -4,6 +4,7 @@ the right reason.
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 
@@ -303,6 +304,20 @@ def test_import_names_each_missing_wheel(
     source = write(tmp_path / "a.csv", text)
     assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 0
     assert "note: no omega_fr, omega_rl, omega_rr: replay" in capsys.readouterr().out
+
+
+def test_import_names_a_misspelt_signal_of_the_profile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "t,AccX,AccY\n0.0,1,1\n0.1,1,1\n"
+    source = write(tmp_path / "a.csv", text)
+    profile = tmp_path / "own.json"
+    channels = {"ax": {"signal": "AccXX"}, "ay": {"signal": "AccY"}}
+    profile.write_text(json.dumps({"version": 1, "name": "own", "channels": channels}))
+    main(["import", str(source), "--profile", str(profile), "--out", str(tmp_path / "o.parquet")])
+    told = capsys.readouterr().out
+    assert "note: ax: no recording has the signal AccXX; did you mean AccX?" in told
+    assert "note: ay" not in told
 
 
 def test_a_clock_that_jumps_by_years_is_refused(
