@@ -124,10 +124,10 @@ def test_real_minute_with_steering_in_degrees_is_named(
     files = [str(BLF), str(NMEA), "--profile", "toyota", "--vehicle", str(VEHICLE)]
     assert edge_agent_main(["import", *files, "--out", str(log)]) == 0
     table = pq.read_table(log)
-    for name in ("delta_fl", "delta_fr"):
-        at = table.schema.get_field_index(name)
-        degrees = pc.multiply(table[name], 180.0 / np.pi).cast(table.schema.field(name).type)
-        table = table.set_column(at, table.schema.field(name), degrees)
+    at = table.schema.get_field_index("delta_fl")
+    field = table.schema.field(at)
+    degrees = pc.multiply(table[field.name], 180.0 / np.pi).cast(field.type)
+    table = table.set_column(at, field, degrees)
     pq.write_table(table, log)
     capsys.readouterr()
     assert edge_agent_main(["check", str(log), "--vehicle", str(VEHICLE)]) == 1
