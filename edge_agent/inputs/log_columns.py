@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Final
 
 import numpy as np
@@ -17,20 +17,23 @@ FRONT_STEERING: Final = per_wheel("delta")[:2]
 REAR_STEERING: Final = per_wheel("delta")[2:]
 
 
-def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
-    """Write steering angles into `signals` for the wheels that have no column in the log. `missing`
-    (4,) is True for these wheels.
+def fill_steering(signals: FloatArray, columns: Collection[str]) -> bool:
+    """Write steering angles into `signals` (T, 18) for the wheels that are not among the names
+    `columns` of the recorded channels.
 
     A front wheel gets the angle of the other front wheel, a rear wheel gets zero. A wheel whose
-    column exists but has no readings is not changed.
+    column exists but has no readings is not changed. Return True if only one front angle was
+    recorded.
     """
-    if missing[0]:
+    left, right, *rear = (name not in columns for name in (*FRONT_STEERING, *REAR_STEERING))
+    if left:
         signals[:, S.DELTA] = signals[:, S.DELTA + 1]
-    if missing[1]:
+    if right:
         signals[:, S.DELTA + 1] = signals[:, S.DELTA]
-    for wheel in (2, 3):
-        if missing[wheel]:
+    for wheel, is_missing in enumerate(rear, 2):
+        if is_missing:
             signals[:, S.DELTA + wheel] = 0.0
+    return left != right
 
 
 def split_front_angle(signals: FloatArray, vehicle: Vehicle) -> None:
@@ -41,12 +44,11 @@ def split_front_angle(signals: FloatArray, vehicle: Vehicle) -> None:
     the inner wheel turns more than the outer one. In a turn of 6 m radius the two angles differ by
     0.1 rad, more than the slip angle of the tyres.
     """
-    per_metre = np.tan(signals[:, S.DELTA]) / (vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle)
-    nearer = 0.5 * vehicle.track_front * per_metre
-    for wheel, side in ((0, 1.0), (1, -1.0)):
-        signals[:, S.DELTA + wheel] = np.arctan2(
-            np.tan(signals[:, S.DELTA + wheel]), 1.0 - side * nearer
-        )
+    slope = np.tan(signals[:, S.DELTA])
+    curvature = slope / (vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle)
+    shift = 0.5 * vehicle.track_front * curvature
+    signals[:, S.DELTA] = np.arctan2(slope, 1.0 - shift)
+    signals[:, S.DELTA + 1] = np.arctan2(slope, 1.0 + shift)
 
 
 def remove_null_positions(signals: FloatArray) -> None:

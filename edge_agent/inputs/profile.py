@@ -17,10 +17,11 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from edge_agent.inputs.log_columns import FRONT_STEERING
 from edge_agent.inputs.units import QUANTITY
 from schemas.config import explain
 from schemas.errors import InputError
-from schemas.signals import CONTEXT, FLAGS, per_wheel
+from schemas.signals import CONTEXT, FLAGS
 
 FOLDER: Final = Path(__file__).parent / "profiles"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -153,10 +154,10 @@ class Profile(Part):
                 raise ValueError(f"{name} has active values; only {', '.join(FLAGS)} have")
             if channel.lasting and name not in CONTEXT:
                 raise ValueError(f"{name} cannot be `lasting`; only {', '.join(CONTEXT)} may be")
-        left, right = (self.channels.get(name) for name in per_wheel("delta")[:2])
-        if left is not None and left == right:
+        left, right = FRONT_STEERING
+        if left in self.channels and self.channels[left] == self.channels.get(right):
             # One measured angle is not the angle of both wheels; see `split_front_angle`.
-            del self.channels["delta_fr"]
+            del self.channels[right]
         return self
 
     def needed_signals(self) -> set[str]:

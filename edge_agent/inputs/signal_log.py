@@ -27,7 +27,6 @@ from edge_agent.inputs.log_columns import (
     FRONT_STEERING,
     GROUND,
     NEEDED,
-    REAR_STEERING,
     fill_steering,
     remove_null_positions,
 )
@@ -91,13 +90,10 @@ def read_log(path: Path) -> SignalLog:
             signals[:, index] = _float_column(table, name)
     signals[np.isinf(signals)] = np.nan
     _check_log(table, signals)
-    fill_steering(
-        signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
-    )
+    has_one_front_angle = fill_steering(signals, table.column_names)
     remove_null_positions(signals)
     ground = _float_column(table, GROUND) if GROUND in table.column_names else None
-    fronts = [name for name in FRONT_STEERING if name in table.column_names]
-    return SignalLog(t, signals, start_ns, ground, _read_context(table), len(fronts) == 1)
+    return SignalLog(t, signals, start_ns, ground, _read_context(table), has_one_front_angle)
 
 
 def require_log(path: Path) -> None:

@@ -377,8 +377,9 @@ def _find_differences(
     )
     if (there < 0).any():
         return [f"{int((there < 0).sum())} cells are not in the checkpoint's map"]
-    apart = np.abs(begun.fusion.beliefs(there, now) - whole.fusion.beliefs(slots, now)).max(axis=1)
+    restored = begun.fusion.beliefs(there, now)
+    difference = np.abs(restored - whole.fusion.beliefs(slots, now)).max(axis=1)
     # The cell was at rest and dropped, and has been visited again since.
-    anew = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
-    wrong = apart > np.where(anew, NEARLY, accepted)
-    return [f"the maps differ by {apart[wrong].max():.2g}"] if wrong.any() else []
+    is_revisited = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
+    excessive = difference[difference > np.where(is_revisited, NEARLY, accepted)]
+    return [f"the maps differ by {excessive.max():.2g}"] if len(excessive) else []

@@ -302,8 +302,7 @@ def run(site: Site) -> list[Figure]:
             )
     named = float(np.mean(streets))
     control = _control(site.folder / "control")
-    public = _slippery_delay(site.folder / "open", 1)
-    delay = _slippery_delay(site.folder / "ice", PUBLIC) - public
+    delay = _slippery_delay(site.folder / "ice", PUBLIC) - _slippery_delay(site.folder / "open", 1)
     return [
         make_figure("faults.privacy.position_over_chance", float(np.mean(over))),
         make_figure("faults.privacy.street_over_chance", round(named - 1.0 / len(STREETS), 9)),

@@ -30,7 +30,7 @@ from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, S, per_wheel
+from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
 
 
@@ -117,7 +117,7 @@ def align_import(
     for index, name in enumerate(CHANNELS):
         if name in merged.columns:
             signals[:, index] = merged.columns[name]
-    fill_steering(signals, [name not in merged.columns for name in per_wheel("delta")])
+    fill_steering(signals, merged.columns)
     found = [
         fault for fault in diagnose(merged.t, signals, vehicle).findings if fault.kind == "clock"
     ]

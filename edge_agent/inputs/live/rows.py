@@ -35,7 +35,7 @@ from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, CONTEXT, per_wheel
+from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import EARTH_RADIUS_M, NS
 from schemas.vehicle import Vehicle
 
@@ -50,8 +50,6 @@ KEPT_S: Final = 3.0
 # gap.
 MOST_BEHIND_S: Final = 5.0
 OLDEST_FIX_S: Final = 2.0  # [s] older positions are not moved into a row
-STEERING: Final = per_wheel("delta")
-UNSTEERED: Final = STEERING[2:]
 
 
 class LiveRows:
@@ -240,9 +238,7 @@ class LiveRows:
         profile has only one front angle, the angles of the two front wheels are computed from it.
         Rear wheels get zero.
         """
-        missing = [name not in self._profile.channels for name in STEERING]
-        fill_steering(signals, missing)
-        if missing[0] != missing[1]:
+        if fill_steering(signals, self._profile.channels):
             split_front_angle(signals, self._vehicle)
 
     def _start_ns(self) -> int:

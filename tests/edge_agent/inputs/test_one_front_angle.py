@@ -13,15 +13,16 @@ import pytest
 
 from edge_agent.app.library import estimate
 from edge_agent.inputs.doctor.adopt import prepare_log
+from edge_agent.inputs.log_columns import FRONT_STEERING
 from edge_agent.inputs.names import draft_profile
 from edge_agent.inputs.profile import load_profile, shipped_profiles
 from edge_agent.inputs.signal_log import SignalLog, read_log
 from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
-from schemas.signals import S, per_wheel
+from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-LEFT, RIGHT = per_wheel("delta")[:2]
+LEFT, RIGHT = FRONT_STEERING
 
 
 def turn_at_corners(tmp_path: Path, mu: float) -> tuple[SignalLog, FloatArray, Vehicle]:

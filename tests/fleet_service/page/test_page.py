@@ -211,6 +211,7 @@ def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
         near(seen, cell_of("ice"))
         waits(seen, ICE_DRAWN)
         seen.page.locator("#map").click()
+        waits(seen, "document.querySelectorAll('[data-value=observations]').length === 2")
         # The map may first show the reports of some of the cars only.
         waits(
             seen,
