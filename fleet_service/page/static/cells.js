@@ -36,10 +36,9 @@ export class Cells {
     this.at = at;  // [s since 1970]; null means now
     this.tiles = new Map();
     this.known = new Set();
-    this.asking = new Map();  // promise of the answer, by requested tile
+    this.asking = new Map();  // level and promise of the last request, by tile
     this.changed = () => {};
     this.borrowed = false;
-    this.generation = 0;
   }
 
   async list() {
@@ -54,8 +53,9 @@ export class Cells {
     for (const tile of this.known) {
       const x = columnOf(tile) / TILES, y = rowOf(tile) / TILES;
       if (x + 1 / TILES <= box.west || x >= box.east || y + 1 / TILES <= box.north || y >= box.south) continue;
-      if (this.tiles.get(tile)?.block.level === level) continue;
-      if (this.asking.has(tile)) awaited.push(this.asking.get(tile)); else asked.push(tile);
+      const asking = this.asking.get(tile);
+      if (asking?.level === level) awaited.push(asking.answered);
+      else if (asking || this.tiles.get(tile)?.block.level !== level) asked.push(tile);
     }
     await Promise.all([this.fetch(asked, level), ...awaited]);
     if (this.tiles.size > MOST_TILES) this.forget(box);
@@ -63,20 +63,24 @@ export class Cells {
 
   // Request tiles, also those that are already loaded.
   fetch(tiles, level) {
-    const answered = this.request(tiles, level).finally(() => tiles.forEach(tile => { if (this.asking.get(tile) === answered) this.asking.delete(tile); }));
-    tiles.forEach(tile => this.asking.set(tile, answered));
-    return answered;
+    const asking = { level };
+    tiles.forEach(tile => this.asking.set(tile, asking));
+    asking.answered = this.request(tiles, asking).finally(() => tiles.forEach(tile => { if (this.asking.get(tile) === asking) this.asking.delete(tile); }));
+    return asking.answered;
   }
 
-  async request(tiles, level) {
-    const generation = this.generation;
+  // Apply the answers, except those of tiles that were requested again since.
+  async request(tiles, asking) {
+    const { level } = asking, isLast = tile => this.asking.get(tile) === asking;
     for (let k = 0; k < tiles.length; k += AT_ONCE) {
-      const words = new URLSearchParams({ tiles: tiles.slice(k, k + AT_ONCE).join(","), level });
+      const wanted = tiles.slice(k, k + AT_ONCE).filter(isLast);
+      if (!wanted.length) continue;
+      const words = new URLSearchParams({ tiles: wanted.join(","), level });
       if (this.at !== null) words.set("at", this.at);
       if (this.borrowed && this.at === null && level === CELL_LEVEL) words.set("borrowed", 1);
       const answer = await fetch(`/blocks?${words}`);
-      if (!answer.ok || generation !== this.generation) return;
-      decode(await answer.arrayBuffer()).forEach(block => this.take(block));
+      if (!answer.ok) return;
+      for (const block of decode(await answer.arrayBuffer())) if (isLast(block.tile)) this.take(block);
       this.changed();
     }
   }
@@ -120,10 +124,7 @@ export class Cells {
   }
 
   // From now on, ignore answers to earlier requests.
-  restart() {
-    this.generation++;
-    this.asking.clear();
-  }
+  restart() { this.asking.clear(); }
 
   // Return all records of a place in a tile, one per heading; [] if no vehicle was there.
   at_place(tile, local) {

@@ -34,9 +34,10 @@ export function fitTo({ map }, points) {
 /** Show all cells, including new ones, until the user moves the map. */
 export async function showAll({ map, state }) {
   // Several rounds, because the first ones may know only tiles or squares instead of cells.
-  for (let zoom = null, k = 0; k < ROUNDS && zoom !== map.view.zoom; k++) {
-    zoom = map.view.zoom;
-    const { extent } = state.cells;
+  for (let before = null, k = 0; k < ROUNDS; k++) {
+    const { extent } = state.cells, now = JSON.stringify(extent);
+    if (now === before) return;
+    before = now;
     if (extent) { map.view.fit(extent); map.view.gone = false; }
     await map.look();
     if (map.view.gone) return;

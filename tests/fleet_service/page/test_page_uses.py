@@ -54,6 +54,20 @@ _DROP: Final = """text => {
   return drop.defaultPrevented;
 }"""
 
+# Two requests for the same tiles, first of squares, then of cells; `slow` delays one answer.
+_ZOOM: Final = """async slow => {
+  const { Cells } = await import("/static/cells.js");
+  const cells = new Cells(null), world = { west: 0, north: 0, east: 1, south: 1 }, real = fetch;
+  await cells.list();
+  globalThis.fetch = async asked => {
+    const answer = await real(asked);
+    if (asked.endsWith(`level=${slow}`)) await new Promise(resolve => setTimeout(resolve, 300));
+    return answer;
+  };
+  await Promise.all([cells.show(world, 18), cells.show(world, 21)]);
+  return Array.from(cells.tiles.values(), ({ block }) => block.level);
+}"""
+
 
 @pytest.mark.campaign
 def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, drive: Drive) -> None:
@@ -307,3 +321,14 @@ def test_whole_map_twice_is_the_same_view(page: RunningPage, drive: Drive) -> No
             "if (gripmap.map.view.covered === covered) return [one, two]; } }"
         )
         assert views[0] == pytest.approx(views[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("slow", [18, grid.CELL_ZOOM])
+def test_zooming_during_a_request_loads_the_level_of_the_last_view(
+    page: RunningPage, drive: Drive, slow: int
+) -> None:
+    drive()
+    with open_map(page) as seen:
+        levels = seen.page.evaluate(_ZOOM, slow)
+        assert levels
+        assert set(levels) == {grid.CELL_ZOOM}
