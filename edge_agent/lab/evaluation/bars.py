@@ -87,14 +87,13 @@ def false_per_hour(results: Results) -> float:
     return sum(float(m["false_changes"].sum()) for m in counted) / hours if hours else math.nan
 
 
-def both_stops(results: Results) -> float:
-    """Return how often the default estimator's friction interval contains the true value
-    (coverage): the mean over two braking manoeuvres with ABS, one on dry road and one on snow.
+def mean_of_two(first: str, second: str, measure: str) -> Callable[[Results], float]:
+    """Return a function that takes the campaign's results and returns the mean of one measure over
+    the drives of two scenarios, with the default estimator.
     """
-    return 0.5 * (
-        mean_of("default.abs.dry", "coverage90")(results)
-        + mean_of("default.abs.snow", "coverage90")(results)
-    )
+    one = mean_of(first, measure)
+    two = mean_of(second, measure)
+    return lambda results: 0.5 * (one(results) + two(results))
 
 
 def on_foreign_tyres(results: Results) -> float:
@@ -114,6 +113,13 @@ def width_ratio(results: Results) -> float:
 M_S = "m/s"
 RAD_S = "rad/s"
 SHARE = "1"
+# Targets of drives on a circle and at street corners: road, measure, target. The measure slippery
+# is the share of the time for which the road is reported as slippery.
+TURNS: Final[tuple[tuple[str, str, float, Literal["less", "more"]], ...]] = (
+    ("dry", "coverage90", 0.85, "more"),
+    ("dry", "slippery", 0.002, "less"),
+    ("ice", "slippery", 0.8, "more"),
+)
 BARS: Final = (
     *(
         EstimatorBar(
@@ -160,7 +166,23 @@ BARS: Final = (
         "default.straight.coverage90", mean_of("default.straight", "coverage90"), SHARE, 0.9, "more"
     ),
     EstimatorBar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
-    EstimatorBar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
+    EstimatorBar(
+        "default.abs.coverage90",
+        mean_of_two("default.abs.dry", "default.abs.snow", "coverage90"),
+        SHARE,
+        0.80,
+        "more",
+    ),
+    *(
+        EstimatorBar(
+            f"default.turns.{road}.{measure}",
+            mean_of_two(f"default.circle.{road}", f"default.corners.{road}", measure),
+            SHARE,
+            bar,
+            better,
+        )
+        for road, measure, bar, better in TURNS
+    ),
     EstimatorBar(
         "default.spin.coverage90", mean_of("default.spin", "coverage90"), SHARE, 0.80, "more"
     ),

@@ -14,6 +14,7 @@ import numpy as np
 from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import DriveSet
 from schemas.numeric import BoolArray, FloatArray
+from schemas.thresholds import CALLED_SHARE
 
 LAST_S = 1.0  # [s] length of "the last second"
 # Difference in friction. A smaller error counts as converged; the bounds of an interval that misses
@@ -50,8 +51,8 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
 
 
 def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    """Return the measures of the estimates that every kind of drive has (errors, coverage and width
-    of the friction interval, NIS, NEES), by name, (N,) each.
+    """Return the measures that every kind of drive has, by name, (N,) each: errors, coverage and
+    width of the friction interval, share of the time reported as slippery, NIS, NEES.
     """
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
@@ -63,6 +64,7 @@ def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     found["mu_error"] = np.abs(reported.mu - batch.mu)[end].mean(axis=0)
     found["coverage90"] = is_covered(batch, reported).mean(axis=0)
     found["end_coverage90"] = is_covered(batch, reported)[end].mean(axis=0)
+    found["slippery"] = (reported.p_slippery > CALLED_SHARE).mean(axis=0)
     found["width"] = (reported.mu_upper - reported.mu_lower).mean(axis=0)
     found["nis"] = reported.innovation_nis.mean(axis=0)
     found["nees"] = nees(batch, reported).mean(axis=0)

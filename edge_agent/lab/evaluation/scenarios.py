@@ -158,6 +158,10 @@ OTHERS: Final = {
     "default.abs.dry": DriveSpec("braking", SEDAN, 0.85, about="anti-lock stop, dry"),
     "default.abs.snow": DriveSpec("braking", SEDAN, 0.30, about="anti-lock stop, snow"),
     "default.spin": DriveSpec("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),
+    "default.circle.dry": DriveSpec("constant-radius", SEDAN, 0.85, about="steady circle, dry"),
+    "default.circle.ice": DriveSpec("constant-radius", SEDAN, 0.20, about="steady circle, ice"),
+    "default.corners.dry": DriveSpec("street-corners", SEDAN, 0.85, about="street corners, dry"),
+    "default.corners.ice": DriveSpec("street-corners", SEDAN, 0.20, about="street corners, ice"),
 }
 
 # Drives of the default estimator on other vehicles; they are reported without targets.

@@ -66,7 +66,7 @@ LESS = 1.0 / 3.0
 MOVES = {
     # Group: number and independence of the measurements.
     "block_time": Move("updates", "acceleration", 0.4),
-    "correlation_time": Move("vy_std", "constant-radius", 1.4),
+    "correlation_time": Move("vy_std", "constant-radius", 1.25),
     # R adapts faster to the spinning wheels.
     "window": Move("adaptation", "acceleration", 2.0, LESS),
     # Group: road.
@@ -83,12 +83,12 @@ MOVES = {
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "abrupt_share": Move("upper", "joints", 0.95, LESS),  # more of a bump is read as slip
     "abrupt_time": Move("upper", "joints", 0.992, LESS),  # a bump is read as slip sooner
-    "steady_half": Move("width", "constant-radius", 1.05),
-    "steady_share": Move("least probabilities", "constant-radius", 0.95),
+    "steady_half": Move("width", "constant-radius", 1.02),
+    "steady_share": Move("least probabilities", "constant-radius", 0.96),
     # More nodes of low friction pay the penalty for sliding.
     "sliding_slope": Move("upper", "constant-radius", 1.08),
-    # Saturated nodes, which have low friction, gain.
-    "freedom_penalty": Move("upper", "constant-radius", 0.85),
+    # Nodes in which the wheels slide lose.
+    "freedom_penalty": Move("width", "braking without torque", 1.1),
     # Group: limits. Tighter limits keep the nodes away from states that cost a penalty.
     "farthest": Move("penalty", "braking", 0.5, LESS),
     # With a smaller limit, R adapts less to large innovations.
@@ -125,14 +125,13 @@ MOVES = {
     "offset_std": Move("std SLOPE", "braking", 1.6),
     # The slope is forgotten after a shorter distance.
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),
-    "steer_std": Move("std STEER", "constant-radius", 1.5),
+    "steer_std": Move("std STEER", "constant-radius", 1.35),
     "wheel_std": Move("std RADIUS", "standing", 2.0),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift": Move("std VX", "slalom", 1.15),
     # Group: noise. Larger assumed noise makes the normalised innovations (nis) smaller.
     "omega_noise": Move("nis", "slalom", 0.4),
-    "angle_share": Move("vy_std", "constant-radius", 1.25),
     "spin_share": Move("nis", "braking", 0.9),
     "floor_x": Move("nis", "acceleration", 0.92),
     "floor_y": Move("nis", "j-turn", 0.86),

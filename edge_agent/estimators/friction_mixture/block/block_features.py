@@ -331,11 +331,8 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     locked *= UNLIKE * locked_axle_force(row, features.loads)
     for axle in range(2):
         side = features.side[axle]
-        turning = (
-            YAW_STD * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
-        )
-        pointing = constants.physical.angle_share * features.steer_sin[2 * axle]
-        angle = row[Parameter.SLOPE_Y] * math.hypot(turning, pointing)
+        place = row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]
+        angle = row[Parameter.SLOPE_Y] * YAW_STD * place / speed
         share = constants.physical.axle_share * side
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.physical.lag * change / features.duration

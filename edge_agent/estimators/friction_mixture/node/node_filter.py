@@ -103,7 +103,7 @@ def update_nodes(
     find_covariances(covariance, node)
     plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
     before = belief_cost(mean, memory.nominal)
-    loss = take_rows(features, mean, covariance, node, design.constants.chosen.freedom_penalty)
+    loss = take_rows(features, mean, covariance, node, features.novelty / inflation)
     keep_within(mean, design.constants, memory.nominal)
     moved = belief_cost(mean, memory.nominal) - before
     price *= design.constants.chosen.freedom_penalty / inflation
@@ -319,14 +319,17 @@ def take_rows(
     mean: FloatArray,
     covariance: FloatArray,
     node: NodeWorkspace,
-    penalty: float,
+    weight: float,
 ) -> float:
     """Update the filters of a group of nodes with the innovations node.residual, one scalar
     measurement at a time. node.spread is the covariance of the innovations.
 
     Return the negative log-likelihood [nat] without constants: half of the normalised squared
-    innovations, plus half of `penalty`·ln(innovation variance) for each measurement of an
-    axle.
+    innovations, plus half of `weight`·ln(innovation variance) for each measurement of an axle.
+
+    This logarithm favours nodes that predict a force exactly: those whose tyres slide. Its weight
+    is 1 for independent blocks. Correlated errors, and unchanged forces, reduce it as they reduce
+    the other evidence. Otherwise the friction would approach the grip in use in each long turn.
     """
     squares = 0.0 * lanes_at(node.residual, 0)
     product = 1.0 + squares
@@ -346,7 +349,7 @@ def take_rows(
             put_lanes(mean, i, lanes_at(mean, i) + lanes_at(node.cross, (i, r)) * step)
         _condition_rows(node, r, per)
     _subtract_rows(covariance, node)
-    return 0.5 * (squares + penalty * log_lanes(product))
+    return 0.5 * (squares + weight * log_lanes(product))
 
 
 @inlined

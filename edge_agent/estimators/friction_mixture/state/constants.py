@@ -158,9 +158,6 @@ class PhysicalConstants(NamedTuple):
     # locks or spins up in .1 to .3 s. The forces are smoothed over the same time before they count
     # as grip in use.
     abrupt_time: float = 0.15
-    # [1] relative error of the direction of an axle's wheels. Their common gain is the state
-    # STEER_GAIN.
-    angle_share: float = 0.01
 
     # --- Noise of the forces ---
     # [1] error of the longitudinal force over load from rolling resistance
@@ -231,10 +228,8 @@ class DesignConstants(NamedTuple):
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.38
-    # [1] weight of the penalties for what a node leaves open: the slip of sliding wheels, which may
-    # have any value, and ln det S of the axles. Weight 0 favours nodes with a large S, weight 1
-    # nodes with saturated tyres. For the axles with .28 dry road was reported as ice, and with .24
-    # less of the snow was found.
+    # [1] weight of the penalty for the slip of sliding wheels, which may have any value. Weight 0
+    # favours nodes in which the wheels slide.
     freedom_penalty: float = 0.2
 
     # --- Tyre ---
