@@ -222,10 +222,10 @@ class DesignConstants(NamedTuple):
 
     # --- Weight of the evidence on friction ---
     # [1] change of force over load from its average at which the evidence counts as new by half
-    steady_half: float = 0.03
+    steady_half: float = 0.02
     # [1] share of the evidence, and of the axles' information, that is used while nothing changes.
     # Errors of tyre curve and offsets then repeat from block to block.
-    steady_share: float = 0.15
+    steady_share: float = 0.4
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.38
     # [1] weight of the penalty for the slip of sliding wheels, which may have any value. Weight 0
