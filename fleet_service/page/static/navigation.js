@@ -2,7 +2,7 @@
 import { byId } from "./elements.js";
 import { worldX, worldY } from "./grid.js";
 
-const PLACE_ZOOM = 18, ALERT_ZOOM = 17.5, ROUNDS = 4;
+const PLACE_ZOOM = 18, ALERT_ZOOM = 17.5, ROUNDS = 8;
 const DOT_PX = .1, DOT_ZOOM = 16, FAR = 1e-3;  // share of the world's width: about 40 km
 
 /** Show a point [deg], at a zoom at which streets are legible. */
