@@ -66,7 +66,7 @@ LESS = 1.0 / 3.0
 MOVES = {
     # Group: number and independence of the measurements.
     "block_time": Move("updates", "acceleration", 0.4),
-    "correlation_time": Move("vy_std", "constant-radius", 1.25),
+    "correlation_time": Move("vy_std", "constant-radius", 1.3),
     # R adapts faster to the spinning wheels.
     "window": Move("adaptation", "acceleration", 2.0, LESS),
     # Group: road.
@@ -83,8 +83,8 @@ MOVES = {
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "abrupt_share": Move("upper", "joints", 0.95, LESS),  # more of a bump is read as slip
     "abrupt_time": Move("upper", "joints", 0.992, LESS),  # a bump is read as slip sooner
-    "steady_half": Move("width", "constant-radius", 1.02),
-    "steady_share": Move("least probabilities", "constant-radius", 0.96),
+    "steady_half": Move("width", "constant-radius", 1.05),
+    "steady_share": Move("least probabilities", "constant-radius", 0.95),
     # More nodes of low friction pay the penalty for sliding.
     "sliding_slope": Move("upper", "constant-radius", 1.08),
     # Nodes in which the wheels slide lose.
@@ -125,7 +125,7 @@ MOVES = {
     "offset_std": Move("std SLOPE", "braking", 1.6),
     # The slope is forgotten after a shorter distance.
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),
-    "steer_std": Move("std STEER", "constant-radius", 1.35),
+    "steer_std": Move("std STEER", "constant-radius", 1.4),
     "wheel_std": Move("std RADIUS", "standing", 2.0),
     "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
