@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -87,13 +87,12 @@ def false_per_hour(results: Results) -> float:
     return sum(float(m["false_changes"].sum()) for m in counted) / hours if hours else math.nan
 
 
-def mean_of_two(first: str, second: str, measure: str) -> Callable[[Results], float]:
+def mean_over(scenarios: Sequence[str], measure: str) -> Callable[[Results], float]:
     """Return a function that takes the campaign's results and returns the mean of one measure over
-    the drives of two scenarios, with the default estimator.
+    the drives of several scenarios, with the default estimator.
     """
-    one = mean_of(first, measure)
-    two = mean_of(second, measure)
-    return lambda results: 0.5 * (one(results) + two(results))
+    means = [mean_of(scenario, measure) for scenario in scenarios]
+    return lambda results: sum(of_one(results) for of_one in means) / len(means)
 
 
 def on_foreign_tyres(results: Results) -> float:
@@ -113,8 +112,9 @@ def width_ratio(results: Results) -> float:
 M_S = "m/s"
 RAD_S = "rad/s"
 SHARE = "1"
-# Targets of drives on a circle and at street corners: road, measure, target. The measure slippery
-# is the share of the time for which the road is reported as slippery.
+TURN_DRIVES: Final = ("circle", "corners", "ramp")
+# Targets of drives on two circles and at street corners: road, measure, target. The measure
+# slippery is the share of the time for which the road is reported as slippery.
 TURNS: Final[tuple[tuple[str, str, float, Literal["less", "more"]], ...]] = (
     ("dry", "coverage90", 0.85, "more"),
     ("dry", "slippery", 0.002, "less"),
@@ -168,7 +168,7 @@ BARS: Final = (
     EstimatorBar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
     EstimatorBar(
         "default.abs.coverage90",
-        mean_of_two("default.abs.dry", "default.abs.snow", "coverage90"),
+        mean_over(("default.abs.dry", "default.abs.snow"), "coverage90"),
         SHARE,
         0.80,
         "more",
@@ -176,7 +176,9 @@ BARS: Final = (
     *(
         EstimatorBar(
             f"default.turns.{road}.{measure}",
-            mean_of_two(f"default.circle.{road}", f"default.corners.{road}", measure),
+            mean_over(
+                [f"default.{turn}.{road}" for turn in ("circle", "corners", "ramp")], measure
+            ),
             SHARE,
             bar,
             better,

@@ -162,6 +162,8 @@ OTHERS: Final = {
     "default.circle.ice": DriveSpec("constant-radius", SEDAN, 0.20, about="steady circle, ice"),
     "default.corners.dry": DriveSpec("street-corners", SEDAN, 0.85, about="street corners, dry"),
     "default.corners.ice": DriveSpec("street-corners", SEDAN, 0.20, about="street corners, ice"),
+    "default.ramp.dry": DriveSpec("parking-ramp", SEDAN, 0.85, about="parking garage, dry"),
+    "default.ramp.ice": DriveSpec("parking-ramp", SEDAN, 0.15, about="parking garage, ice"),
 }
 
 # Drives of the default estimator on other vehicles; they are reported without targets.

@@ -304,6 +304,13 @@ def street_corners(now: Moment) -> tuple[float, float]:
     return 0.45 * (smooth_step(turn / 1.2) - smooth_step((turn - 2.6) / 1.2)), hold(now)
 
 
+def parking_ramp(now: Moment) -> tuple[float, float]:
+    """Return the controls (road-wheel angle, acceleration) for a circle of 8 m radius to the left
+    at constant speed, as on the ramp of a parking garage, after two seconds straight on.
+    """
+    return math.atan(WHEELBASE / 8.0) * smooth_step((now.t - 2.0) / 2.0), hold(now)
+
+
 def throttle(_now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) for 3 m/s^2 from the first sample on,
     with straight wheels: the "throttle opening of 0.3" of paper 003.
@@ -375,6 +382,9 @@ MANOEUVRES: Final = {
     ),
     "street-corners": Manoeuvre(
         street_corners, 5.0, 24.0, 0.85, "turns by 90 degrees with a radius of 6 m"
+    ),
+    "parking-ramp": Manoeuvre(
+        parking_ramp, 3.5, 40.0, 0.85, "circle of 8 m radius, as in a parking garage"
     ),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

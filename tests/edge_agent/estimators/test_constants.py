@@ -83,7 +83,7 @@ MOVES = {
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "abrupt_share": Move("upper", "joints", 0.95, LESS),  # more of a bump is read as slip
     "abrupt_time": Move("upper", "joints", 0.992, LESS),  # a bump is read as slip sooner
-    "steady_half": Move("width", "constant-radius", 1.05),
+    "steady_half": Move("least probabilities", "constant-radius", 1.06),
     "steady_share": Move("least probabilities", "constant-radius", 0.95),
     # More nodes of low friction pay the penalty for sliding.
     "sliding_slope": Move("upper", "constant-radius", 1.08),

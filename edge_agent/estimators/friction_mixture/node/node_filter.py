@@ -103,7 +103,8 @@ def update_nodes(
     find_covariances(covariance, node)
     plain = weigh_rows(memory, design, scratch, lanes_at(scratch.share, group), inflation)
     before = belief_cost(mean, memory.nominal)
-    loss = take_rows(features, mean, covariance, node, features.novelty / inflation)
+    weight = features.novelty * certain_share(memory, inflation)
+    loss = take_rows(features, mean, covariance, node, weight)
     keep_within(mean, design.constants, memory.nominal)
     moved = belief_cost(mean, memory.nominal) - before
     price *= design.constants.chosen.freedom_penalty / inflation
@@ -329,7 +330,8 @@ def take_rows(
 
     This logarithm favours nodes that predict a force exactly: those whose tyres slide. Its weight
     is 1 for independent blocks. Correlated errors, and unchanged forces, reduce it as they reduce
-    the other evidence. Otherwise the friction would approach the grip in use in each long turn.
+    the other evidence, and so do innovations below their stated variance (`certain_share`).
+    Otherwise the friction would approach the grip in use in each long turn.
     """
     squares = 0.0 * lanes_at(node.residual, 0)
     product = 1.0 + squares
@@ -388,6 +390,21 @@ def _subtract_rows(covariance: FloatArray, node: NodeWorkspace) -> None:
         for j in range(i + 1):
             left = lanes_at(covariance, (i, j)) - multiply_row(scaled, node.cross, j)
             put_lanes(covariance, (i, j), left)
+
+
+@compiled
+def certain_share(memory: MixtureMemory, inflation: float) -> float:
+    """Return the share of ln(innovation variance) of the axles that counts as evidence.
+
+    It is 1 / `inflation` for errors that are correlated over several blocks. If the innovations of
+    the last second are smaller still than their variance, which includes the largest changes of
+    slope, bank and offsets, it is the ratio of their squares to this variance. With more, nodes
+    would lose probability only because their variance is too large.
+    """
+    share = 1.0 / inflation
+    if memory.theoretical[1] > 0.0:
+        share = min(share, memory.actual[1] / memory.theoretical[1])
+    return share
 
 
 @compiled

@@ -125,8 +125,9 @@ class PhysicalConstants(NamedTuple):
     # to 17 mrad on logs of real cars, mostly below 4
     steer_std: float = 0.004
     # [1] standard deviation of the steering gain: steering ratios in vehicle files of real
-    # cars are 3 to 8 % off
-    steer_gain_std: float = 0.02
+    # cars are 3 to 8 % off. With .02, slow turns on dry road of a car with such an error read as
+    # ice.
+    steer_gain_std: float = 0.04
     # [rad] mean steering compliance per lateral force over load: 0 to .035 on production cars
     # (front C/F_z of 10 to 20)
     compliance_mean: float = 0.005
