@@ -27,6 +27,7 @@ from edge_agent.calibration.learn import DriveEstimates, one_drive, surer_values
 from edge_agent.inputs.block import Block
 from edge_agent.inputs.correct import Corrector
 from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.driving_direction import DrivingDirection, sign_wheels
 from edge_agent.inputs.profile import Profile
 from schemas.numeric import FloatArray
 from schemas.runtime.durable import open_durably
@@ -117,10 +118,12 @@ class Trip:
                 "and braking"
             )
         corrector = Corrector(self.vehicle)
+        direction = DrivingDirection(self.vehicle)
         with closing(source):
             for block in source:
                 self._keep_block(block, ground())
-                mended = corrector.advance(block.t[:, 0], block.signals[:, 0])
+                t = block.t[:, 0]
+                mended = direction.advance(t, corrector.advance(t, block.signals[:, 0]))
                 yield replace(block, signals=mended[:, None])
 
     def learn_rest(self) -> None:
@@ -173,7 +176,7 @@ class Trip:
                 log.warning("the signal doctor: %s", ", ".join(self._faults))
             estimates: DriveEstimates = {}
             if diagnosis.is_passed and final and t[-1] - t[0] >= LEAST_S:
-                estimates = one_drive(t, signals, self._plain)
+                estimates = one_drive(t, sign_wheels(t, signals, self._plain), self._plain)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             log.warning("a part of this trip cannot be analysed: %s", error)
             return

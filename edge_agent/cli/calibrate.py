@@ -68,6 +68,7 @@ def _read_drive(path: Path, vehicle: Vehicle, *, trusted: bool) -> Drive:
     """
     from edge_agent.inputs.correct import scale_axles
     from edge_agent.inputs.doctor.findings import diagnose
+    from edge_agent.inputs.driving_direction import sign_wheels
     from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
 
@@ -79,7 +80,7 @@ def _read_drive(path: Path, vehicle: Vehicle, *, trusted: bool) -> Drive:
         raise InputError(
             "log", f"{path}: {names}", "correct its profile (edge-agent check), or --trust it"
         )
-    return log.t, signals
+    return log.t, sign_wheels(log.t, signals, vehicle)
 
 
 def predict_drive(vehicle: Vehicle, drive: Drive) -> Prediction:

@@ -25,6 +25,7 @@ from edge_agent.inputs.correct import correct_log, free_rear_wheels
 from edge_agent.inputs.doctor.diagnosis import Diagnosis
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.doctor.fix import OF_DEVICE, apply_findings
+from edge_agent.inputs.driving_direction import sign_wheels
 from edge_agent.inputs.log_columns import fill_steering, split_front_angle
 from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import Profile
@@ -47,15 +48,16 @@ class Adopted(NamedTuple):
 
 def prepare_log(log: SignalLog, vehicle: Vehicle) -> Adopted:
     """Return `log`, corrected for use by the estimator: first by the vehicle's calibration, then by
-    the measurements of the signal doctor. If only one front angle was measured, the angles of the
-    two wheels are computed from it.
+    the measurements of the signal doctor. Wheel speeds without sign become negative where the car
+    drives backwards. If only one front angle was measured, the angles of the two wheels are
+    computed from it.
     """
     corrected = correct_log(log.t, log.signals, vehicle)
     adopted = adopt_measured(replace(log, signals=corrected), vehicle)
-    if not log.has_one_front_angle:
-        return adopted
-    signals = adopted.log.signals.copy()
-    split_front_angle(signals, vehicle)
+    signals = sign_wheels(adopted.log.t, adopted.log.signals, vehicle)
+    if log.has_one_front_angle:
+        signals = signals.copy()
+        split_front_angle(signals, vehicle)
     return adopted._replace(log=replace(adopted.log, signals=signals, has_one_front_angle=False))
 
 
