@@ -15,6 +15,7 @@ from fleet_service.cli import export
 from schemas.errors import InputError
 from schemas.runtime import commandline
 from tests import reference_pages
+from tests.language import NOT_OURS
 from tests.results import list_pages
 from tests.structure import ROOT
 from tests.test_commands import LINES
@@ -24,6 +25,7 @@ HALVES = {"edge_agent": "edge-agent", "fleet_service": "fleet-service"}
 README_WORDS = 450
 FIRST_COMMAND_WITHIN = 120
 ROOM_LINES = 60
+COLUMNS = 100
 CONTRACT = "schemas/README.md"  # reference for other languages, not an overview of a folder
 
 
@@ -198,3 +200,14 @@ def test_room_readmes_have_at_most_sixty_lines() -> None:
         if page.name == "README.md" and name not in (CONTRACT, "README.md"):
             lines = len(page.read_text(encoding="utf-8").splitlines())
             assert lines <= ROOM_LINES, f"{name}: {lines} lines"
+
+
+def test_prose_of_pages_keeps_to_the_line_length_of_the_code() -> None:
+    """Tables and code may be wider. Otherwise ROOM_LINES would not limit the length of a page."""
+    for page in list_pages():
+        if page.name in NOT_OURS:
+            continue
+        text = page.read_text(encoding="utf-8")
+        prose = re.sub(r"^```.*?^```|^    \S.*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
+        wide = [line for line in prose.splitlines() if len(line) > COLUMNS]
+        assert not wide, f"{page.relative_to(ROOT)}: {wide}"
