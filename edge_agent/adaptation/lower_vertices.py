@@ -115,7 +115,8 @@ class LowerVertices:
 
     def to_vector(self) -> FloatArray:
         """Return the free parameters, (16,): the shares `feet` of the input sets, then the shares
-        `out_feet` of the output sets."""
+        `out_feet` of the output sets.
+        """
         return np.array([*self.feet, *self.out_feet])
 
     @classmethod

@@ -96,7 +96,8 @@ def plain_rules(steady: float) -> RuleBase:
 @compiled
 def is_high(value: float, ramp: FloatArray | tuple[float, float]) -> float:
     """Return the membership (degree, 0 to 1) of `value` in a fuzzy set that rises from 0 at ramp[0]
-    to 1 at ramp[1]."""
+    to 1 at ramp[1].
+    """
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
 
 

@@ -96,7 +96,8 @@ class MapSubscriber:
     @property
     def local_map(self) -> LocalMap:
         """Return the local copy of the map; the caller must have acquired the lock of the
-        subscriber."""
+        subscriber.
+        """
         return self._map
 
     @property

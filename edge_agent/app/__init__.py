@@ -1,2 +1,3 @@
 """Functions that the commands of `edge-agent` call: live loop, replay of logs, estimators by name,
-metrics."""
+metrics.
+"""

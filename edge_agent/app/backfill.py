@@ -50,7 +50,8 @@ class Task(NamedTuple):
 
 class Outcome(NamedTuple):
     """Result of the estimation of one drive: the number of estimated samples, or the reason of a
-    failure."""
+    failure.
+    """
 
     task: Task
     samples: int

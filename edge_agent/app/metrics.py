@@ -87,7 +87,8 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 
 def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     """Return one message per problem of the publisher and of the estimation loop, for the health
-    check."""
+    check.
+    """
     status = publisher.status
     found = [] if status.links else ["no session is open"]
     if status.cut_off:

@@ -64,7 +64,8 @@ class SignalWatch:
 
     def watch_blocks(self, source: Iterator[Block]) -> Iterator[Block]:
         """Yield the blocks of samples of a source unchanged, and record which signals they
-        contain."""
+        contain.
+        """
         for block in source:
             self.add(block)
             yield block

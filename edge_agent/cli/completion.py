@@ -1,5 +1,6 @@
 """`edge-agent completion`: print a script for a shell, by which the shell completes commands and
-options."""
+options.
+"""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ Files on which an acknowledgement depends are segments (files of new rows), keys
 identities. They are uploaded before the acknowledgement (`upload_segments`). All other files follow
 later (`sync`). Uploads come first and deletions last, so that the bucket contains every row at
 least once at any time. At start (`sync_without_lease`), files that only the bucket has are
-downloaded , and files that only the folder has are uploaded. An object is deleted only if the
+downloaded, and files that only the folder has are uploaded. An object is deleted only if the
 upload journal (list of own uploads) contains it.
 """
 

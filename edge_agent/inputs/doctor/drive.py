@@ -176,7 +176,8 @@ class EvenTimes:
 
     def interpolate_channel(self, x: FloatArray) -> FloatArray:
         """Return the readings x (T,) of a signal at the even time steps (n,); see
-        `interpolate_near`."""
+        `interpolate_near`.
+        """
         if not np.isfinite(x).all():
             return interpolate_near(self.t, x, self.at)
         return np.where(self._is_covered, np.interp(self.at, self.t, x), np.nan)

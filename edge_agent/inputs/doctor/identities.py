@@ -165,7 +165,8 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 def fit_identities(drive: EvenDrive) -> dict[str, Fit]:
     """Fit every identity (two quantities that are equal by physics) to a drive; return the fits by
-    name."""
+    name.
+    """
     return {
         name: fit_identity(sides(drive), drive.moving, drive.grips, level=name == "ground")
         for name, sides in IDENTITIES.items()

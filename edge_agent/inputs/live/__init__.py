@@ -1,2 +1,3 @@
 """Live sources: threads that receive messages, and rows (one sample of all channels each) that are
-built from the messages at a fixed rate."""
+built from the messages at a fixed rate.
+"""

@@ -110,7 +110,8 @@ class Ros2Feed(Feed):
 
     def listen(self) -> None:
         """Receive messages until the source is stopped. The method does not handle a lost router,
-        because Zenoh itself reconnects."""
+        because Zenoh itself reconnects.
+        """
         session = open_session(self._settings, self.stopping)
         if session is None:
             return

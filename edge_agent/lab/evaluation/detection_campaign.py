@@ -160,7 +160,8 @@ def town_named(text: str) -> DetectionTown:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Evaluate the detection of slippery road in the towns given on the command line, and print a
-    table."""
+    table.
+    """
     parse = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

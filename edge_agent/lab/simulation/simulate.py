@@ -261,7 +261,8 @@ def _sense_records(
     records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float
 ) -> FloatArray:
     """Simulate the sensors: return readings (T, 18) for the records of true values (T, RECORD) of
-    one vehicle."""
+    one vehicle.
+    """
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))

@@ -163,7 +163,8 @@ def tune(
     habits: Habits | None = None,
 ) -> PaperTuning:
     """Tune the lower vertices with the ant colony; the objective is averaged over all
-    noise levels."""
+    noise levels.
+    """
     score = OBJECTIVES[objective]
     laid: list[FloatArray] = []
 

@@ -53,7 +53,8 @@ SHOWN: Final = (*GIVEN, *WAYS)
 @dataclass
 class Study:
     """Results of all searches of each kind (ant colony, random search), and the drives used for
-    search and scoring."""
+    search and scoring.
+    """
 
     train: StudySet
     held_out: StudySet

@@ -75,7 +75,8 @@ class Databroker:
 
     def value(self, path: str) -> Any:  # noqa: ANN401
         """Return the data point (value and time stamp) that this simulated broker has stored for a
-        path."""
+        path.
+        """
         with self._changed:
             return self._values[path]
 

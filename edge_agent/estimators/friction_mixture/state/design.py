@@ -62,7 +62,8 @@ class MixtureDesign(NamedTuple):
 
 def nominal_states(constants: Constants) -> Nominal:
     """Return the prior of the states of a node (filter of one friction hypothesis): mean, standard
-    deviation, and time within which a state returns to the prior."""
+    deviation, and time within which a state returns to the prior.
+    """
     mean = np.zeros(STATES)
     std = np.ones(STATES)
     time = np.full(STATES, np.inf)

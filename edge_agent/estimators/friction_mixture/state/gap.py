@@ -47,7 +47,8 @@ def spread_moments(memory: MixtureMemory) -> None:
 @compiled
 def put_split_to_sleep(memory: MixtureMemory) -> None:
     """Deactivate the nodes of split roads (different friction left and right), and normalise the
-    weights of the other nodes."""
+    weights of the other nodes.
+    """
     if not memory.split:
         return
     memory.split = False

@@ -148,7 +148,8 @@ class Reproduction:
     @property
     def missed_rows(self) -> list[str]:
         """Return the names of the rows whose number under the paper's conditions (`matched`) misses
-        its target."""
+        its target.
+        """
         return [row.name for row in self.rows if not row.holds]
 
     def all_figures(self) -> list[Figure]:
