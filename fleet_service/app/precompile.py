@@ -59,9 +59,9 @@ def exercise_map() -> None:
     """
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2), (1, 2)):
-        o = _make_visits(epoch * EPOCH_NS, cells)
-        Alerts(fusion).update(fusion.update(o).slots)
-        fusion.slots_of(o.cell, o.sector)
+        observations = _make_visits(epoch * EPOCH_NS, cells)
+        Alerts(fusion).update(fusion.update(observations).slots)
+        fusion.slots_of(observations.cell, observations.sector)
     at_least(np.zeros(1))
     bound_by_used(level_above_used(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
     column = np.zeros(1, np.int64)  # read-only, like an array that Arrow returns

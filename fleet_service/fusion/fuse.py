@@ -137,59 +137,53 @@ class Fusion(BeliefMap):
         """
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
-    def update(self, o: Observations, before: RecordedResult | None = None) -> Updated:
+    def update(self, observations: Observations, before: RecordedResult | None = None) -> Updated:
         """Fuse observations in any order and return the outcome for each.
 
         A late observation is fused at the checkpoint (the time before which observations are
         final), with its likelihood aged to that time (`late.aged_evidence`).
 
         Args:
-            o: the observations.
+            observations: n observations.
             before: outcome that was recorded when these observations were fused for the first time;
                 given only when an archive is replayed.
         """
-        n = len(o.time)
-        used = np.zeros(n, np.float32)
-        limited = np.where(o.limited < 0, np.int8(UNLIMITED), np.int8(0))
         if before is None:
-            checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
-            late = o.time < checkpoint
-            late_by = np.zeros(n, np.int64)
-            rows = np.flatnonzero(late)
-            if len(rows):
-                rows = rows[checkpoint - o.time[rows] <= LATE_MOST_NS]
-                late_by[rows] = fused_at(o.time[rows], checkpoint) - o.time[rows]
+            late, late_by = _find_late(observations.time, self.checkpoint)
+            most_waiting = c.WAITING_MOST
         else:
             late = before.late
             late_by = before.late_by
-        old = late_by > 0
-        if old.any():
-            o = delay_observations(o, late_by, self._weather)
-        left = late & ~old
-        vehicle = self.store.vehicles_of(o.vehicle)
-        epoch = o.time // c.EPOCH_NS
+            most_waiting = _ANY
+        delayed = late_by > 0
+        if delayed.any():
+            observations = delay_observations(observations, late_by, self._weather)
+        left_out = late & ~delayed
+        vehicle = self.store.vehicles_of(observations.vehicle)
+        epoch = observations.time // c.EPOCH_NS
+        # The loop writes weight and flags of one epoch after the other into these arrays.
+        arrivals = _make_arrivals(observations, vehicle, delayed)
         touched = [np.zeros(0, np.int64)]
-        for e in distinct_values(epoch[~left]).tolist():
-            self._advance(e)
-            rows = np.flatnonzero((epoch == e) & ~left)
-            votes = self._vote_weights_at(e)
-            flagged = rows[o.limited[rows] > 0]
-            limited[flagged] = np.where(votes.may_support_alerts(vehicle[flagged]), HEEDED, CLAIMED)
-            if before is None:
-                used[rows] = votes.weights(vehicle[rows])
-            else:
-                used[rows] = before.weight[rows]
-            arrivals = _make_arrivals(o, vehicle, used, old)._replace(limited=limited)
-            slots, left_out = self._absorb(
-                o, rows, arrivals, c.WAITING_MOST if before is None else _ANY
+        for current in distinct_values(epoch[~left_out]).tolist():
+            self._advance(current)
+            rows = np.flatnonzero((epoch == current) & ~left_out)
+            votes = self._vote_weights_at(current)
+            arrivals.weight[rows] = (
+                votes.weights(vehicle[rows]) if before is None else before.weight[rows]
             )
+            flagged = rows[observations.limited[rows] > 0]
+            arrivals.limited[flagged] = np.where(
+                votes.may_support_alerts(vehicle[flagged]), HEEDED, CLAIMED
+            )
+            slots, exceeding = self._absorb(observations, rows, arrivals, most_waiting)
             touched.append(slots)
-            late = late | left_out
-            left = left | left_out
-        used[left] = 0.0
-        late_by = np.where(left, 0, late_by)
+            late = late | exceeding
+            left_out = left_out | exceeding
+        arrivals.weight[left_out] = 0.0
+        late_by = np.where(left_out, 0, late_by)
         changed = np.concatenate(touched).astype(np.int32)  # NumPy sorts these twice as fast
-        return Updated(late, late_by, used, distinct_values(changed).astype(np.int64))
+        slots = distinct_values(changed).astype(np.int64)
+        return Updated(late, late_by, arrivals.weight, slots)
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit
@@ -268,46 +262,68 @@ class Fusion(BeliefMap):
         self._shape = shape_of(self.store.peers, self.vote_weights[-1].weight)
 
     def _absorb(
-        self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
+        self, observations: Observations, rows: IntArray, arrivals: Arrivals, most_waiting: int
     ) -> tuple[IntArray, BoolArray]:
+        """Add the votes of the selected observations to the lateness windows. Return the slots that
+        changed, (k,), and a mask (n,) of the observations left out, because `most_waiting`
+        observations of their vehicle already wait in the cell.
+        """
         # Sort by time, so that no row of the batch makes the belief after another one stale.
-        rows = rows[np.argsort(o.time[rows], kind="stable")]
-        at, keys, share = _spread_votes(o, rows)
+        rows = rows[np.argsort(observations.time[rows], kind="stable")]
+        at, keys, share = _spread_votes(observations, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
         return slots, absorb_votes(
-            self.store.state, self._weather, arrivals, Votes(at, slots, share, most)
+            self.store.state, self._weather, arrivals, Votes(at, slots, share, most_waiting)
         )
 
 
-def _make_arrivals(
-    o: Observations, vehicle: IntArray, weight: Float32Array, old: BoolArray
-) -> Arrivals:
+def _find_late(time: IntArray, checkpoint: int | None) -> tuple[BoolArray, IntArray]:
+    """Return a mask of the observations older than the checkpoint, and the delay [ns] after which
+    each of them is fused; 0 for one that is in time or too old to be fused. All arrays have the
+    shape (n,).
+    """
+    late = np.zeros(len(time), np.bool_)
+    late_by = np.zeros(len(time), np.int64)
+    if checkpoint is not None:
+        late = time < checkpoint
+        rows = np.flatnonzero(late & (checkpoint - time <= LATE_MOST_NS))
+        late_by[rows] = fused_at(time[rows], checkpoint) - time[rows]
+    return late, late_by
+
+
+def _make_arrivals(observations: Observations, vehicle: IntArray, delayed: BoolArray) -> Arrivals:
+    """Return the columns of n observations that the windows store. Weights are 0, and reports of an
+    intervention (`limited`) are not marked as heeded or claimed yet.
+    """
+    n = len(observations.time)
     return Arrivals(
-        time=o.time,
-        number=o.vehicle,
-        boot=o.boot,
-        sequence=o.sequence,
+        time=observations.time,
+        number=observations.vehicle,
+        boot=observations.boot,
+        sequence=observations.sequence,
         vehicle=vehicle,
-        weight=weight,
-        evidence=o.evidence,
-        reported=o.reported,
-        used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
-        shared=shared_parts(o.reported),
-        manoeuvre=o.manoeuvre,
-        late=old,
-        limited=np.zeros(len(o.time), np.int8),
+        weight=np.zeros(n, np.float32),
+        evidence=observations.evidence,
+        reported=observations.reported,
+        used=(np.clip(observations.used, 0.0, 2.5) * USED).astype(np.uint8),
+        shared=shared_parts(observations.reported),
+        manoeuvre=observations.manoeuvre,
+        late=delayed,
+        limited=np.where(observations.limited < 0, np.int8(UNLIMITED), np.int8(0)),
     )
 
 
-def voted_keys(o: Observations) -> IntArray:
+def voted_keys(observations: Observations) -> IntArray:
     """Return the keys (cell · 4 + sector) of all cells and sectors that the observations affect, as
     one array. A key occurs once for each observation that affects it.
     """
-    return _spread_votes(o, np.arange(len(o.time)))[1]
+    return _spread_votes(observations, np.arange(len(observations.time)))[1]
 
 
-def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
+def _spread_votes(
+    observations: Observations, rows: IntArray
+) -> tuple[IntArray, IntArray, Float32Array]:
     """Return the votes of the selected observations, sorted by time. A vote is the effect of one
     observation on one cell and heading sector. The three arrays contain the row of the observation,
     the key (cell · 4 + sector), and P(the vehicle was in this cell).
@@ -315,23 +331,26 @@ def _spread_votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, 
     Besides its own cell and sector, an observation may affect a second sector and neighbouring
     cells.
     """
-    own = 1.0 - o.other_share[rows].sum(axis=1)
-    key = o.cell[rows] * grid.SECTORS
+    own = 1.0 - observations.other_share[rows].sum(axis=1)
+    key = observations.cell[rows] * grid.SECTORS
     at = [rows]
-    keys = [key + o.sector[rows]]
+    keys = [key + observations.sector[rows]]
     share = [own]
-    second = np.flatnonzero(o.second[rows] >= 0)
+    second = np.flatnonzero(observations.second[rows] >= 0)
     if len(second):
         at.append(rows[second])
-        keys.append(key[second] + o.second[rows[second]])
+        keys.append(key[second] + observations.second[rows[second]])
         share.append(own[second])
-    elsewhere, which = np.nonzero(o.other[rows] >= 0)
+    elsewhere, which = np.nonzero(observations.other[rows] >= 0)
     if len(elsewhere):
         at.append(rows[elsewhere])
-        keys.append(o.other[rows[elsewhere], which] * grid.SECTORS + o.sector[rows[elsewhere]])
-        share.append(o.other_share[rows[elsewhere], which])
+        keys.append(
+            observations.other[rows[elsewhere], which] * grid.SECTORS
+            + observations.sector[rows[elsewhere]]
+        )
+        share.append(observations.other_share[rows[elsewhere], which])
     whole = np.concatenate(at)
-    order = np.argsort(o.time[whole], kind="stable") if len(at) > 1 else slice(None)
+    order = np.argsort(observations.time[whole], kind="stable") if len(at) > 1 else slice(None)
     return (
         whole[order],
         np.concatenate(keys)[order],

@@ -50,20 +50,22 @@ def fused_at(time: IntArray, checkpoint: int) -> IntArray:
     return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // US_STEP * US_STEP)
 
 
-def delay_observations(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
+def delay_observations(
+    observations: Observations, late_by: IntArray, weather: Weather
+) -> Observations:
     """Return the observations with their times moved forward by `late_by` (n,) [ns]. Their
     likelihoods are aged by the same time, because the road may have changed since.
     """
     rows = np.flatnonzero(late_by)
-    evidence = o.evidence.copy()
+    evidence = observations.evidence.copy()
     evidence[rows] = aged_evidence(
-        o.evidence[rows],
-        o.cell[rows] * grid.SECTORS,
-        o.time[rows],
-        o.time[rows] + late_by[rows],
+        observations.evidence[rows],
+        observations.cell[rows] * grid.SECTORS,
+        observations.time[rows],
+        observations.time[rows] + late_by[rows],
         weather,
     )
-    return replace(o, time=o.time + late_by, evidence=evidence)
+    return replace(observations, time=observations.time + late_by, evidence=evidence)
 
 
 def aged_evidence(

@@ -224,13 +224,13 @@ def replay(
         if since.known is not None:
             new = ~_are_known(rows, since.known)
             rows = {name: column[new] for name, column in rows.items()}
-        o = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
+        observations = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
         before = _recorded_result(rows)
         end = int(segments.to_nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
-        o, before = _join_parts([*waiting, (o, before)])
-        epoch = (o.time + before.late_by) // EPOCH_NS
-        waiting = [_select_rows(o, before, epoch > end)]
-        yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), listener)
+        observations, before = _join_parts([*waiting, (observations, before)])
+        epoch = (observations.time + before.late_by) // EPOCH_NS
+        waiting = [_select_rows(observations, before, epoch > end)]
+        yield from _fuse_epochs(fusion, *_select_rows(observations, before, epoch <= end), listener)
     if waiting:
         yield from _fuse_epochs(fusion, *waiting[0], listener)
 
@@ -259,7 +259,7 @@ def _join_parts(
     """
     of = Observations(
         **{
-            f.name: np.concatenate([getattr(o, f.name) for o, _ in parts])
+            f.name: np.concatenate([getattr(observations, f.name) for observations, _ in parts])
             for f in fields(Observations)
         }
     )
@@ -272,29 +272,29 @@ def _join_parts(
 
 
 def _select_rows(
-    o: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
+    observations: Observations, before: RecordedResult, rows: BoolArray | IntArray | slice
 ) -> tuple[Observations, RecordedResult]:
     """Return a selection of archived observations (n,) and of their recorded results (lateness and
     vote weight). `rows` is a mask, an array of indices, or a slice.
     """
-    return o.take(rows), RecordedResult(
+    return observations.take(rows), RecordedResult(
         before.late[rows], before.late_by[rows], before.weight[rows]
     )
 
 
 def _fuse_epochs(
-    fusion: Fusion, o: Observations, before: RecordedResult, listener: EpochListener
+    fusion: Fusion, observations: Observations, before: RecordedResult, listener: EpochListener
 ) -> Iterator[Updated]:
     """Add archived observations to the beliefs about friction epoch by epoch (minute by minute), in
     order of the time at which they were first processed.
     """
-    time = o.time + before.late_by
+    time = observations.time + before.late_by
     order = np.argsort(time, kind="stable")
-    o, before = _select_rows(o, before, order)
+    observations, before = _select_rows(observations, before, order)
     borders = np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1
     for start, stop in pairwise([0, *borders.tolist(), len(order)]):
         if start < stop:
-            taken, used = _select_rows(o, before, slice(start, stop))
+            taken, used = _select_rows(observations, before, slice(start, stop))
             with listener(taken):
                 updated = fusion.update(taken, used)
             yield updated

@@ -107,25 +107,25 @@ class PublicCells:
         return self._fusion.slots_of(cell, sector)
 
     @contextmanager
-    def follow(self, o: Observations) -> Iterator[None]:
-        """Provide a context in which the caller adds the observations `o` to the beliefs about
-        friction; at the end of the context, update the public copy of the cells.
+    def follow(self, observations: Observations) -> Iterator[None]:
+        """Provide a context in which the caller adds `observations` to the beliefs about friction;
+        at the end of the context, update the public copy of the cells.
         """
-        now = int(o.time.max(initial=0))
+        now = int(observations.time.max(initial=0))
         self.publish(now)
         yield
-        self.visitors.add(o)
+        self.visitors.add(observations)
         self._add_slots()
-        bits = bit_of(o.vehicle)
-        for sector in (o.sector, o.second):
-            slots = self._fusion.slots_of(o.cell, np.maximum(sector, 0))
+        bits = bit_of(observations.vehicle)
+        for sector in (observations.sector, observations.second):
+            slots = self._fusion.slots_of(observations.cell, np.maximum(sector, 0))
             mine = (sector >= 0) & (slots >= 0)
             np.bitwise_or.at(self._pending, slots[mine], bits[mine])
-        tiles = grid.tile_of(o.cell)
+        tiles = grid.tile_of(observations.cell)
         for tile in np.unique(tiles).tolist():
             present = int(np.bitwise_or.reduce(bits[tiles == tile]))
             self._present[tile] = self._present.get(tile, 0) | present
-        keys = voted_keys(o)
+        keys = voted_keys(observations)
         voted = np.unique(self._fusion.slots_of(keys // grid.SECTORS, keys % grid.SECTORS))
         self._copy_more_slippery(voted[voted >= 0], now)
 

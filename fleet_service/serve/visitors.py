@@ -40,14 +40,14 @@ class Visitors:
         self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
         self._part = 0  # number of the newest part of the window, counted from the epoch
 
-    def add(self, o: Observations) -> None:
-        """Record, for each cell that the observations `o` report, the vehicles that report it."""
+    def add(self, observations: Observations) -> None:
+        """Record, for each cell that `observations` report, the vehicles that report it."""
         self._grow()
-        part = o.time // PART_NS
+        part = observations.time // PART_NS
         self._move_on(int(part.max(initial=self._part)))
-        bit = bit_of(o.vehicle)
-        for sector in (o.sector, o.second):
-            slot = self._fusion.slots_of(o.cell, np.maximum(sector, 0))
+        bit = bit_of(observations.vehicle)
+        for sector in (observations.sector, observations.second):
+            slot = self._fusion.slots_of(observations.cell, np.maximum(sector, 0))
             for back in range(PARTS):
                 mine = (part == self._part - back) & (slot >= 0) & (sector >= 0)
                 np.bitwise_or.at(self._bits[:, back], slot[mine], bit[mine])
