@@ -98,43 +98,47 @@ def count_differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list
     )
 
 
-def _attacking_rows(v: Visits, count: int) -> BoolArray:
-    return (v.vehicle < count) & (v.seconds >= 60.0 * BEGIN)
+def _attacking_rows(visits: Visits, count: int) -> BoolArray:
+    return (visits.vehicle < count) & (visits.seconds >= 60.0 * BEGIN)
 
 
 def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
     """Return the visits of a drive with the attackers' reports replaced: at every visit they claim
     a random friction, with high confidence.
     """
-    v = drive.visits
-    claim = rng.uniform(0.05, 1.2, len(v))
-    return _with_claims(v, _attacking_rows(v, ATTACKERS), claim)
+    visits = drive.visits
+    claim = rng.uniform(0.05, 1.2, len(visits))
+    return _with_claims(visits, _attacking_rows(visits, ATTACKERS), claim)
 
 
-def _with_claims(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
+def _with_claims(visits: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
     reports = SimulatedReports(
-        v.reports.reading,
-        v.reports.std,
-        np.where(lying, claim, v.reports.used),
-        v.reports.manoeuvre,
-        np.where(lying[:, None], agent.overconfident_likelihood(claim), v.reports.log_likelihood),
+        visits.reports.reading,
+        visits.reports.std,
+        np.where(lying, claim, visits.reports.used),
+        visits.reports.manoeuvre,
+        np.where(
+            lying[:, None], agent.overconfident_likelihood(claim), visits.reports.log_likelihood
+        ),
     )
-    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
+    return Visits(
+        visits.seconds, visits.vehicle, visits.place, visits.mu, visits.excited & ~lying, reports
+    )
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
     """Return the visits of a drive in which the attackers report wrong cells: their measurements
     are correct, but all their positions are shifted along the town.
     """
-    v = drive.visits
-    moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
+    visits = drive.visits
+    moved = (visits.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
     return Visits(
-        v.seconds,
-        v.vehicle,
-        np.where(_attacking_rows(v, ATTACKERS), moved, v.place),
-        v.mu,
-        v.excited,
-        v.reports,
+        visits.seconds,
+        visits.vehicle,
+        np.where(_attacking_rows(visits, ATTACKERS), moved, visits.place),
+        visits.mu,
+        visits.excited,
+        visits.reports,
     )
 
 
@@ -176,7 +180,7 @@ def add_newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def _add_visits(
-    v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray
+    visits: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray
 ) -> Visits:
     std = np.full(len(claim), agent.OVERCONFIDENT_STD)
     reports = (
@@ -187,17 +191,17 @@ def _add_visits(
         agent.overconfident_likelihood(claim),
     )
     joined = (
-        np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True)
+        np.concatenate([a, b]) for a, b in zip(vars(visits.reports).values(), reports, strict=True)
     )
     both = Visits(
-        np.append(v.seconds, seconds),
-        np.append(v.vehicle, vehicle),
-        np.append(v.place, place),
-        np.append(v.mu, np.full(len(claim), np.nan)),
-        np.append(v.excited, np.zeros(len(claim), bool)),
+        np.append(visits.seconds, seconds),
+        np.append(visits.vehicle, vehicle),
+        np.append(visits.place, place),
+        np.append(visits.mu, np.full(len(claim), np.nan)),
+        np.append(visits.excited, np.zeros(len(claim), bool)),
         SimulatedReports(*joined),
     )
-    return town.select_visits(both, np.argsort(both.seconds, kind="stable"))
+    return both.take(np.argsort(both.seconds, kind="stable"))
 
 
 VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {

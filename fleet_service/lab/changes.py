@@ -36,7 +36,9 @@ def changing_town(rng: Generator, before: float, after: float) -> Town:
     drawn = town.draw_town(rng, MINUTES, 0.0)
     mu = drawn.mu.copy()
     excitement = drawn.excitement.copy()
-    mu[:CHANGE, :LENGTH], mu[CHANGE:, :LENGTH], excitement[:LENGTH] = before, after, EXCITEMENT
+    mu[:CHANGE, :LENGTH] = before
+    mu[CHANGE:, :LENGTH] = after
+    excitement[:LENGTH] = EXCITEMENT
     return Town(mu, excitement, drawn.changed, drawn.common, drawn.usual)
 
 
@@ -49,7 +51,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     """
     place = changing_town(rng, before, after)
     visits = town.drive_fleet(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
-    o = observations_of(rows_of(visits), visits.vehicle)
+    observations = observations_of(rows_of(visits), visits.vehicle)
     here = (visits.place < LENGTH) & visits.excited & (visits.seconds >= 60.0 * CHANGE)
     passes = np.zeros(LENGTH, np.int64)
     seen = np.full(LENGTH, UNREACHED)
@@ -57,7 +59,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
     for part in np.split(np.arange(len(visits)), np.flatnonzero(here) + 1):
         if not len(part) or (seen < UNREACHED).all():
             continue
-        fusion.update(o.take(part))
+        fusion.update(observations.take(part))
         if here[part[-1]]:
             cell = visits.place[part[-1]]
             passes[cell] += 1

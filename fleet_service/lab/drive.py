@@ -32,37 +32,37 @@ TWICE_SHARE: Final = 0.03
 CELL: Final = cell_numbers()
 
 
-def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
+def rows_of(visits: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     """Return simulated visits as the archive columns from which a map is computed; every row is a
     separate batch (message with records).
 
     `cells` contains the grid number of each place of the town.
     """
-    n = len(v)
-    nan = np.full(len(v), np.nan, np.float32)
-    cell = cells[v.place]
-    used = v.reports.used.astype(np.float32)
+    n = len(visits)
+    nan = np.full(len(visits), np.nan, np.float32)
+    cell = cells[visits.place]
+    used = visits.reports.used.astype(np.float32)
     along, across = (
-        used * np.array(part, np.float32)[v.reports.manoeuvre]
+        used * np.array(part, np.float32)[visits.reports.manoeuvre]
         for part in ((1, -1, 0, 0), (0, 0, 1, -1))
     )
-    order = np.lexsort((v.seconds, v.vehicle))
+    order = np.lexsort((visits.seconds, visits.vehicle))
     seq = np.empty(n, np.int64)
-    first = np.searchsorted(v.vehicle[order], v.vehicle[order])
+    first = np.searchsorted(visits.vehicle[order], visits.vehicle[order])
     seq[order] = np.arange(n) - first + 1
     return {
-        "leave_time": START + (v.seconds * NS).astype(np.int64),
+        "leave_time": START + (visits.seconds * NS).astype(np.int64),
         "cell": cell,
         "latitude": grid.centre(cell)[0],
         "sector": np.zeros(n, np.int8),
         "yaw": np.zeros(n, np.float32),
         "position_std": np.full(n, 1.5, np.float32),
-        "boot": v.vehicle + 1,
+        "boot": visits.vehicle + 1,
         "region": grid.region_of(cell),
         "seq": seq,
         "row": np.zeros(n, np.int32),
         "with_likelihood": np.ones(n, bool),
-        "log_likelihood": mugrid.encode_log_likelihood(v.reports.log_likelihood),
+        "log_likelihood": mugrid.encode_log_likelihood(visits.reports.log_likelihood),
         "used_longitudinal": along,
         "used_lateral": across,
         "mu": nan,
@@ -72,18 +72,20 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
     }
 
 
-def draw_arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
+def draw_arrivals(rng: Generator, visits: Visits) -> tuple[FloatArray, IntArray]:
     """Draw at random how the reports of the visits are delivered: some come late, some twice.
     Return two arrays with one item per delivery: the arrival time [s], in ascending order, and the
     index of the visit.
     """
-    n = len(v)
+    n = len(visits)
     delay = rng.exponential(DELAY_S, n) + np.where(
         rng.random(n) < LATE_SHARE, rng.uniform(0.0, LATE_S, n), 0.0
     )
     twice = np.flatnonzero(rng.random(n) < TWICE_SHARE)
     which = np.concatenate([np.arange(n), twice])
-    at = v.seconds[which] + np.concatenate([delay, delay[twice] + rng.exponential(5.0, len(twice))])
+    at = visits.seconds[which] + np.concatenate(
+        [delay, delay[twice] + rng.exponential(5.0, len(twice))]
+    )
     order = np.argsort(at, kind="stable")
     return at[order], which[order]
 
@@ -136,32 +138,32 @@ class AlertWatch:
         self.alerted.append(np.isin(slots, list(self.alerts.slots)) & known)
 
 
-def split_minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
-    """Yield, for each of `count` minutes, the observations of `o` that arrive in it; `at` (n,)
-    contains the arrival times [s], ascending.
+def split_minutes(observations: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
+    """Yield, for each of `count` minutes, the observations that arrive in it; `at` (n,) contains
+    the arrival times [s], ascending.
     """
     for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[
         :count
     ]:
-        yield o.take(rows)
+        yield observations.take(rows)
 
 
 def watch_drive(
-    rng: Generator, v: Visits, count: int, snapshot_minutes: tuple[int, ...] | None = None
+    rng: Generator, visits: Visits, count: int, snapshot_minutes: tuple[int, ...] | None = None
 ) -> AlertWatch:
     """Deliver simulated visits to a new `Fusion` (a map's beliefs) for `count` minutes. Return the
     map with the beliefs and alerts that were read after each minute, or only at the minutes in
     `snapshot_minutes`.
     """
-    rows = rows_of(v)
-    at, which = draw_arrivals(rng, v)
-    kept = novel_deliveries(rows, v.vehicle, which)
+    rows = rows_of(visits)
+    at, which = draw_arrivals(rng, visits)
+    kept = novel_deliveries(rows, visits.vehicle, which)
     at = at[kept]
     which = which[kept]
     fusion = Fusion(LATENESS_S)
     watched = AlertWatch(fusion, Alerts(fusion))
-    o = observations_of(rows, v.vehicle).take(which)
-    for minute, part in enumerate(split_minutes(o, at, count), 1):
+    observations = observations_of(rows, visits.vehicle).take(which)
+    for minute, part in enumerate(split_minutes(observations, at, count), 1):
         if len(part.time):
             updated = fusion.update(part)
             watched.alerts.update(updated.slots)

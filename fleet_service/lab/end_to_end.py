@@ -129,17 +129,19 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     return {f"{world.prefix}.{name}": value for name, value in found.items()}
 
 
-def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
+def raised_alerts(fusion: Fusion, observations: Observations) -> list[Alert]:
     """Compute a map from the observations of a drive second by second, as a service does; return
     the alerts that were raised.
     """
     alerts = Alerts(fusion)
     raised = []
-    second = (o.time - o.time.min()) // NS
+    second = (observations.time - observations.time.min()) // NS
     for rows in np.split(np.argsort(second, kind="stable"), np.cumsum(np.bincount(second))[:-1]):
         if len(rows):
             raised += [
-                alert for alert in alerts.update(fusion.update(o.take(rows)).slots) if alert.raised
+                alert
+                for alert in alerts.update(fusion.update(observations.take(rows)).slots)
+                if alert.raised
             ]
     return raised
 

@@ -57,13 +57,14 @@ def order_difference(rng: Generator) -> float:
     allowed delay.
     """
     visits = drive_town(rng)
-    o = observations_of(rows_of(visits), visits.vehicle)
+    observations = observations_of(rows_of(visits), visits.vehicle)
     straight = Fusion(LATENESS_S)
     mixed = Fusion(LATENESS_S)
-    straight.update(o)
+    straight.update(observations)
     arrival = np.argsort(visits.seconds + rng.uniform(0.0, 0.5 * LATENESS_S, len(visits)))
     late = sum(
-        int(mixed.update(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS)
+        int(mixed.update(observations.take(rows)).late.sum())
+        for rows in np.array_split(arrival, PARTS)
     )
     return 1.0 if late else largest_difference(straight, mixed)
 

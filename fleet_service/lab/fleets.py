@@ -140,11 +140,9 @@ def _fleet_figures(fleet: Fleet, found: Found) -> dict[str, float]:
     ours = join_scores(found.ours)
     out = {}
     name = f"fusion.{fleet.name}"
-    out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = (
-        rmse(ours),
-        coverage(ours),
-        safe_share(ours),
-    )
+    out[f"{name}.rmse"] = rmse(ours)
+    out[f"{name}.coverage90"] = coverage(ours)
+    out[f"{name}.safe95"] = safe_share(ours)
     out[f"{name}.interval_score"] = float(ours.interval.mean())
     out[f"fusion.false_ice.{fleet.name}"] = _share_of_minutes(found.false_ice)
     out[f"fusion.missed_ice.{fleet.name}"] = _share_of_minutes(found.missed_ice)

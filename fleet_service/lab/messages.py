@@ -39,25 +39,27 @@ def clock_of(seconds: float) -> int:
     return START + int(seconds * NS) + NS
 
 
-def make_messages(v: Visits) -> list[SentMessage]:
+def make_messages(visits: Visits) -> list[SentMessage]:
     """Return each vehicle's visits as messages with batches, in order of time per vehicle and
     region.
     """
-    rows = rows_of(v)
+    rows = rows_of(visits)
     out = []
     latitude, longitude = grid.centre(rows["cell"])
-    order = np.lexsort((v.seconds, rows["region"], v.vehicle))
-    streams = np.flatnonzero(np.diff(v.vehicle[order]) | np.diff(rows["region"][order])) + 1
+    order = np.lexsort((visits.seconds, rows["region"], visits.vehicle))
+    streams = np.flatnonzero(np.diff(visits.vehicle[order]) | np.diff(rows["region"][order])) + 1
     for stream in np.split(order, streams):
         for seq, start in enumerate(range(0, len(stream), BATCH_ROWS), 1):
             out.append(
-                _make_message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq)
+                _make_message(
+                    visits, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq
+                )
             )
     return out
 
 
 def _make_message(
-    v: Visits,
+    visits: Visits,
     rows: dict[str, np.ndarray],
     latitude: np.ndarray,
     longitude: np.ndarray,
@@ -81,7 +83,7 @@ def _make_message(
         "used_lateral": rows["used_lateral"][part],
         "log_likelihood": rows["log_likelihood"][part],
     }
-    vehicle = int(v.vehicle[part[0]])
+    vehicle = int(visits.vehicle[part[0]])
     region = int(rows["region"][part[0]])
     name = name_of(vehicle)
     batch = Batch(Kind.OBSERVATION, name, vehicle + 1, region, seq, 1, columns, "synthetic")

@@ -56,19 +56,19 @@ class AskedWay(NamedTuple):
 
 def ask_moments(folder: Path) -> list[AskedWay]:
     """Return the scores of the map at each of MOMENTS that the drive in `folder` reaches."""
-    o = end_to_end.observations_in(end_to_end.read_observations(folder / OBSERVATIONS))
+    observations = end_to_end.observations_in(end_to_end.read_observations(folder / OBSERVATIONS))
     visits = pq.read_table(folder / TRUTH)
-    begin = int(o.time.min())
+    begin = int(observations.time.min())
     left = visits["leave_time"].cast(pa.int64())
     fusion = Fusion(LATENESS_S)
     taken = begin - 1
     out = []
     for seconds in MOMENTS:
         until = begin + int(seconds * NS)
-        rows = np.flatnonzero((o.time > taken) & (o.time <= until))
+        rows = np.flatnonzero((observations.time > taken) & (observations.time <= until))
         if not len(rows):
             break
-        end_to_end.raised_alerts(fusion, o.take(rows))
+        end_to_end.raised_alerts(fusion, observations.take(rows))
         past = visits.filter(pc.less_equal(left, pa.scalar(until)))
         taken = until
         slots, truth = end_to_end.slots_with_truth(fusion, past)

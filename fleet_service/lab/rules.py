@@ -77,8 +77,10 @@ def vehicle_posteriors(
             gain = p / (p + std[k] ** 2)
             m += gain * (reading[k] - m)
             p *= 1.0 - gain
-        mean[who], variance[who] = m, p
-        out[k, 0], out[k, 1] = m, p
+        mean[who] = m
+        variance[who] = p
+        out[k, 0] = m
+        out[k, 1] = p
     return out
 
 
@@ -139,47 +141,50 @@ def fuse_by_rules(
                 mean[rule, cell] = (own * m0 + added * m1) / (own + added)
                 variance[rule, cell] = 1.0 / (own + added)
             k += 1
-        out[t, :, :, 0], out[t, :, :, 1] = mean, variance
+        out[t, :, :, 0] = mean
+        out[t, :, :, 1] = variance
     return out
 
 
-def recent_medians(v: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
+def recent_medians(visits: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
     """Return, for each cell, the median of the last friction values that the vehicles reported
     within MEDIAN_MIN minutes before `minute`, and its standard deviation, (cells,) each.
     """
-    recent = (v.seconds < 60.0 * minute) & (v.seconds >= 60.0 * (minute - MEDIAN_MIN))
-    rows = np.flatnonzero(np.isfinite(v.reports.reading) & recent)
-    pair = v.place[rows] * (int(v.vehicle.max(initial=0)) + 1) + v.vehicle[rows]
+    recent = (visits.seconds < 60.0 * minute) & (visits.seconds >= 60.0 * (minute - MEDIAN_MIN))
+    rows = np.flatnonzero(np.isfinite(visits.reports.reading) & recent)
+    pair = visits.place[rows] * (int(visits.vehicle.max(initial=0)) + 1) + visits.vehicle[rows]
     # Visits are in order of time, so the first one in reverse order is the newest.
     _, last = np.unique(pair[::-1], return_index=True)
     rows = rows[::-1][last]
     mean = np.full(CELLS, PRIOR_MEAN)
     std = np.full(CELLS, PRIOR_VAR**0.5)
-    for cell in np.unique(v.place[rows]).tolist():
-        readings = v.reports.reading[rows[v.place[rows] == cell]]
+    for cell in np.unique(visits.place[rows]).tolist():
+        readings = visits.reports.reading[rows[visits.place[rows] == cell]]
         mean[cell] = np.median(readings)
         std[cell] = mean[cell] * np.hypot(MEDIAN_COMMON, MEDIAN_OWN / np.sqrt(len(readings)))
     return mean, std
 
 
 def score_rules(
-    v: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
+    visits: Visits, town: Town, at: tuple[int, ...], vehicles: int, where: BoolArray | bool = True
 ) -> list[Scores]:
-    """Return the scores of the maps that the simple rules RULES compute from the visits `v`, one
-    item per rule, for the map at the minutes `at`. Cells outside the mask `where` are left out, and
-    so are cells in which no vehicle used enough grip to measure the friction.
+    """Return the scores of the maps that the simple rules RULES compute from `visits`,
+    one item per rule, for the map at the minutes `at`. Cells outside the mask `where` are left out,
+    and so are cells in which no vehicle used enough grip to measure the friction.
     """
-    sent = vehicle_posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
+    sent = vehicle_posteriors(visits.vehicle, visits.reports.reading, visits.reports.std, vehicles)
     read_times = 60.0 * np.array(at, float)
-    readings = (v.reports.reading, v.reports.std)
-    found = fuse_by_rules(v.place, v.seconds, sent, readings, read_times, CELLS)
+    readings = (visits.reports.reading, visits.reports.std)
+    found = fuse_by_rules(visits.place, visits.seconds, sent, readings, read_times, CELLS)
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
-        n = excited_vehicles(v, town, minute, vehicles)
+        n = excited_vehicles(visits, town, minute, vehicles)
         of_rules = [
             (found[k, rule, :, 0], np.sqrt(found[k, rule, :, 1])) for rule in range(_KALMAN)
         ]
-        for (mean, std), per_rule in zip([*of_rules, recent_medians(v, minute)], out, strict=True):
+        for (mean, std), per_rule in zip(
+            [*of_rules, recent_medians(visits, minute)], out, strict=True
+        ):
             half = Z_95 * std
             lower, mid, upper = (
                 np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0)

@@ -66,23 +66,25 @@ def join_scores(scores: list[Scores]) -> Scores:
     )
 
 
-def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
+def excited_vehicles(visits: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
     """Return the number of distinct excited vehicles that reported each cell before `minute` and
     after the last change of its surface, (CELLS,). An excited vehicle used enough grip to measure
     the friction.
     """
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
-    rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
+    rows = (
+        visits.excited & (visits.seconds < 60.0 * minute) & (visits.seconds >= since[visits.place])
+    )
     has_reported = np.zeros((CELLS, vehicles), bool)
-    has_reported[v.place[rows], v.vehicle[rows]] = True
+    has_reported[visits.place[rows], visits.vehicle[rows]] = True
     return np.asarray(has_reported.sum(axis=1))
 
 
-def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
+def earlier_visits(visits: Visits, until_s: float, vehicles: int) -> IntArray:
     """Return the number of visits (passages of cells) that each vehicle made before the time
     `until_s` [s], (vehicles,).
     """
-    return np.bincount(v.vehicle[v.seconds < until_s], minlength=vehicles)
+    return np.bincount(visits.vehicle[visits.seconds < until_s], minlength=vehicles)
 
 
 def of_intervals(
@@ -157,7 +159,7 @@ def crps_of(belief: FloatArray, truth: FloatArray) -> FloatArray:
 def score_snapshots(
     beliefs: Mapping[int, FloatArray],
     town: Town,
-    v: Visits,
+    visits: Visits,
     at: tuple[int, ...],
     vehicles: int,
     where: BoolArray | bool = True,
@@ -167,7 +169,7 @@ def score_snapshots(
     """
     out = []
     for minute in at:
-        n = excited_vehicles(v, town, minute, vehicles)
+        n = excited_vehicles(visits, town, minute, vehicles)
         truth = town.mu[minute]
         out.append(of_beliefs(beliefs[minute], truth, n).taken((n >= 1) & where))
     return join_scores(out)

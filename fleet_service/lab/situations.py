@@ -135,11 +135,13 @@ def backlog_fused(rng: Generator) -> float:
     place = town.draw_town(rng, 60, 0.0)
     errors = Errors.draw(rng, BACKLOG + 1)
     visits = town.drive_fleet(rng, place, errors, 60)
-    o = observations_of(rows_of(visits), visits.vehicle)
-    live = o.vehicle == BACKLOG
+    observations = observations_of(rows_of(visits), visits.vehicle)
+    live = observations.vehicle == BACKLOG
     fusion = Fusion(LATENESS_S)
-    fusion.update(o.take(live))
-    found = [fusion.update(o.take(rows)) for rows in np.array_split(np.flatnonzero(~live), 50)]
+    fusion.update(observations.take(live))
+    found = [
+        fusion.update(observations.take(rows)) for rows in np.array_split(np.flatnonzero(~live), 50)
+    ]
     late = np.concatenate([updated.late for updated in found])
     fused = np.concatenate([updated.late_by > 0 for updated in found])
     return float(fused[late].mean())
@@ -206,13 +208,14 @@ def false_alert(rng: Generator) -> bool:
         valued,
         agent.draw_reports(rng, Errors.draw(rng, n, WINTER), passes),
     )
-    o = observations_of(rows_of(visits), who)
+    observations = observations_of(rows_of(visits), who)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     raised = False
     for k in range(n):
         raised |= any(
-            alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots)
+            alert.raised
+            for alert in alerts.update(fusion.update(observations.take(np.array([k]))).slots)
         )
     return raised
 

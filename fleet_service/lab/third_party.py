@@ -134,15 +134,7 @@ def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatAr
     reports = make_reports(rng, gain_std * rng.normal(size=VEHICLES), vehicle, mu[place], excited)
     order = np.argsort(seconds, kind="stable")
     visits = Visits(seconds, vehicle, place_fixes(rng, place), mu[place], excited, reports)
-    return ForeignDrive(select_visits(visits, order), cell_numbers(CELLS)), mu
-
-
-def select_visits(v: Visits, rows: IntArray) -> Visits:
-    """Return the simulated visits with the given row numbers."""
-    reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
-    return Visits(
-        v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
-    )
+    return ForeignDrive(visits.take(order), cell_numbers(CELLS)), mu
 
 
 def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
@@ -153,9 +145,9 @@ def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, In
     drive, mu = drive_honest(rng, gain_std)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
-    o = make_observations(drive)
+    observations = make_observations(drive)
     for rows in split_by(drive.visits.seconds, STEP_S):
-        alerts.update(fusion.update(o.take(rows)).slots)
+        alerts.update(fusion.update(observations.take(rows)).slots)
     now = START + 60 * MINUTES * NS
     alerts.expire(now)
     slots = fusion.slots_of(drive.cells, np.zeros(CELLS, np.int64))
@@ -244,8 +236,8 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
     (CHANGE_CELLS,), with NEVER if the event did not occur.
     """
     drive = drive_change(rng, excitement)
-    v = drive.visits
-    o = make_observations(drive)
+    visits = drive.visits
+    observations = make_observations(drive)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     raised = np.full(CHANGE_CELLS, NEVER)
@@ -254,14 +246,14 @@ def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]
     phase = 0.0
     turned = 60.0 * MINUTES
     back = 2.0 * turned
-    for rows in split_by(v.seconds, STEP_S):
-        alerts.update(fusion.update(o.take(rows)).slots)
-        last = v.seconds[rows[-1]]
+    for rows in split_by(visits.seconds, STEP_S):
+        alerts.update(fusion.update(observations.take(rows)).slots)
+        last = visits.seconds[rows[-1]]
         if last // turned != phase:
             phase = last // turned
             passes[:] = 0
-        excited = rows[v.excited[rows] & (v.place[rows] < CHANGE_CELLS)]
-        passes += np.bincount(v.place[excited], minlength=CHANGE_CELLS)
+        excited = rows[visits.excited[rows] & (visits.place[rows] < CHANGE_CELLS)]
+        passes += np.bincount(visits.place[excited], minlength=CHANGE_CELLS)
         slots = fusion.slots_of(drive.cells[:CHANGE_CELLS], np.zeros(CHANGE_CELLS, np.int64))
         under = np.isin(slots, list(alerts.slots))
         if turned <= last < back:
@@ -310,11 +302,14 @@ def count_cold(rng: Generator) -> int:
     )
     reports = agent.draw_reports(rng, agent.Errors.draw(rng, n), passes)
     seconds = np.asarray(COLD_GAP_S * who, np.float64)
-    o = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)
+    observations = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
     for k in range(n):
-        if any(alert.raised for alert in alerts.update(fusion.update(o.take(np.array([k]))).slots)):
+        if any(
+            alert.raised
+            for alert in alerts.update(fusion.update(observations.take(np.array([k]))).slots)
+        ):
             return k + 1
     return NEVER
 

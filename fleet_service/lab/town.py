@@ -136,6 +136,17 @@ class Visits:
     def __len__(self) -> int:
         return len(self.seconds)
 
+    def take(self, rows: IntArray | BoolArray) -> Visits:
+        """Return the visits that `rows` (numbers or a mask) selects."""
+        return Visits(
+            self.seconds[rows],
+            self.vehicle[rows],
+            self.place[rows],
+            self.mu[rows],
+            self.excited[rows],
+            SimulatedReports(*(column[rows] for column in vars(self.reports).values())),
+        )
+
 
 def drive_fleet(
     rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0
@@ -182,28 +193,24 @@ def drive_fleet(
     reported_place = np.where(reported_at // LENGTH == place // LENGTH, reported_at, place)
     order = np.argsort(seconds, kind="stable")
     visits = Visits(seconds, vehicle, reported_place, mu, excited, reports)
-    return select_visits(visits, order)
+    return visits.take(order)
 
 
-def select_visits(v: Visits, rows: IntArray | BoolArray) -> Visits:
-    """Return the simulated visits that `rows` (numbers or a mask) selects."""
-    reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
-    return Visits(
-        v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports
-    )
-
-
-def claim_falsely(v: Visits, liars: BoolArray, claim: float) -> Visits:
+def claim_falsely(visits: Visits, liars: BoolArray, claim: float) -> Visits:
     """Return the visits with false reports: the vehicles that the mask `liars` (V,) selects report
     the friction `claim` with high confidence, instead of their own values.
     """
-    lying = liars[v.vehicle]
-    readings = np.where(lying, claim, v.reports.reading)
+    lying = liars[visits.vehicle]
+    readings = np.where(lying, claim, visits.reports.reading)
     reports = SimulatedReports(
         readings,
-        np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std),
-        np.where(lying, claim, v.reports.used),
-        v.reports.manoeuvre,
-        np.where(lying[:, None], agent.overconfident_likelihood(claim), v.reports.log_likelihood),
+        np.where(lying, agent.OVERCONFIDENT_STD, visits.reports.std),
+        np.where(lying, claim, visits.reports.used),
+        visits.reports.manoeuvre,
+        np.where(
+            lying[:, None], agent.overconfident_likelihood(claim), visits.reports.log_likelihood
+        ),
     )
-    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
+    return Visits(
+        visits.seconds, visits.vehicle, visits.place, visits.mu, visits.excited & ~lying, reports
+    )

@@ -103,7 +103,7 @@ def drive_cars(rng: Generator, place: Town, cars: float, demand: float) -> TownT
     )
     order = np.argsort(seconds, kind="stable")
     return TownTraffic(
-        town.select_visits(Visits(seconds, vehicle, cell, mu, excited, reports), order),
+        Visits(seconds, vehicle, cell, mu, excited, reports).take(order),
         (share >= 1.0)[order],
     )
 
@@ -121,21 +121,23 @@ def two_events(traffic: TownTraffic, seconds: float) -> BoolArray:
     """Return a mask of cells, (CELLS,): True if, within the last hour, slip controllers intervened
     twice while less grip than the slippery limit was used.
     """
-    v = traffic.visits
-    recent = (v.seconds > seconds - HOUR_S) & (v.seconds <= seconds)
-    rows = recent & traffic.limited & (v.reports.used < SLIPPERY_MU)
-    return np.asarray(np.bincount(v.place[rows], minlength=CELLS) >= 2)
+    visits = traffic.visits
+    recent = (visits.seconds > seconds - HOUR_S) & (visits.seconds <= seconds)
+    rows = recent & traffic.limited & (visits.reports.used < SLIPPERY_MU)
+    return np.asarray(np.bincount(visits.place[rows], minlength=CELLS) >= 2)
 
 
 def slippery_median(traffic: TownTraffic, seconds: float) -> BoolArray:
     """Return a mask of cells, (CELLS,): True if vehicles reported at least two friction values
     within the last hour, and their median is slippery.
     """
-    v = traffic.visits
-    rows = np.flatnonzero((v.seconds > seconds - HOUR_S) & (v.seconds <= seconds) & v.excited)
+    visits = traffic.visits
+    rows = np.flatnonzero(
+        (visits.seconds > seconds - HOUR_S) & (visits.seconds <= seconds) & visits.excited
+    )
     out = np.zeros(CELLS, np.bool_)
-    for cell in np.unique(v.place[rows]).tolist():
-        values = v.reports.reading[rows[v.place[rows] == cell]]
+    for cell in np.unique(visits.place[rows]).tolist():
+        values = visits.reports.reading[rows[visits.place[rows] == cell]]
         out[cell] = len(values) >= 2 and np.median(values) < SLIPPERY_MU
     return out
 
@@ -144,7 +146,7 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
     """Compute the map from the visits minute by minute, and read the map every STEP minutes from
     minute BEGIN on.
     """
-    o = make_observations(traffic)
+    observations = make_observations(traffic)
     fusion = Fusion(LATENESS_S, enrolled=True)
     alerts = Alerts(fusion)
     read: list[tuple[FloatArray | BoolArray, ...]] = []
@@ -152,7 +154,7 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
     for minute in range(1, MINUTES + 1):
         rows = np.arange(ends[minute - 1], ends[minute])
         if len(rows):
-            alerts.update(fusion.update(o.take(rows)).slots)
+            alerts.update(fusion.update(observations.take(rows)).slots)
         if minute < BEGIN or minute % STEP:
             continue
         now = START + minute * 60 * NS
