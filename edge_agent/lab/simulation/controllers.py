@@ -72,23 +72,25 @@ def slip_limit(p: FloatArray, i: int) -> float:
 
 
 @compiled
-def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
+def control_slip(
+    x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, dt: float
+) -> None:
     """Advance all slip controllers (ABS, traction control) in the vehicle's state `x` by `dt` [s],
-    from the wheel slips in `w` (8, 4), the vehicle's parameters `p` and its inputs `u` (6, 4).
+    from the wheel slips in `wheels` (8, 4), the vehicle's parameters `p` and its inputs `u` (6, 4).
     """
     x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
     x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
     x[Motion.ESC_LEFT] = max(x[Motion.ESC_LEFT] - dt, 0.0)
     unit = p[Parameter.MASS] * GRAVITY * p[Parameter.RADIUS]
     wheel, esc_brake_ratio = stabilise(x, p, u, dt)
-    traction_active = cut_drive(x, p, u, w, dt)
+    traction_active = cut_drive(x, p, u, wheels, dt)
     for i in range(4):
         target = esc_brake_ratio * unit if i == wheel else 0.0
-        if traction_active and spin_excess(x, p, w, i) > MUCH and u[Control.DRIVE, i] > 0.0:
+        if traction_active and spin_excess(x, p, wheels, i) > MUCH and u[Control.DRIVE, i] > 0.0:
             target = max(target, TCS_BRAKE * unit)
         step = HELD_RATE * unit * dt
         x[Motion.HELD + i] += min(max(target - x[Motion.HELD + i], -step), step)
-        modulate(x, p, u, w, i, dt)
+        modulate(x, p, u, wheels, i, dt)
     low = max(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3])
     if min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3]) > 0.0:
         low = min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3])
@@ -97,15 +99,17 @@ def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt:
 
 
 @compiled
-def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
+def modulate(
+    x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, i: int, dt: float
+) -> None:
     """Advance by `dt` [s] the limit that ABS sets to the brake torque of wheel `i`: reduce the
     limit while the wheel slips too much, otherwise hold or increase it. `x` is the vehicle's state,
-    which is changed, `p` the vehicle's parameters, `u` the inputs and `w` the forces and slips of
-    the wheels.
+    which is changed, `p` the vehicle's parameters, `u` the inputs and `wheels` the forces and slips
+    of the wheels.
     """
     demanded = u[Control.BRAKE, i] + x[Motion.HELD + i]
     limit = slip_limit(p, i)
-    slip = w[Wheel.SLIP, i]
+    slip = wheels[Wheel.SLIP, i]
     pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
     if demanded <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
         x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
@@ -124,18 +128,18 @@ def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int,
 
 
 @compiled
-def spin_excess(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
+def spin_excess(x: FloatArray, p: FloatArray, wheels: FloatArray, i: int) -> float:
     """Return the drive slip of wheel `i` divided by the slip at which traction control acts [1].
-    `x` is the vehicle's state, `p` the vehicle's parameters, and `w` contains the wheels' speeds
-    over ground.
+    `x` is the vehicle's state, `p` the vehicle's parameters, and `wheels` contains the wheels'
+    speeds over ground.
     """
-    along = w[Wheel.SPEED, i]
+    along = wheels[Wheel.SPEED, i]
     faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
     return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
 
 
 @compiled
-def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
+def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, dt: float) -> bool:
     """Cut or restore the engine torque in the vehicle's state `x` over `dt` [s], as traction
     control does.
 
@@ -144,7 +148,7 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: fl
     """
     acts = drags = False
     for i in range(4):
-        spin = spin_excess(x, p, w, i)
+        spin = spin_excess(x, p, wheels, i)
         if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (
             u[Control.DRIVE, i] < 0.0 and spin < -1.0
         ):

@@ -120,17 +120,17 @@ def ways_of(ways: IntArray, lane: int) -> int:
 
 
 @compiled
-def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
-    """Advance the route state `g` (lane and point on it) to the position of the vehicle with the
-    state `x`. At the end of a lane, the next lane is chosen at random.
+def follow(x: FloatArray, route: IntArray, lanes: Lanes, key: Key) -> float:
+    """Advance the route state `route` (lane and point on it) to the position of the vehicle with
+    the state `x`. At the end of a lane, the next lane is chosen at random.
 
     Return the distance [m] from the vehicle to the next point of the lane, at most the distance
     between two points.
     """
     points, first, size, spacing, ways = lanes
     while True:
-        lane = g[Route.LANE]
-        point = g[Route.POINT]
+        lane = route[Route.LANE]
+        point = route[Route.POINT]
         row = points[first[lane] + point]
         along = (x[Motion.X] - row[LanePoint.X]) * row[LanePoint.COS] + (
             x[Motion.Y] - row[LanePoint.Y]
@@ -138,26 +138,29 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
         if not along > 0.0:
             return float(min(-along, spacing[lane]))
         if point + 1 < size[lane]:
-            g[Route.POINT] = point + 1
+            route[Route.POINT] = point + 1
             continue
-        g[Route.LANE], g[Route.POINT] = ways[lane, g[Route.WAY]], 0
-        g[Route.TURNS] += 1
-        g[Route.WAY] = int(uniform(key, g[Route.TURNS]) * ways_of(ways, g[Route.LANE]))
+        route[Route.LANE] = ways[lane, route[Route.WAY]]
+        route[Route.POINT] = 0
+        route[Route.TURNS] += 1
+        route[Route.WAY] = int(uniform(key, route[Route.TURNS]) * ways_of(ways, route[Route.LANE]))
 
 
 @compiled
-def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
+def place_ahead(
+    driver: FloatArray, route: IntArray, lanes: Lanes, distance: float
+) -> tuple[int, float]:
     """Return the position `distance` [m] ahead of the vehicle on its route: the row of a lane point
-    in the table of points, and the metres beyond that point. `d` is the driver's state, `g` the
-    vehicle's place on the route.
+    in the table of points, and the metres beyond that point. `driver` is the driver's state,
+    `route` the vehicle's place on the route.
 
     The random choice of the route is made only one lane in advance. Beyond the end of the next
     lane, the function assumes the first continuation of each lane.
     """
     _, first, size, spacing, ways = lanes
-    lane = g[Route.LANE]
-    way = g[Route.WAY]
-    left = max(distance - d[Driver.SHORT] + g[Route.POINT] * spacing[lane], 0.0)
+    lane = route[Route.LANE]
+    way = route[Route.WAY]
+    left = max(distance - driver[Driver.SHORT] + route[Route.POINT] * spacing[lane], 0.0)
     while True:
         length = (size[lane] - 1) * spacing[lane]
         if left <= length:
@@ -169,56 +172,56 @@ def place_ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tu
 
 
 @compiled
-def budget(d: FloatArray) -> float:
-    """Return the budget q: the acceleration [m/s^2] that the driver with the state `d` is ready to
-    demand from the tyres.
+def budget(driver: FloatArray) -> float:
+    """Return the budget q: the acceleration [m/s^2] that the driver with the state `driver` is
+    ready to demand from the tyres.
     """
-    style = d[Driver.STYLE] * (
-        CAREFUL if heeds_warning(d) and d[Driver.WARNED_START] <= 0.0 else 1.0
+    style = driver[Driver.STYLE] * (
+        CAREFUL if heeds_warning(driver) and driver[Driver.WARNED_START] <= 0.0 else 1.0
     )
-    return float(min(style * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
+    return float(min(style * driver[Driver.BELIEF] * GRAVITY, driver[Driver.COMFORT]))
 
 
 @compiled
-def cruise(d: FloatArray) -> float:
-    """Return the speed that the driver with the state `d` chooses on an open road [m/s]; the speed
-    is lower where the driver believes that the road is slippery.
+def cruise(driver: FloatArray) -> float:
+    """Return the speed that the driver with the state `driver` chooses on an open road [m/s]; the
+    speed is lower where the driver believes that the road is slippery.
     """
-    return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
+    return float(driver[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * driver[Driver.BELIEF])))
 
 
 @compiled
-def update_belief(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
-    """Update the grip that the driver believes in (part of the state `d`) after `dt` [s]. This grip
-    depends on `looks`, the friction that the road ahead seems to have, and on whether wheels slide,
-    as `w` (forces and slips of the wheels) shows.
+def update_belief(driver: FloatArray, looks: float, wheels: FloatArray, dt: float) -> None:
+    """Update the grip that the driver believes in (part of the state `driver`) after `dt` [s]. This
+    grip depends on `looks`, the friction that the road ahead seems to have, and on whether wheels
+    slide, as `wheels` (forces and slips of the wheels) shows.
     """
-    lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
-    d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
+    lag = WORSE_S if looks < driver[Driver.BELIEF] else BETTER_S
+    driver[Driver.BELIEF] += (looks - driver[Driver.BELIEF]) * -math.expm1(-dt / lag)
     for i in range(4):
-        if w[Wheel.THETA, i] > SLIDING:
-            d[Driver.BELIEF] *= math.exp(-dt / ALARM_S)
+        if wheels[Wheel.THETA, i] > SLIDING:
+            driver[Driver.BELIEF] *= math.exp(-dt / ALARM_S)
             break
-    d[Driver.BELIEF] = max(d[Driver.BELIEF], LEAST_BELIEF)
+    driver[Driver.BELIEF] = max(driver[Driver.BELIEF], LEAST_BELIEF)
 
 
 @compiled
-def advance_warning(d: FloatArray, vx: float, dt: float) -> None:
-    """Advance the warning stored in the driver's state `d` by `dt` [s]: reduce the remaining
+def advance_warning(driver: FloatArray, vx: float, dt: float) -> None:
+    """Advance the warning stored in the driver's state `driver` by `dt` [s]: reduce the remaining
     reaction time by `dt`, and the distances to the stretch's start and end by `vx` * `dt`.
     """
-    if d[Driver.WARNED_END] > 0.0:
-        d[Driver.WARNED_IN] -= dt
-        d[Driver.WARNED_START] -= vx * dt
-        d[Driver.WARNED_END] -= vx * dt
+    if driver[Driver.WARNED_END] > 0.0:
+        driver[Driver.WARNED_IN] -= dt
+        driver[Driver.WARNED_START] -= vx * dt
+        driver[Driver.WARNED_END] -= vx * dt
 
 
 @compiled
-def heeds_warning(d: FloatArray) -> bool:
-    """Return True if the driver with the state `d` takes a warning into account now: there is a
-    warning, and the reaction time has passed.
+def heeds_warning(driver: FloatArray) -> bool:
+    """Return True if the driver with the state `driver` takes a warning into account now: there is
+    a warning, and the reaction time has passed.
     """
-    return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
+    return bool(driver[Driver.WARNED_END] > 0.0 and driver[Driver.WARNED_IN] <= 0.0)
 
 
 @compiled
@@ -249,7 +252,7 @@ def is_stopping(t: float, share: float, key: Key) -> bool:
 
 
 @compiled
-def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
+def warned_square(driver: FloatArray, route: IntArray, lanes: Lanes) -> float:
     """Return the square of the driver's target speed [m^2/s^2] at the start of a stretch of which
     the driver was warned.
 
@@ -257,56 +260,61 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     The other is the speed that the bends and junctions ahead allow with the grip that the warning
     announces.
     """
-    row, _ = place_ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
-    lane = g[Route.LANE]
-    stays = lanes[1][lane] <= row < lanes[1][lane] + lanes[2][lane]
-    profile = lanes[0][row, LanePoint.PROFILE + (g[Route.WAY] if stays else 0)]
+    points, first, size, _, _ = lanes
+    row = place_ahead(driver, route, lanes, max(driver[Driver.WARNED_START], 0.0))[0]
+    lane = route[Route.LANE]
+    stays = first[lane] <= row < first[lane] + size[lane]
+    profile = points[row, LanePoint.PROFILE + (route[Route.WAY] if stays else 0)]
     q = min(
-        CAREFUL * d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY,
-        d[Driver.COMFORT],
+        CAREFUL * driver[Driver.STYLE] * max(driver[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY,
+        driver[Driver.COMFORT],
     )
-    return float(max(min(d[Driver.WARNED_SPEED] ** 2, q * profile), SLOWEST**2))
+    return float(max(min(driver[Driver.WARNED_SPEED] ** 2, q * profile), SLOWEST**2))
+
+
+@compiled
+def profile_ahead(driver: FloatArray, route: IntArray, lanes: Lanes, distance: float) -> float:
+    """Return the lane's speed profile `distance` [m] ahead of the vehicle: the squared speed that
+    bends and junctions allow per unit of the driver's budget [m].
+    """
+    points, first, size, spacing, _ = lanes
+    lane = route[Route.LANE]
+    row, beyond = place_ahead(driver, route, lanes, distance)
+    last = first[lane] + size[lane] - 1
+    stays = first[lane] <= row <= last
+    column = LanePoint.PROFILE + route[Route.WAY]
+    if not stays:
+        here = points[first[lane] + route[Route.POINT], column]
+        return float(min(here, points[row, LanePoint.PROFILE]))
+    profile = points[row, column]
+    if row < last:
+        profile += (points[row + 1, column] - profile) * beyond / spacing[lane]
+    return float(profile)
 
 
 @compiled
 def wished_acceleration(
     x: FloatArray,
-    driver: tuple[FloatArray, IntArray],
+    driver_and_route: tuple[FloatArray, IntArray],
     lanes: Lanes,
     p: FloatArray,
     t: float,
     key: Key,
 ) -> float:
     """Return the longitudinal acceleration [m/s^2] that the driver demands at time `t` [s]. `x` is
-    the vehicle's state, `driver` the driver's state and place on the route, `p` the vehicle's
-    parameters, and `key` the random key of the traffic.
+    the vehicle's state, `driver_and_route` the driver's state and place on the route, `p` the
+    vehicle's parameters, and `key` the random key of the traffic.
     """
-    d, g = driver
+    driver, route = driver_and_route
     vx = x[Motion.VX]
-    q = budget(d)
+    q = budget(driver)
     reach = max(2.0, 0.5 * vx)
-    lane = g[Route.LANE]
-    row, beyond = place_ahead(d, g, lanes, reach)
-    last = lanes[1][lane] + lanes[2][lane] - 1
-    stays = lanes[1][lane] <= row <= last
-    here = lanes[0][lanes[1][lane] + g[Route.POINT], LanePoint.PROFILE + g[Route.WAY]]
-    squared_speed_ahead = (
-        lanes[0][row, LanePoint.PROFILE + g[Route.WAY]]
-        if stays
-        else min(here, lanes[0][row, LanePoint.PROFILE])
-    )
-    if stays and row < last:
-        squared_speed_ahead += (
-            (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - squared_speed_ahead)
-            * beyond
-            / lanes[3][lane]
-        )
-    aim = min(q * squared_speed_ahead, cruise(d) ** 2)
-    if heeds_warning(d):
+    aim = min(q * profile_ahead(driver, route, lanes, reach), cruise(driver) ** 2)
+    if heeds_warning(driver):
         aim = min(
             aim,
-            warned_square(d, g, lanes)
-            + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0),
+            warned_square(driver, route, lanes)
+            + 2.0 * WARNED_BRAKES * max(driver[Driver.WARNED_START] - reach, 0.0),
         )
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
@@ -314,14 +322,14 @@ def wished_acceleration(
     # Share of the driving force on the axle that drives more; this axle carries half of the weight.
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     gas = min(
-        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
+        PULL * driver[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
         0.8 * q,
         strongest_pull(p, vx) / p[Parameter.MASS],
     )
     alarm = traffic_braking(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
         wish = min(wish, -alarm * q)
-    if is_stopping(t, d[Driver.STOPS], key):
+    if is_stopping(t, driver[Driver.STOPS], key):
         wish = -STOPPING * q
     hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
     return float(min(max(wish, -max(longitudinal, LEAST_BRAKING) * hardest), longitudinal * gas))
@@ -329,15 +337,15 @@ def wished_acceleration(
 
 @compiled
 def wished_force(
-    p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float
+    p: FloatArray, driver: FloatArray, vx: float, acceleration: float, along: float
 ) -> float:
     """Return the longitudinal force [N] that a driver demands to reach an `acceleration` [m/s^2] at
-    the speed `vx` [m/s], limited by tyres and engine. `p` are the vehicle's parameters, and `d` is
-    the driver's state. `along` [m/s^2] is the acceleration by gravity along the road.
+    the speed `vx` [m/s], limited by tyres and engine. `p` are the vehicle's parameters, and
+    `driver` is the driver's state. `along` [m/s^2] is the acceleration by gravity along the road.
     """
     driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
     most = min(
-        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
+        PULL * driver[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven),
         strongest_pull(p, vx) / p[Parameter.MASS],
     )
     return float(p[Parameter.MASS] * min(acceleration - along, max(most, acceleration)))
@@ -345,17 +353,20 @@ def wished_force(
 
 @compiled
 def wished_steer(
-    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float
+    x: FloatArray, driver: FloatArray, route: IntArray, lanes: Lanes, p: FloatArray, t: float
 ) -> float:
     """Return the mean road-wheel angle [rad] with which the driver steers on a circle to a point
-    ahead. `x` is the vehicle's state, `d` the driver's state, `p` the vehicle's parameters and `g`
-    the place on the route. The angle is limited to the angles that the front tyres can follow.
+    ahead. `x` is the vehicle's state, `driver` the driver's state, `p` the vehicle's parameters and
+    `route` the place on the route. The angle is limited to the angles that the front tyres can
+    follow.
     """
     vx = max(x[Motion.VX], SLOWEST)
     base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
-    number, beyond = place_ahead(d, g, lanes, 2.5 + 0.45 * vx)
+    number, beyond = place_ahead(driver, route, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
-    offset = d[Driver.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[Driver.WOBBLE])
+    offset = driver[Driver.WOBBLE] * math.sin(
+        2.0 * math.pi * WOBBLE_HZ * t + 1e3 * driver[Driver.WOBBLE]
+    )
     dx = row[LanePoint.X] + row[LanePoint.COS] * beyond - row[LanePoint.SIN] * offset - x[Motion.X]
     dy = row[LanePoint.Y] + row[LanePoint.SIN] * beyond + row[LanePoint.COS] * offset - x[Motion.Y]
     c = math.cos(x[Motion.YAW])
@@ -374,36 +385,36 @@ def wished_steer(
 @compiled
 def drive(
     vehicle: tuple[FloatArray, FloatArray, FloatArray],
-    driver: tuple[FloatArray, IntArray],
+    driver_and_route: tuple[FloatArray, IntArray],
     world: tuple[Lanes, FloatArray],
     now: tuple[float, float, float],
     keys: tuple[Key, Key],
 ) -> None:
-    """Advance a driver's state and place on the route, `driver` = (d, g), by one sample. Afterwards
-    d[STEER] and d[FORCE] are the road-wheel angle and the force that the driver now demands.
+    """Advance a driver and the place on the route by one sample. Afterwards the driver's state
+    contains the road-wheel angle (STEER) and the force (FORCE) that the driver now demands.
 
     `vehicle` is the vehicle's state, its parameters, and the forces and slips of its wheels at the
-    last sample. `world` is the lanes and the friction table. `now` is the time [s], the length of
-    the sample [s] and the acceleration by gravity along the road [m/s^2]. `keys` are the random
-    keys of route and traffic.
+    last sample. `driver_and_route` is the driver's state and the place on the route. `world` is the
+    lanes and the friction table. `now` is the time [s], the length of the sample [s] and the
+    acceleration by gravity along the road [m/s^2]. `keys` are the random keys of route and traffic.
     """
-    x, p, w = vehicle
-    d, g = driver
+    x, p, wheels = vehicle
+    driver, route = driver_and_route
     lanes, friction = world
     t, dt, along = now
-    d[Driver.SHORT] = follow(x, g, lanes, keys[0])
-    number, _ = place_ahead(d, g, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
+    driver[Driver.SHORT] = follow(x, route, lanes, keys[0])
+    number, _ = place_ahead(driver, route, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
     point = lanes[0][number]
     looks = look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y])
-    advance_warning(d, x[Motion.VX], dt)
-    if heeds_warning(d) and d[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
-        looks = min(looks, d[Driver.WARNED_MU])
-    update_belief(d, looks, w, dt)
-    acceleration = wished_acceleration(x, driver, lanes, p, t, keys[1])
-    force = wished_force(p, d, x[Motion.VX], acceleration, along)
-    if x[Motion.VX] < RESTING and is_stopping(t, d[Driver.STOPS], keys[1]):
-        force = -p[Parameter.MASS] * (STOPPING * budget(d) + abs(along))
-    d[Driver.FORCE] += (force - d[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
-    d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(
-        -dt / ARMS_S
-    )
+    advance_warning(driver, x[Motion.VX], dt)
+    if heeds_warning(driver) and driver[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
+        looks = min(looks, driver[Driver.WARNED_MU])
+    update_belief(driver, looks, wheels, dt)
+    acceleration = wished_acceleration(x, driver_and_route, lanes, p, t, keys[1])
+    force = wished_force(p, driver, x[Motion.VX], acceleration, along)
+    if x[Motion.VX] < RESTING and is_stopping(t, driver[Driver.STOPS], keys[1]):
+        force = -p[Parameter.MASS] * (STOPPING * budget(driver) + abs(along))
+    driver[Driver.FORCE] += (force - driver[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
+    driver[Driver.STEER] += (
+        wished_steer(x, driver, route, lanes, p, t) - driver[Driver.STEER]
+    ) * -math.expm1(-dt / ARMS_S)

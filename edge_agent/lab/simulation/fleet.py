@@ -122,7 +122,7 @@ def run(
     `samples` is the index of the first sample, and the count of samples. `timing` is the sample
     period [s], and the integration steps per sample.
     """
-    vehicles, drivers, routes, wheels = states
+    vehicles, drivers, routes, all_wheels = states
     lanes, friction, relief, surface = ground
     first, steps = samples
     period, substeps = timing
@@ -130,25 +130,25 @@ def run(
     u = np.zeros((INPUTS, 4))
     for n in range(vehicles.shape[0]):
         x = vehicles[n]
-        d = drivers[n]
-        g = routes[n]
-        w = wheels[n]
+        driver = drivers[n]
+        route = routes[n]
+        wheels = all_wheels[n]
         p = parameters[n]
         for k in range(steps):
             t = (first + k) * period
-            lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
+            lane = lanes[0][lanes[1][route[Route.LANE]] + route[Route.POINT]]
             turned = -math.expm1(-abs(x[Motion.VX]) * period / TURN_OVER_M)
-            d[Driver.CROSS_SLOPE] += (
-                cross_slope(relief, lane[LanePoint.CURVATURE]) - d[Driver.CROSS_SLOPE]
+            driver[Driver.CROSS_SLOPE] += (
+                cross_slope(relief, lane[LanePoint.CURVATURE]) - driver[Driver.CROSS_SLOPE]
             ) * turned
             heading = (math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW]))
             east, north = gradient(
-                relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.CROSS_SLOPE]
+                relief, (x[Motion.X], x[Motion.Y]), heading, driver[Driver.CROSS_SLOPE]
             )
             u[Control.TILT, 0], u[Control.TILT, 1] = slope_in_body(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
-            drive((x, p, w), (d, g), (lanes, friction), now, (keys[0][n], keys[1][n]))
-            command(p, u, d[Driver.STEER], d[Driver.FORCE])
+            drive((x, p, wheels), (driver, route), (lanes, friction), now, (keys[0][n], keys[1][n]))
+            command(p, u, driver[Driver.STEER], driver[Driver.FORCE])
             if p[TrueParameter.REGENERATION] > 0.0:
                 regenerate(x, p, u)
             velocity = ground_velocity(x)
@@ -156,8 +156,8 @@ def run(
                 px, py = wheel_place(x, p, i)
                 u[Control.MU, i] = look_up(friction, PatchColumn.MU, t, px, py)
                 u[Control.SWING, i] = load_swing(surface, (px, py), velocity)
-            observe(x, p, u, w, records[k, n])
-            advance(x, p, u, w, period / substeps, substeps)
+            observe(x, p, u, wheels, records[k, n])
+            advance(x, p, u, wheels, period / substeps, substeps)
     return records
 
 
@@ -319,11 +319,12 @@ class SimulatedFleet:
         `stretch` is the start and the end of the slippery stretch as distances ahead [m]; (0, 0)
         cancels the warning. `speed` [m/s] is the advised speed and `mu` the friction to expect.
         """
-        d = self._states[1][k]
-        if d[Driver.WARNED_END] <= 0.0:
-            d[Driver.WARNED_IN] = TOLD_S
-        d[Driver.WARNED_START], d[Driver.WARNED_END] = stretch
-        d[Driver.WARNED_SPEED], d[Driver.WARNED_MU] = speed, mu
+        driver = self._states[1][k]
+        if driver[Driver.WARNED_END] <= 0.0:
+            driver[Driver.WARNED_IN] = TOLD_S
+        driver[Driver.WARNED_START], driver[Driver.WARNED_END] = stretch
+        driver[Driver.WARNED_SPEED] = speed
+        driver[Driver.WARNED_MU] = mu
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:

@@ -167,8 +167,8 @@ def relax_slip(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
 
 
 @compiled
-def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
-    """Write loads, forces, slips and torques of the wheels to `w` (8, 4), for the state `x`,
+def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray) -> None:
+    """Write loads, forces, slips and torques of the wheels to `wheels` (8, 4), for the state `x`,
     parameters `p` and inputs `u` (6, 4).
     """
     loads = wheel_loads(body_of(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
@@ -210,25 +210,31 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         secant = curve / theta if theta > TINY else 1.0
         pull = secant * u[Control.MU, i] * load
         drive, brake = wheel_torques(x, p, u, i, raw_slip)
-        w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
-        w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, raw_slip, theta
-        w[Wheel.SLOPE, i] = secant * slope_x * load * radius / max(abs(along), SLOWEST_M_S)
+        wheels[Wheel.FX, i] = pull * theta_x
+        wheels[Wheel.FY, i] = pull * theta_y
+        wheels[Wheel.FZ, i] = load
+        wheels[Wheel.SPEED, i] = along
+        wheels[Wheel.SLIP, i] = raw_slip
+        wheels[Wheel.THETA, i] = theta
+        wheels[Wheel.SLOPE, i] = secant * slope_x * load * radius / max(abs(along), SLOWEST_M_S)
         if p[TrueParameter.RELAXATION] > 0.0:
-            w[Wheel.SLOPE, i] *= DIRECT
-        w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
+            wheels[Wheel.SLOPE, i] *= DIRECT
+        wheels[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
 @compiled
 def body_accelerations(
-    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray
+    x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray
 ) -> tuple[float, float, float]:
     """Return (a_x, a_y) that an accelerometer at the centre of gravity measures [m/s^2], and the
     yaw acceleration [rad/s^2].
 
-    `x`, `p` and `u` are state, parameters and inputs of the vehicle. `w` (8, 4) is the array of
-    wheel data that `wheel_forces` has filled for this state.
+    `x`, `p` and `u` are state, parameters and inputs of the vehicle. `wheels` (8, 4) is the array
+    of wheel data that `wheel_forces` has filled for this state.
     """
-    ax, ay, yaw_acceleration = planar_accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
+    ax, ay, yaw_acceleration = planar_accelerations(
+        p, wheels[Wheel.FX], wheels[Wheel.FY], u[Control.STEER]
+    )
     return (
         ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[Parameter.MASS],
         ay,
@@ -241,7 +247,7 @@ def turn_wheels(
     x: FloatArray,
     p: FloatArray,
     u: FloatArray,
-    w: FloatArray,
+    wheels: FloatArray,
     dt: float,
     change: tuple[float, float],
 ) -> None:
@@ -250,31 +256,33 @@ def turn_wheels(
     stable. The wheels of a locked rear axle turn as one.
 
     `change` contains dv_x/dt [m/s^2] and the yaw acceleration [rad/s^2]. The function computes from
-    it how much each wheel's speed over the ground changes. `w` (8, 4) is the array of wheel data
-    that `wheel_forces` has filled for this state.
+    it how much each wheel's speed over the ground changes. `wheels` (8, 4) is the array of wheel
+    data that `wheel_forces` has filled for this state.
     """
     gain, yaw_acceleration = change
     for i in range(4):
         radius = rolling_radius(p, u, i)
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
         omega = x[Motion.OMEGA + i]
-        slip = abs(w[Wheel.SLIP, i])
+        slip = abs(wheels[Wheel.SLIP, i])
         slow = max(abs(omega), STANDING)
-        resistance = p[TrueParameter.ROLLING] * radius * w[Wheel.FZ, i] * omega / slow
+        resistance = p[TrueParameter.ROLLING] * radius * wheels[Wheel.FZ, i] * omega / slow
         excess = (
-            w[Wheel.TORQUE, i]
+            wheels[Wheel.TORQUE, i]
             - resistance
-            - radius * w[Wheel.FX, i]
-            + dt * w[Wheel.SLOPE, i] * ground
+            - radius * wheels[Wheel.FX, i]
+            + dt * wheels[Wheel.SLOPE, i] * ground
         )
-        damping = radius * w[Wheel.SLOPE, i]
+        damping = radius * wheels[Wheel.SLOPE, i]
         smooth = p[TrueParameter.ABS_HZ] <= 0.0
         if smooth and slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
-            demanded_torque = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
+            demanded_torque = (
+                u[Control.DRIVE, i] if wheels[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
+            )
             damping += (
                 demanded_torque
                 * radius
-                / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+                / (max(abs(wheels[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
             )
         if abs(omega) < BRAKED:
             damping += u[Control.BRAKE, i] / BRAKED
@@ -320,27 +328,27 @@ def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> N
 
 @compiled
 def advance(
-    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int
+    x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, dt: float, substeps: int
 ) -> None:
     """Advance the state `x` of the simulated vehicle by `substeps` integration steps of `dt` [s]
-    with parameters `p` and constant inputs `u`. `w` (8, 4) is scratch memory for forces and slips
-    of the wheels.
+    with parameters `p` and constant inputs `u`. `wheels` (8, 4) is scratch memory for forces and
+    slips of the wheels.
     """
     along, across, _ = gravity(u)
     for _ in range(substeps):
         if is_held(x, p, u):
             settle_standing(x, p, u, dt)
             continue
-        wheel_forces(x, p, u, w)
-        ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
+        wheel_forces(x, p, u, wheels)
+        ax, ay, yaw_acceleration = body_accelerations(x, p, u, wheels)
         vx = x[Motion.VX]
         vy = x[Motion.VY]
         r = x[Motion.YAW_RATE]
-        turn_wheels(x, p, u, w, dt, (ax + r * vy + along, yaw_acceleration))
+        turn_wheels(x, p, u, wheels, dt, (ax + r * vy + along, yaw_acceleration))
         if p[TrueParameter.RELAXATION] > 0.0:
             relax_slip(x, p, u, dt)
         if p[TrueParameter.ABS_HZ] > 0.0:
-            control_slip(x, p, u, w, dt)
+            control_slip(x, p, u, wheels, dt)
         c = math.cos(x[Motion.YAW] + 0.5 * dt * r)
         s = math.sin(x[Motion.YAW] + 0.5 * dt * r)
         x[Motion.X] += dt * (c * vx - s * vy)

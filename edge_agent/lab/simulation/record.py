@@ -48,45 +48,39 @@ RECORD: Final = 39
 
 
 @compiled
-def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
+def observe(
+    x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, record: FloatArray
+) -> None:
     """Fill `record` (RECORD,) with the true values of the vehicle at this instant, from its state
-    `x`, parameters `p` and inputs `u`. The function also fills `w`, the forces and slips of the
-    wheels.
+    `x`, parameters `p` and inputs `u`. The function also fills `wheels`, the forces and slips of
+    the wheels.
     """
-    wheel_forces(x, p, u, w)
-    ax, ay, _ = body_accelerations(x, p, u, w)
-    record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
+    wheel_forces(x, p, u, wheels)
+    ax, ay, _ = body_accelerations(x, p, u, wheels)
+    record[RecordColumn.AX] = ax
+    record[RecordColumn.AY] = ay
     record[RecordColumn.AX_FELT] = ax + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
     record[RecordColumn.AY_FELT] = ay + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
-    record[RecordColumn.YAW_RATE], record[RecordColumn.VX], record[RecordColumn.VY] = (
-        x[Motion.YAW_RATE],
-        x[Motion.VX],
-        x[Motion.VY],
-    )
-    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = (
-        x[Motion.X],
-        x[Motion.Y],
-        x[Motion.YAW],
-    )
+    record[RecordColumn.YAW_RATE] = x[Motion.YAW_RATE]
+    record[RecordColumn.VX] = x[Motion.VX]
+    record[RecordColumn.VY] = x[Motion.VY]
+    record[RecordColumn.X] = x[Motion.X]
+    record[RecordColumn.Y] = x[Motion.Y]
+    record[RecordColumn.YAW] = x[Motion.YAW]
     for i in range(4):
-        (
-            record[RecordColumn.DELTA + i],
-            record[RecordColumn.OMEGA + i],
-            record[RecordColumn.TORQUE + i],
-        ) = (
-            u[Control.STEER, i],
-            x[Motion.OMEGA + i],
-            w[Wheel.TORQUE, i],
-        )
+        record[RecordColumn.DELTA + i] = u[Control.STEER, i]
+        record[RecordColumn.OMEGA + i] = x[Motion.OMEGA + i]
+        record[RecordColumn.TORQUE + i] = wheels[Wheel.TORQUE, i]
         record[RecordColumn.MU + i] = u[Control.MU, i]
-        record[RecordColumn.UTILISATION + i] = math.hypot(w[Wheel.FX, i], w[Wheel.FY, i]) / (
-            u[Control.MU, i] * w[Wheel.FZ, i]
-        )
-        record[RecordColumn.THETA + i] = w[Wheel.THETA, i]
+        record[RecordColumn.UTILISATION + i] = math.hypot(
+            wheels[Wheel.FX, i], wheels[Wheel.FY, i]
+        ) / (u[Control.MU, i] * wheels[Wheel.FZ, i])
+        record[RecordColumn.THETA + i] = wheels[Wheel.THETA, i]
     record[RecordColumn.ABS] = 1.0 if x[Motion.ABS_LEFT] > 0.0 else 0.0
     record[RecordColumn.TCS] = 1.0 if x[Motion.TCS_LEFT] > 0.0 else 0.0
     record[RecordColumn.ESC] = 1.0 if x[Motion.ESC_LEFT] > 0.0 else 0.0
-    record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
+    record[RecordColumn.SLOPE] = u[Control.TILT, 0]
+    record[RecordColumn.BANK] = u[Control.TILT, 1]
     if is_held(x, p, u):
         _observe_held(x, p, u, record)
 
@@ -97,7 +91,8 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
     tyres then balance the force of the slope.
     """
     along, across, share = gravity(u)
-    record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
+    record[RecordColumn.AX] = -along
+    record[RecordColumn.AY] = -across
     record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
     record[RecordColumn.AY_FELT] = -across + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
     record[RecordColumn.YAW_RATE] = record[RecordColumn.VX] = record[RecordColumn.VY] = 0.0
