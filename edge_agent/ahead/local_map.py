@@ -95,7 +95,8 @@ def belief_of(
         shares = np.insert(f[k], at, min(max(slippery[k], below), above))
         knots += np.arange(6) * 1e-9  # makes the knots strictly increasing, as `interp` requires
         upto = np.interp(mugrid.EDGES, knots, shares, left=0.0, right=1.0)
-        upto[0], upto[-1] = 0.0, 1.0
+        upto[0] = 0.0
+        upto[-1] = 1.0
         out[k] = np.diff(upto)
     return out
 

@@ -116,7 +116,9 @@ class MapPrior:
         return out
 
     def _enter_place(self, k: int, key: int, belief: FloatArray | None) -> None:
-        before, self._map[k], self._key[k] = self._map[k], belief, key
+        before = self._map[k]
+        self._map[k] = belief
+        self._key[k] = key
         self._wrong[k] = self._found[k] = SHARE + KEPT * (self._found[k] - SHARE)
         if belief is None:
             return

@@ -141,7 +141,9 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
     fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude = signals[..., S.LATITUDE]
     longitude = signals[..., S.LONGITUDE]
-    fixes["latitude"], fixes["longitude"], fixes["yaw"] = latitude, longitude, signals[..., S.YAW]
+    fixes["latitude"] = latitude
+    fixes["longitude"] = longitude
+    fixes["yaw"] = signals[..., S.YAW]
     is_located = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
     fixes["cell"] = NOWHERE
     fixes["cell"][is_located] = cell = grid.cell_of(latitude[is_located], longitude[is_located])
@@ -224,7 +226,8 @@ def _advance_tracks(
             heading = track.yaw if now - track.yaw_time <= FIX_HELD_S else track.course
             held = now - track.fix_time <= FIX_HELD_S
             if held:
-                located.latitude[k, n], located.longitude[k, n] = track.latitude, track.longitude
+                located.latitude[k, n] = track.latitude
+                located.longitude[k, n] = track.longitude
                 located.yaw[k, n] = heading
             if not held and track.cell != NOWHERE:
                 track.cell = NOWHERE
@@ -239,4 +242,5 @@ def _advance_tracks(
                 located.closes[k, n] = True
             located.inside[k, n] = fix.cell != NOWHERE and fix.cell == track.cell
             located.outside[k, n] = fix.cell != NOWHERE and fix.cell != track.cell
-            located.cell[k, n], located.sector[k, n] = track.cell, track.sector
+            located.cell[k, n] = track.cell
+            located.sector[k, n] = track.sector

@@ -201,7 +201,9 @@ def _scan_fields(scan: _Scan, ends: IntArray, first: int) -> None:
             fine = fine and (
                 count == n * layout.per_record[column] or (count == 0 and not layout.needed[column])
             )
-        out.understood[k], out.sizes[k], at = fine, n, end
+        out.understood[k] = fine
+        out.sizes[k] = n
+        at = end
 
 
 @refcount_free
@@ -226,7 +228,8 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
     if wire != _RUN or at < 0 or not 0 <= length <= end - at:
         return -1
     if role < _COLUMN:
-        out.texts[k, role - _TEXT, 0], out.texts[k, role - _TEXT, 1] = at, at + length
+        out.texts[k, role - _TEXT, 0] = at
+        out.texts[k, role - _TEXT, 1] = at + length
         for position in range(at, at + length):
             if scan.strict and data[position] >= 128:
                 return -1
@@ -245,7 +248,8 @@ def _scan_field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) ->
             if position < 0 or not -(1 << 31) <= value < 1 << 31:
                 return -1
             count += 1
-    out.begins[k, column], out.counts[k, column] = at, count
+    out.begins[k, column] = at
+    out.counts[k, column] = count
     return at + length
 
 

@@ -185,7 +185,8 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
         (S.LONGITUDE, 1, (sensors.position[0] * east, 0.0)),
         (S.YAW, 1, (sensors.yaw[0], 0.0)),
     ):
-        white[first : first + count], offset[first : first + count] = std, bias
+        white[first : first + count] = std
+        offset[first : first + count] = bias
     rng = np.random.default_rng([seed, index, OFFSET_STREAM])
     gain = np.ones(len(CHANNELS))
     gain[S.TORQUE : S.TORQUE + 4] += rng.normal(0.0, sensors.torque[1])

@@ -73,7 +73,8 @@ def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) ->
     [deg].
     """
     wkb = np.zeros(len(longitude), _POINT)
-    wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
+    wkb["order"] = _LITTLE_ENDIAN
+    wkb["type"] = _TYPE_POINT
     wkb["xy"] = np.stack([longitude, latitude], axis=1)
     return _add_geo_metadata(
         table, _binary_array(wkb), "Point", (longitude, latitude, longitude, latitude)
@@ -140,12 +141,10 @@ def _wkb_polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
     k).
     """
     wkb = np.zeros(len(x), _ring_dtype(x.shape[1] + 1))
-    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = (
-        _LITTLE_ENDIAN,
-        _TYPE_POLYGON,
-        1,
-        x.shape[1] + 1,
-    )
+    wkb["order"] = _LITTLE_ENDIAN
+    wkb["type"] = _TYPE_POLYGON
+    wkb["rings"] = 1
+    wkb["points"] = x.shape[1] + 1
     corners = np.stack([x, y], axis=2)
     wkb["xy"] = np.concatenate([corners, corners[:, :1]], axis=1)
     return wkb
