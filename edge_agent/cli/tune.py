@@ -13,7 +13,7 @@ import importlib.util
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -138,20 +138,21 @@ def _run_comparison(args: argparse.Namespace, ants: int, iterations: int) -> int
     duration = QUICK_DURATION_S if args.quick else DURATION_S
     chosen = args.objective or ("predictive" if args.log else "interval")
     train, held_out = _tuning_drives(args, chosen, duration)
-    print_line(
+    print_flushed(
         f"{len(train.vehicles)} drives for the search, {len(held_out.vehicles)} held out, "
         f"{duration:g} s each"
     )
     objective = objective_on(train, ESTIMATOR, chosen)
     # Load the compiled filter now, so that the first iteration takes as long as the others.
     objective(Memberships().to_vector())
-    results = [
+    repeats = [
         _run_searches(objective, ants, iterations, args.seed + k) for k in range(args.repeats)
     ]
-    results_of = {way: [result[way] for result in results] for way in WAYS[1:]}
-    best = {"default": Memberships()}
-    for way, repeats in results_of.items():
-        best[way] = Memberships.from_vector(max(repeats, key=lambda result: result.value).best)
+    results = {way: [repeat[way] for repeat in repeats] for way in WAYS[1:]}
+    best = {"default": Memberships()} | {
+        way: Memberships.from_vector(max(found, key=lambda result: result.value).best)
+        for way, found in results.items()
+    }
     scores = {
         way: SplitScores(
             train=_score_memberships(best[way], train),
@@ -161,34 +162,39 @@ def _run_comparison(args: argparse.Namespace, ants: int, iterations: int) -> int
     }
     print(comparison_table(scores))
     winner = max(WAYS, key=lambda way: _search_worth(scores[way].held_out, chosen))
-    evaluations = {
-        way: sum(result.evaluations for result in repeats) for way, repeats in results_of.items()
-    }
-    command = " ".join(
+    budget = Budget(ants=ants, iterations=iterations, evaluations=_count_evaluations(results))
+    document = Document(
+        estimator=ESTIMATOR,
+        memberships=best[winner].to_json(),
+        objective=chosen,
+        winner=winner,
+        scores=scores,
+        candidates={
+            way: [Memberships.from_vector(result.best).to_json() for result in found]
+            for way, found in results.items()
+        },
+        provenance=_make_provenance(_comparison_command(args, budget, chosen), args.seed, budget),
+    )
+    save_tuned(args.out, document)
+    print(f"wrote {args.out}: the sets found by {winner}")
+    return 0
+
+
+def _comparison_command(args: argparse.Namespace, budget: Budget, objective: str) -> str:
+    """Return the command line that repeats the comparison of searches."""
+    return " ".join(
         [
-            f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations}",
-            f"--repeats {args.repeats} --objective {chosen}",
+            f"edge-agent tune --seed {args.seed} --ants {budget.ants}",
+            f"--iterations {budget.iterations} --repeats {args.repeats} --objective {objective}",
             *(["--quick"] if args.quick else []),
             *(log.name for log in args.log),
         ]
     )
-    document = _make_document(
-        best[winner],
-        chosen,
-        scores,
-        _make_provenance(
-            command,
-            args.seed,
-            Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        ),
-    )
-    candidates = {
-        way: [Memberships.from_vector(result.best).to_json() for result in repeats]
-        for way, repeats in results_of.items()
-    }
-    save_tuned(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
-    print(f"wrote {args.out}: the sets found by {winner}")
-    return 0
+
+
+def _count_evaluations(results: Mapping[str, Sequence[Result]]) -> dict[str, int]:
+    """Return the number of evaluations of the objective by all searches of each kind."""
+    return {way: sum(result.evaluations for result in found) for way, found in results.items()}
 
 
 def _tuning_drives(
@@ -254,7 +260,7 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         positions=POSITIONS,
         seeds=seeds,
         duration_s=QUICK_DURATION_S if args.quick else STUDY_DURATION_S,
-        reporter=lambda way: progress_printer(way, iterations, time.monotonic, print_line),
+        reporter=lambda way: progress_printer(way, iterations, time.monotonic, print_flushed),
     )
     listed = study_report.figures(done)
     title = "edge-agent tune --study" + " --quick" * args.quick
@@ -264,25 +270,19 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     study_report.draw(listed, ants, args.study / "convergence.png")
     names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
     scores = {way: SplitScores(**study_report.scores(done, name)) for way, name in names.items()}
-    evaluations = {
-        way: sum(result.evaluations for result in results) for way, results in done.found.items()
-    }
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     )
-    document = _make_document(
-        done.best("colony"),
-        "innovation",
-        scores,
-        _make_provenance(
-            command + " --quick" * args.quick,
-            args.seed,
-            Budget(ants=ants, iterations=iterations, evaluations=evaluations),
-        ),
-        "paper-aco-fckf",
+    budget = Budget(ants=ants, iterations=iterations, evaluations=_count_evaluations(done.found))
+    document = Document(
+        estimator="paper-aco-fckf",
+        memberships=done.best("colony").to_json(),
+        objective="innovation",
+        scores=scores,
+        provenance=_make_provenance(command + " --quick" * args.quick, args.seed, budget),
     )
     save_tuned(args.study / "paper-aco-fckf.json", document)
-    print_line(text)
+    print_flushed(text)
     return 0
 
 
@@ -301,12 +301,12 @@ def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -
             ants=ants,
             iterations=iterations,
             rng=np.random.default_rng([seed, stream]),
-            progress=progress_printer(way, iterations, time.monotonic, print_line),
+            progress=progress_printer(way, iterations, time.monotonic, print_flushed),
         )
     return results
 
 
-def print_line(line: str) -> None:
+def print_flushed(line: str) -> None:
     """Print a line and flush it, so that it appears immediately in a pipe too."""
     print(line, flush=True)
 
@@ -345,22 +345,6 @@ def _make_provenance(command: str, seed: int, budget: Budget) -> Provenance:
     return Provenance.model_validate(
         {name: header[name] for name in ("date", "commit", "machine", "versions")}
         | {"command": command, "seed": seed, "budget": budget}
-    )
-
-
-def _make_document(
-    memberships: Memberships,
-    objective: str,
-    scores: dict[str, SplitScores],
-    provenance: Provenance,
-    estimator: str = ESTIMATOR,
-) -> Document:
-    return Document(
-        estimator=estimator,
-        memberships=memberships.to_json(),
-        objective=objective,
-        scores=scores,
-        provenance=provenance,
     )
 
 
