@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.estimators import federated_ckf
+from edge_agent.estimators import Estimates, federated_ckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
 from edge_agent.estimators.literal.federated_friction import AS_PRINTED, FederatedSetting, estimate
 from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
@@ -23,6 +23,7 @@ from edge_agent.lab.evaluation.papers.outcome import (
     PaperTable,
     PlotPanel,
     Reproduction,
+    Values,
 )
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from schemas.numeric import FloatArray
@@ -69,89 +70,111 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
         "000", "Joint federated cubature filters for motion and friction", federated_ckf.ELEMENTS
     )
     batch, mu = _run_friction(MATCHED[SCENARIO], AS_PRINTED)
+    joint_batch, joint = without_noise(
+        MATCHED[SCENARIO], lambda vehicles: federated_ckf.make_bank(vehicles, PROPORTIONAL)
+    )
+    done.tables = [
+        _printed_filter_table(batch, mu),
+        _joint_filter_table(means(joint_batch, joint), seeds),
+    ]
+    done.plots = [_state_plot(batch, mu, joint), _signal_plot(batch), _path_plot(batch)]
+    done.notes = list(NOTES)
+    return done
+
+
+def _printed_filter_table(batch: DriveSet, mu: FloatArray) -> PaperTable:
+    """Return the table about the friction filter as printed. `mu` (T, 4) is its estimate for the
+    drive with matched conditions, `batch`.
+    """
     first, after = seconds_near(batch, mu.mean(axis=1))
     own_batch, own_mu = _run_friction(PAPERS[SCENARIO], AS_PRINTED)
     own_first, own_after = seconds_near(own_batch, own_mu.mean(axis=1))
     similar_batch, similar_mu = _run_friction(
         MATCHED["000.jump.similarity"], AS_PRINTED._replace(proportional=False)
     )
-    joint_batch, joint = without_noise(
-        MATCHED[SCENARIO], lambda vehicles: federated_ckf.make_bank(vehicles, PROPORTIONAL)
+    _, similar_after = seconds_near(similar_batch, similar_mu.mean(axis=1))
+    return PaperTable(
+        "Figure 5(d): friction filter as printed, motion given",
+        (
+            PaperRow(
+                "seconds_to_within_0.1",
+                "from the start to μ within .1 [s]",
+                3.0,
+                first,
+                own_first,
+                bar=3.2,
+                shown="about 3",
+            ),
+            PaperRow(
+                "seconds_after_the_change",
+                "from the change to μ within .1 [s]",
+                NONE,
+                after,
+                own_after,
+                bar=3.0,
+                shown="a short time",
+            ),
+            PaperRow(
+                "similarity.mae_mu",
+                "stiffness does not depend on μ, in plant and filter: MAE μ",
+                NONE,
+                float(np.abs(similar_mu.mean(axis=1) - similar_batch.mu[:, 0]).mean()),
+            ),
+            PaperRow(
+                "similarity.seconds_after_the_change",
+                "stiffness does not depend on μ, from the change to μ within .1 [s]",
+                NONE,
+                similar_after,
+            ),
+        ),
     )
-    matched = means(joint_batch, joint)
+
+
+def _joint_filter_table(matched: Values, seeds: Sequence[int]) -> PaperTable:
+    """Return the table about the project's joint filter. `matched` has its mean errors under
+    matched conditions; `seeds` are the seeds of the drives with ordinary sensors.
+    """
     own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.make_bank))
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
-    never = seconds_near(similar_batch, similar_mu.mean(axis=1))
-    done.tables = [
-        PaperTable(
-            "Figure 5(d): friction filter as printed, motion given",
-            (
+    return PaperTable(
+        "Joint filter of the project with the printed tyre",
+        (
+            PaperRow(
+                "coverage90",
+                "coverage of the 90 % interval of μ",
+                NONE,
+                matched["coverage90"],
+                own["coverage90"],
+                real["coverage90"],
+                default["coverage90"],
+                bar=0.88,
+                better="more",
+            ),
+            *(
                 PaperRow(
-                    "seconds_to_within_0.1",
-                    "from the start to μ within .1 [s]",
-                    3.0,
-                    first,
-                    own_first,
-                    bar=3.2,
-                    shown="about 3",
-                ),
-                PaperRow(
-                    "seconds_after_the_change",
-                    "from the change to μ within .1 [s]",
+                    f"mae_{key}",
+                    f"MAE {name}",
                     NONE,
-                    after,
-                    own_after,
-                    bar=3.0,
-                    shown="a short time",
-                ),
-                PaperRow(
-                    "similarity.mae_mu",
-                    "stiffness does not depend on μ, in plant and filter: MAE μ",
-                    NONE,
-                    float(np.abs(similar_mu.mean(axis=1) - similar_batch.mu[:, 0]).mean()),
-                ),
-                PaperRow(
-                    "similarity.seconds_after_the_change",
-                    "stiffness does not depend on μ, from the change to μ within .1 [s]",
-                    NONE,
-                    never[1],
-                ),
+                    matched[f"mae_{key}"],
+                    own[f"mae_{key}"],
+                    real[f"mae_{key}"],
+                    default[f"mae_{key}"],
+                )
+                for name, key in (
+                    ("μ", "mu"),
+                    ("v_x [m/s]", "vx"),
+                    ("v_y [m/s]", "vy"),
+                    ("β [rad]", "beta"),
+                )
             ),
         ),
-        PaperTable(
-            "Joint filter of the project with the printed tyre",
-            (
-                PaperRow(
-                    "coverage90",
-                    "coverage of the 90 % interval of μ",
-                    NONE,
-                    matched["coverage90"],
-                    own["coverage90"],
-                    real["coverage90"],
-                    default["coverage90"],
-                    bar=0.88,
-                    better="more",
-                ),
-                *(
-                    PaperRow(
-                        f"mae_{key}",
-                        f"MAE {name}",
-                        NONE,
-                        matched[f"mae_{key}"],
-                        own[f"mae_{key}"],
-                        real[f"mae_{key}"],
-                        default[f"mae_{key}"],
-                    )
-                    for name, key in (
-                        ("μ", "mu"),
-                        ("v_x [m/s]", "vx"),
-                        ("v_y [m/s]", "vy"),
-                        ("β [rad]", "beta"),
-                    )
-                ),
-            ),
-        ),
-    ]
+    )
+
+
+def _state_plot(batch: DriveSet, mu: FloatArray, joint: Estimates) -> PaperPlot:
+    """Return the plot of the motion estimated by the joint filter, and of the friction `mu` (T, 4)
+    estimated by the printed filter.
+    """
     truth = batch.truth
     t = batch.t[:, 0]
     beta = np.arctan2(truth["true_vy"], truth["true_vx"])[:, 0]
@@ -175,18 +198,12 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     )
     true_mu = Curve("true, mean", t, batch.mu[:, 0], "truth")
     panels.append(PlotPanel("(d) as printed", "t [s]", "μ", (true_mu, *wheels), (0.0, 1.2)))
-    done.plots = [
-        PaperPlot(
-            "states",
-            "Figure 5: motion by the joint filter, friction by the printed filter",
-            tuple(panels),
-            2,
-        ),
-        _signal_plot(batch),
-        _path_plot(batch),
-    ]
-    done.notes = list(NOTES)
-    return done
+    return PaperPlot(
+        "states",
+        "Figure 5: motion by the joint filter, friction by the printed filter",
+        tuple(panels),
+        2,
+    )
 
 
 NOTES: Final = (
