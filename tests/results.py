@@ -179,19 +179,19 @@ TABLES: Final = (
         "The papers' figures: printed, of our implementation, with realistic sensors, and of the "
         "default estimator with realistic sensors",
         re.compile(f"({'|'.join(map(re.escape, printed.names()))})$"),
-        report.table,
+        report.paper_table,
     ),
     Table(
         "edge",
         "All estimators on rough drives in hilly towns",
         re.compile(r"world\."),
-        report.world,
+        report.world_table,
     ),
     Table(
         "edge",
         "Sensor faults",
         re.compile(r"faults\..*\.(told|finite|coverage90|aco-fckf\.(width|rmse_vx|rmse_vy))$"),
-        report.faults,
+        report.fault_table,
     ),
     Table(
         "fleet",

@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
 def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.bars import figures as figures_of
     from edge_agent.lab.evaluation.campaign import run_campaign
-    from edge_agent.lab.evaluation.report import report
+    from edge_agent.lab.evaluation.report import evaluation_report
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write
 
@@ -115,7 +115,7 @@ def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
     figures = figures_of(results, quick=args.quick)
     name = "edge-agent evaluate" + (" --quick" if args.quick else "")
     write(args.out / "figures.json", name, list(seeds), figures)
-    text = report(figures, seeds=count)
+    text = evaluation_report(figures, seeds=count)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     if not args.no_plots:
         from edge_agent.lab.evaluation.plots import draw

@@ -96,7 +96,7 @@ FRICTION: Final = (
 SHOWN_LEVELS: Final = LEVELS[::2]
 
 
-def report(figures: Sequence[Figure], *, seeds: int) -> str:
+def evaluation_report(figures: Sequence[Figure], *, seeds: int) -> str:
     """Return the complete evaluation report as Markdown."""
     by_name = {figure.name: figure.value for figure in figures}
     barred = [figure for figure in figures if figure.bar is not None]
@@ -105,32 +105,32 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
         f"# Evaluation\n\n{held} of {len(barred)} bars hold; mean over {seeds} seeds.",
         markdown(barred),
         PAPERS_HEAD,
-        table(by_name),
+        paper_table(by_name),
         WHY_NOT.rstrip(),
         OWN_HEAD,
-        own_plants(barred, by_name),
+        own_plants_table(barred, by_name),
         ORACLE_HEAD,
-        oracles(barred, by_name),
+        oracle_table(barred, by_name),
         WORLD_HEAD,
-        world(by_name),
+        world_table(by_name),
         VEHICLES_HEAD,
-        scenarios(
+        scenario_table(
             by_name, "real.default.", ("coverage90", "width", "mae_mu", "rmse_vx", "rmse_vy")
         ),
         FAULTS_HEAD,
-        faults(by_name),
+        fault_table(by_name),
         CONSISTENCY_HEAD,
-        consistency(by_name),
-        reliability(by_name),
+        consistency_table(by_name),
+        reliability_table(by_name),
         ALL_HEAD,
-        scenarios(
+        scenario_table(
             by_name, "real.", ("rmse_vx", "rmse_vy", "mae_mu", "coverage90", "width", "nees", "nis")
         ),
     )
     return "\n\n".join(parts) + "\n"
 
 
-def table(values: dict[str, float]) -> str:
+def paper_table(values: dict[str, float]) -> str:
     """Return a Markdown table that compares the numbers printed in the papers with the results of
     this evaluation, `values` by name.
     """
@@ -141,19 +141,23 @@ def table(values: dict[str, float]) -> str:
             row.real.replace("ESTIMATOR", OWN[row.paper]),
             row.real.replace("ESTIMATOR", DEFAULT),
         )
-        rows.append([row.paper, row.what, row.value, *(number(values, name) for name in cells)])
-    return grid(("paper", "figure", "printed", "ours", "realistic", "default, realistic"), rows)
+        rows.append(
+            [row.paper, row.what, row.value, *(format_value(values, name) for name in cells)]
+        )
+    return markdown_table(
+        ("paper", "figure", "printed", "ours", "realistic", "default, realistic"), rows
+    )
 
 
-def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table with the column titles `head` and the given rows of cells."""
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
-def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
-    """Return the mean of the figure (named number) `name` as text for the report. With `spread`, "±
-    standard deviation" is added if the standard deviation is known. If the figure was not measured,
-    return a dash.
+def format_value(values: dict[str, float], name: str, *, spread: bool = True) -> str:
+    """Return the mean of the figure `name` as text for the report. With `spread`, "± standard
+    deviation" is added if the standard deviation is known. If the figure was not measured, return a
+    dash.
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
@@ -164,7 +168,7 @@ def number(values: dict[str, float], name: str, *, spread: bool = True) -> str:
     )
 
 
-def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
+def own_plants_table(barred: Sequence[Figure], values: dict[str, float]) -> str:
     """Return a Markdown table of the results for paper 004 that have a target: the value under the
     paper's conditions, and the values with the simulator's own vehicle models ("plants").
     """
@@ -176,12 +180,14 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
             experiment = plant if noise == "constant" else f"{plant}.{noise}"
             name = f"noise.004.{experiment}.paper-aco-fckf.{measure}"
             own = replace(bar, value=values.get(name, math.nan))
-            cells.append(number(values, name, spread=False) + ("" if own.holds else " (missed)"))
+            cells.append(
+                format_value(values, name, spread=False) + ("" if own.holds else " (missed)")
+            )
         rows.append([f"{noise} noise, {measure}", f"{bar.bar}", f"{bar.value:.3g}", *cells])
-    return grid(("figure", "bar", "matched plant", "sedan", "van"), rows)
+    return markdown_table(("figure", "bar", "matched plant", "sedan", "van"), rows)
 
 
-def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
+def oracle_table(barred: Sequence[Figure], values: dict[str, float]) -> str:
     """Return a Markdown table of those results with a target for which an oracle (an ideal
     observer) was run. It shows the target, the value of the default estimator, and that of the
     oracle.
@@ -190,11 +196,11 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
     for bar in barred:
         name = f"oracle.{bar.name.removeprefix('papers.')}"
         if name in values:
-            rows.append([bar.name, f"{bar.bar}", f"{bar.value:.3g}", number(values, name)])
-    return grid(("figure", "bar", "default", "oracle"), rows)
+            rows.append([bar.name, f"{bar.bar}", f"{bar.value:.3g}", format_value(values, name)])
+    return markdown_table(("figure", "bar", "default", "oracle"), rows)
 
 
-def world(values: dict[str, float]) -> str:
+def world_table(values: dict[str, float]) -> str:
     """Return a Markdown table of the results in towns whose cars have large sensor errors, as real
     cars have; one row per estimator.
     """
@@ -217,12 +223,14 @@ def world(values: dict[str, float]) -> str:
         "lost": "lost",
         "standing_5pct.v_max": "standing [m/s]",
     }
-    names = [*estimators(values, "world.", ".coverage90"), "baseline"]
-    rows = [[name, *(number(values, f"world.{name}.{key}") for key in shown)] for name in names]
-    return grid(("estimator", *shown.values()), rows)
+    names = [*list_estimators(values, "world.", ".coverage90"), "baseline"]
+    rows = [
+        [name, *(format_value(values, f"world.{name}.{key}") for key in shown)] for name in names
+    ]
+    return markdown_table(("estimator", *shown.values()), rows)
 
 
-def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
+def list_estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
     """Return the names of the estimators that occur in the keys of `values` between `prefix` and
     `suffix`, each once, in the order of their first occurrence.
     """
@@ -234,19 +242,21 @@ def estimators(values: dict[str, float], prefix: str, suffix: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def scenarios(values: dict[str, float], prefix: str, measures: Sequence[str]) -> str:
+def scenario_table(values: dict[str, float], prefix: str, measures: Sequence[str]) -> str:
     """Return a Markdown table with one row per scenario and estimator and one column per given
     measure.
     """
     rows = []
-    for found in estimators(values, prefix, ".rmse_vx"):
+    for found in list_estimators(values, prefix, ".rmse_vx"):
         scenario, _, estimator = found.rpartition(".")
-        cells = (number(values, f"{prefix}{found}.{measure}", spread=False) for measure in measures)
+        cells = (
+            format_value(values, f"{prefix}{found}.{measure}", spread=False) for measure in measures
+        )
         rows.append([scenario, estimator, *cells])
-    return grid(("scenario", "estimator", *measures), rows)
+    return markdown_table(("scenario", "estimator", *measures), rows)
 
 
-def faults(values: dict[str, float]) -> str:
+def fault_table(values: dict[str, float]) -> str:
     """Return a Markdown table of the results with sensor faults, one row per fault."""
     shown = ("coverage90", "width", "rmse_vx", "rmse_vy")
     rows = []
@@ -265,14 +275,14 @@ def faults(values: dict[str, float]) -> str:
             [
                 name,
                 case.expected,
-                "–" if not case.flag else verdict(recognised),
-                verdict(whole),
+                "–" if not case.flag else format_verdict(recognised),
+                format_verdict(whole),
                 *(
-                    number(values, f"faults.{name}.{DEFAULT}.{measure}", spread=False)
+                    format_value(values, f"faults.{name}.{DEFAULT}.{measure}", spread=False)
                     for measure in shown
                 ),
                 ", ".join(
-                    number(values, f"faults.{name}.{paper}.coverage90", spread=False)
+                    format_value(values, f"faults.{name}.{paper}.coverage90", spread=False)
                     for paper in FRICTION
                 ),
             ]
@@ -285,10 +295,10 @@ def faults(values: dict[str, float]) -> str:
         *shown,
         "coverage of 004, 000, 003",
     )
-    return grid(head, rows)
+    return markdown_table(head, rows)
 
 
-def verdict(shares: Sequence[float]) -> str:
+def format_verdict(shares: Sequence[float]) -> str:
     """Return the cell of the report for a check of several estimators. `shares` has, for each
     estimator, the share of drives that passed the check. The cell is "yes" if all shares are 1,
     otherwise "NO" with the smallest share; a dash if there are no shares.
@@ -296,12 +306,12 @@ def verdict(shares: Sequence[float]) -> str:
     return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 
-def consistency(values: dict[str, float]) -> str:
+def consistency_table(values: dict[str, float]) -> str:
     """Return a Markdown table with one row per estimator: NEES and NIS (normalised squared errors
     and innovations) over all scenarios, and the share of instants at which their means lie within
     the bounds for a consistent filter.
     """
-    names = estimators(values, "reliability.", ".below_05")
+    names = list_estimators(values, "reliability.", ".below_05")
     rows = []
     for name in names:
         cells = []
@@ -314,7 +324,7 @@ def consistency(values: dict[str, float]) -> str:
             cells.append(f"{sum(found) / len(found):.3g}" if found else "–")
         rows.append([name, *cells])
     ends = {
-        m: " to ".join(number(values, f"bounds.{m}.{end}") for end in ("lower", "upper"))
+        m: " to ".join(format_value(values, f"bounds.{m}.{end}") for end in ("lower", "upper"))
         for m in ("nees", "nis")
     }
     head = (
@@ -324,10 +334,10 @@ def consistency(values: dict[str, float]) -> str:
         f"NIS (bounds {ends['nis']})",
         "within",
     )
-    return grid(head, rows)
+    return markdown_table(head, rows)
 
 
-def reliability(values: dict[str, float]) -> str:
+def reliability_table(values: dict[str, float]) -> str:
     """Return a Markdown table with one row per estimator: the share of true frictions below each
     stated quantile.
     """
@@ -335,13 +345,13 @@ def reliability(values: dict[str, float]) -> str:
         [
             name,
             *(
-                number(values, f"reliability.{name}.below_{100 * level:02.0f}")
+                format_value(values, f"reliability.{name}.below_{100 * level:02.0f}")
                 for level in SHOWN_LEVELS
             ),
         ]
-        for name in estimators(values, "reliability.", ".below_05")
+        for name in list_estimators(values, "reliability.", ".below_05")
     ]
-    return grid(("estimator", *(f"{100 * level:.0f} %" for level in SHOWN_LEVELS)), rows)
+    return markdown_table(("estimator", *(f"{100 * level:.0f} %" for level in SHOWN_LEVELS)), rows)
 
 
 def detection_report(figures: Sequence[Figure]) -> str:
@@ -381,6 +391,6 @@ def detection_table(figures: Sequence[Figure]) -> str:
                 limits.append(f"{figure.bar:g}")
                 held += [figure.holds] if shown else []
         sign = "" if not limits else "≤ " if by_name[f"{name}.rough"].better == "less" else "≥ "
-        verdict_ = "" if not held else "holds" if all(held) else "✗"
-        rows.append([f"`{name}`", *cells, sign + "; ".join(dict.fromkeys(limits)), verdict_])
-    return grid(("figure", "rough", "plain", "bar", ""), rows)
+        verdict = "" if not held else "holds" if all(held) else "✗"
+        rows.append([f"`{name}`", *cells, sign + "; ".join(dict.fromkeys(limits)), verdict])
+    return markdown_table(("figure", "rough", "plain", "bar", ""), rows)

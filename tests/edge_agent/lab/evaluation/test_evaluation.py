@@ -21,7 +21,7 @@ from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.faults import CASES
 from edge_agent.lab.evaluation.paper_004 import noisy, variances
 from edge_agent.lab.evaluation.printed import OWN, PRINTED
-from edge_agent.lab.evaluation.report import report
+from edge_agent.lab.evaluation.report import evaluation_report
 from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, SEDAN, VEHICLES, foreign
 from edge_agent.lab.seeds import FIGURES
 from schemas.runtime.figures import Figure
@@ -186,7 +186,7 @@ def test_foreign_tyres_make_another_drive(kind: str) -> None:
 
 
 def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
-    text = report(
+    text = evaluation_report(
         [
             Figure("papers.001.rmse_vx", 0.3, "m/s", 0.02),
             Figure("real.001.dlc.aco-fckf.rmse_vx", 0.3, "m/s"),
