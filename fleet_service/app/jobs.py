@@ -217,7 +217,7 @@ class BackgroundJobs:
         self.failed: dict[str, int] = {}
         self._stop = threading.Event()
         self._busy: tuple[str, float] | None = None
-        self._thread = threading.Thread(target=self._keep, name="upkeep")
+        self._thread = threading.Thread(target=self._run_due_jobs, name="upkeep")
 
     def health_problems(self) -> list[str]:
         """Return one message per background job (such as compaction) that has failed or does not
@@ -250,7 +250,7 @@ class BackgroundJobs:
         self._stop.set()
         self._thread.join()
 
-    def _keep(self) -> None:
+    def _run_due_jobs(self) -> None:
         # Setting a priority is not permitted everywhere; then the jobs run with the normal one.
         with suppress(OSError):
             # On Linux this changes the priority of this thread only.

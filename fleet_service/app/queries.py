@@ -44,7 +44,7 @@ class Queries:
         none, it is a stream without rows if readers saw cells there before, else empty bytes.
         """
         group = self._shared.tiles.first_group(tiles)
-        made = zip(group, self._shared.tiles.make(group, now), strict=True)
+        made = zip(group, self._shared.tiles.make_tiles(group, now), strict=True)
         emptied = self._shared.state.map.emptied
         return {
             tile: shown.payload if shown.cells.num_rows or tile in emptied else b""
@@ -71,7 +71,7 @@ class Queries:
         for start in range(0, shared.state.fusion.size, SLOTS):
             with shared.guard:
                 slots = np.arange(start, min(start + SLOTS, shared.state.fusion.size))
-                seen = shared.tiles.seen(shared.tiles.public(slots, now), now)
+                seen = shared.tiles.read_cells(shared.tiles.public_slots(slots, now), now)
                 tables.append(pa.Table.from_batches([batch_of(seen, now)]))
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 

@@ -123,14 +123,14 @@ class Service:
         self._status_line = StatusLine(self.engine, self.inbox, self._clock, events)
         self._began = self._stepped_at
         self._survived = False
-        self._followed = False  # True once another service has the lease
+        self._was_replaced = False  # True once another service has the lease
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then write the waiting rows to disk, acknowledge them, and
         stop.
         """
         if self.engine.holding.lease is not None:
-            self.engine.holding.lease.serves = self._works
+            self.engine.holding.lease.serves = self._is_working
         try:
             with self._serve_monitoring() as address:
                 session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
@@ -144,7 +144,7 @@ class Service:
         """Return 0 if all admitted data are on disk and nothing failed; 1 otherwise, or if another
         service has taken over.
         """
-        has_failed = self.failure is not None or self._followed
+        has_failed = self.failure is not None or self._was_replaced
         return 1 if has_failed or self.engine.settlement.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
@@ -188,7 +188,7 @@ class Service:
             holding.mark_lost()
         return holding.is_lost
 
-    def _hanging(self) -> str | None:
+    def _describe_hang(self) -> str | None:
         """Return a description of a part of the service that hangs or has died, so that only a
         restart helps; None if there is none. The worker (the thread that processes messages) calls
         this and is not checked itself.
@@ -201,7 +201,7 @@ class Service:
             return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
         return "upkeep has ended" if self._upkeep.has_ended else None
 
-    def _works(self) -> bool:
+    def _is_working(self) -> bool:
         """Return True if this service can serve its regions: a router is connected, and the worker
         makes progress.
         """
@@ -239,7 +239,7 @@ class Service:
         else:
             wait_s = min(IDLE_S, self.engine.settlement.until_early_s(time.monotonic()))
             has_work = self._rounds.waiting or self._acks
-            self._take(session, self.inbox.drain(0.0 if has_work else wait_s))
+            self._ingest(session, self.inbox.drain(0.0 if has_work else wait_s))
         now = self._stepped_at = time.monotonic()
         self._acks.add(self.engine.settlement.end_flush())
         is_flush_due = now - self._flushed_at >= self._config.segment_s
@@ -263,7 +263,7 @@ class Service:
     def _report_status(self, now: float) -> None:
         """Write the status line, and notify the watchdog unless a part of the service hangs."""
         self._status_line.write_line(now)
-        if hanging := self._hanging():
+        if hanging := self._describe_hang():
             self._events.info(f"watchdog signal withheld: {hanging}")
         else:
             watchdog.notify_alive()
@@ -273,7 +273,7 @@ class Service:
         afterwards, because senders keep messages that were not acknowledged.
         """
         if self.engine.holding.is_lost:
-            self._followed = True
+            self._was_replaced = True
             # From here on, waiting for a bucket or a router must not delay the end for long.
             stop.set()
             self._events.info(
@@ -288,14 +288,14 @@ class Service:
             messages = self.inbox.drain(0.0)
             if not messages:
                 break
-            self._take(session, messages)
+            self._ingest(session, messages)
         self._acks.add(self.engine.settlement.flush())
         self._acks.publish_all(session)
         if not leaves:  # after a hand-over, the next owner publishes all tiles
             self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status_line.write_line(time.monotonic())
 
-    def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
+    def _ingest(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
             publish_alerts(session, ingest_messages(self.engine, self._clock, messages))
 

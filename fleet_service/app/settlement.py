@@ -119,7 +119,7 @@ class Settlement:
         Raises:
             OSError: no segment could be written for too long.
         """
-        return self._tasks.ask(work, stop)
+        return self._tasks.run_on_worker(work, stop)
 
     def flush(self) -> list[tuple[str, bytes]]:
         """Write the waiting rows as durable segments; return (vehicle, bytes) of each
@@ -130,7 +130,7 @@ class Settlement:
         """
         acks = self._acknowledge(self._log.flush)
         if not self.failing:
-            self._tasks.do()
+            self._tasks.run_queued()
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:

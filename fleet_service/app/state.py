@@ -53,7 +53,7 @@ class ServiceState(NamedTuple):
         fusion, map, alerts: beliefs about the friction of all cells; the map and the active alerts
             made from them.
         streams: record of the batches (messages with records) that were admitted.
-        refused: number of checkpoints (saved states) that could not be loaded.
+        refused: number of checkpoints that could not be loaded.
         public: cells that readers may see; None if they may see all cells.
     """
 
@@ -130,7 +130,7 @@ class SharedState:
     def _readable_tiles(self) -> set[int]:
         """Return the numbers of the tiles that have cells for readers."""
         fusion = self.state.fusion
-        slots = self.tiles.public(np.arange(fusion.size), self.state.streams.newest)
+        slots = self.tiles.public_slots(np.arange(fusion.size), self.state.streams.newest)
         return set(distinct_values(tile_of(fusion, slots)).tolist())
 
 

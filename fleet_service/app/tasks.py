@@ -31,7 +31,7 @@ class Tasks:
     def __bool__(self) -> bool:
         return not self._queue.empty()
 
-    def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+    def run_on_worker(self, work: Callable[[], T], stop: threading.Event) -> T | None:
         """Queue the function `work`, wait until the worker has run it, and return its result; None
         if `stop` is set meanwhile.
 
@@ -50,7 +50,7 @@ class Tasks:
                     return None
                 raise OSError("no segment could be written within the time limit")
 
-    def do(self) -> None:
+    def run_queued(self) -> None:
         """Run all queued functions; the worker calls this."""
         while self:
             done, work = self._queue.get()

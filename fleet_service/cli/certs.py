@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         ) from error
     try:
         registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
-        leaving = registry.leaving(fleet)
+        leaving = registry.list_leaving(fleet)
         if arguments.dry_run:
             print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'none'}")
             return 0

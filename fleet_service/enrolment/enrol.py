@@ -84,11 +84,11 @@ class Registry:
         Raises:
             InputError: a file is damaged, a name was revoked, or a step is out of order.
         """
-        signer = self._signer(step)
+        signer = self._prepare_signer(step)
         done = EnrolmentResult()
         for name in fleet.names:
             hosts = fleet.routers[name].hosts if name in fleet.routers else []
-            if self._good(name, hosts, signer.certificate):
+            if self._is_usable(name, hosts, signer.certificate):
                 done.kept.append(name)
             else:
                 self._refuse_revoked(name)
@@ -96,20 +96,20 @@ class Registry:
                     self._folder / name
                 )
                 done.made.append(name)
-        done.revoked += self._revoke(self.leaving(fleet))
+        done.revoked += self._revoke(self.list_leaving(fleet))
         self._write_trusted()
         for name in fleet.routers:
             text = json.dumps(router_configuration(fleet, name, self._used_at), indent=1)
             ca.write_atomically(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
         return done
 
-    def _signer(self, step: Step | None) -> ca.KeyPair:
+    def _prepare_signer(self, step: Step | None) -> ca.KeyPair:
         current = self._authority / "ca"
         coming = self._authority / "next"
         if step == "next" and ca.read_pair(coming) is None:
             ca.new_authority(self._terms.ca_days, self._now).write(coming)
         if step == "switch":
-            self._switch()
+            self._switch_authority()
         if step == "drop":
             (self._authority / "old.pem").unlink(missing_ok=True)
         signer = ca.read_pair(current)
@@ -124,7 +124,7 @@ class Registry:
             signer.write(current)
         return signer
 
-    def _switch(self) -> None:
+    def _switch_authority(self) -> None:
         """Let the next certificate authority sign all certificates from now on. An interrupted call
         can be repeated.
         """
@@ -142,7 +142,7 @@ class Registry:
         for ending in (".key", ".pem"):
             (self._authority / f"next{ending}").unlink()
 
-    def _good(self, name: str, hosts: list[str], signer: x509.Certificate) -> bool:
+    def _is_usable(self, name: str, hosts: list[str], signer: x509.Certificate) -> bool:
         pair = ca.read_pair(self._folder / name)
         if pair is None:
             return False
@@ -164,7 +164,7 @@ class Registry:
         if (
             lost is None
             or lost.not_valid_after_utc < self._now
-            or not any(ca.is_signed_by(lost, signer) for signer in self._trusted())
+            or not any(ca.is_signed_by(lost, signer) for signer in self._read_trusted())
         ):
             return
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
@@ -174,18 +174,18 @@ class Registry:
             "give another name",
         )
 
-    def leaving(self, fleet: Enrolment) -> list[str]:
+    def list_leaving(self, fleet: Enrolment) -> list[str]:
         """Return the names that have a certificate of this authority but are not in the enrolment
         file; `enrol` would revoke them.
         """
-        signers = self._trusted()
+        signers = self._read_trusted()
         return [
             path.stem
             for path in sorted(self._folder.glob("*.pem"))
-            if self._leaves(path, fleet, signers)
+            if self._is_leaving(path, fleet, signers)
         ]
 
-    def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
+    def _is_leaving(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
         """Return True if the file at `path` is a certificate of one of the authorities `signers`
         for a name that is not in the enrolment file.
         """
@@ -209,7 +209,7 @@ class Registry:
                     path.rename(self._revoked / path.name)
         return gone
 
-    def _trusted(self) -> list[x509.Certificate]:
+    def _read_trusted(self) -> list[x509.Certificate]:
         """Return the certificates of the authorities that all participants trust."""
         found = (
             ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old")
@@ -217,5 +217,5 @@ class Registry:
         return [certificate for certificate in found if certificate is not None]
 
     def _write_trusted(self) -> None:
-        trusted = b"".join(map(ca.to_pem, self._trusted()))
+        trusted = b"".join(map(ca.to_pem, self._read_trusted()))
         ca.write_atomically(self._folder / "trust.pem", trusted, 0o644)

@@ -81,7 +81,7 @@ class MapRoutes:
         from now on.
         """
         try:
-            stream = self._of.watchers.enter(
+            stream = self._of.watchers.add_watcher(
                 request_params.parse_view(request), request.client.host if request.client else ""
             )
         except TooManyWatchersError:

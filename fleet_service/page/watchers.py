@@ -71,7 +71,7 @@ class Watchers:
     def __len__(self) -> int:
         return len(self._watchers)
 
-    def enter(self, view: View, client: str = "") -> AsyncIterator[bytes]:
+    def add_watcher(self, view: View, client: str = "") -> AsyncIterator[bytes]:
         """Return the stream of events (changes of the map) for a view, from now on, until the
         browser disconnects.
 
@@ -86,8 +86,8 @@ class Watchers:
         watcher = _OpenPage(view, asyncio.Queue(WAITING), client)
         self._watchers[watcher.queue] = watcher
         watcher.queue.put_nowait(_encode_event("alerts", self._world.alerts.as_json()))
-        watcher.queue.put_nowait(_encode_event("beat", self._beat()))
-        return self._events(watcher)
+        watcher.queue.put_nowait(_encode_event("beat", self._beat_content()))
+        return self._stream_events(watcher)
 
     def _make_place(self, client: str) -> None:
         counts = Counter(watcher.client for watcher in self._watchers.values())
@@ -96,9 +96,9 @@ class Watchers:
             raise TooManyWatchersError
         oldest = next(watcher for watcher in self._watchers.values() if watcher.client == greedy)
         del self._watchers[oldest.queue]
-        self._put(oldest, None)
+        self._queue_event(oldest, None)
 
-    async def _events(self, watcher: _OpenPage) -> AsyncIterator[bytes]:
+    async def _stream_events(self, watcher: _OpenPage) -> AsyncIterator[bytes]:
         try:
             while (event := await watcher.queue.get()) is not None:
                 yield event
@@ -113,22 +113,22 @@ class Watchers:
         while True:
             await asyncio.sleep(FLUSH_S)
             if changes := self._world.changes():
-                self.push(changes)
+                self.send_changes(changes)
             if self._world.alerts.take_change():
-                self._tell(_encode_event("alerts", self._world.alerts.as_json()))
+                self._send_to_all(_encode_event("alerts", self._world.alerts.as_json()))
             if time.monotonic() - beaten >= BEAT_S:
                 beaten = time.monotonic()
-                self._tell(_encode_event("beat", self._beat()))
+                self._send_to_all(_encode_event("beat", self._beat_content()))
 
     def close(self) -> None:
         """End the event streams of all browsers."""
         for watcher in list(self._watchers.values()):
-            self._put(watcher, None)
+            self._queue_event(watcher, None)
 
-    def _beat(self) -> dict[str, Any]:
+    def _beat_content(self) -> dict[str, Any]:
         return {"now": time.time(), "heard": self._world.last_received, **self._state()}
 
-    def push(self, changes: list[TileBlock]) -> None:
+    def send_changes(self, changes: list[TileBlock]) -> None:
         """Send changed blocks to the browsers whose view they touch."""
         # blocks by (tile, level), each encoded once for all browsers that show it
         lines: dict[tuple[int, int], bytes] = {}
@@ -141,7 +141,7 @@ class Watchers:
                         lines[place] = self._event_line(block, watcher.view.level)
                     found.append(lines[place])
             if found:
-                self._put(watcher, b"event: tiles\n" + b"".join(found) + b"\n")
+                self._queue_event(watcher, b"event: tiles\n" + b"".join(found) + b"\n")
 
     def _event_line(self, block: TileBlock, level: int) -> bytes:
         """Return the line of an event that contains the block in the form of a zoom level."""
@@ -149,11 +149,11 @@ class Watchers:
         content = block.encoded() if is_cells else self._world.encoded(block.tile, level)
         return b"data: " + base64.b64encode(content) + b"\n"
 
-    def _tell(self, event: bytes) -> None:
+    def _send_to_all(self, event: bytes) -> None:
         for watcher in list(self._watchers.values()):
-            self._put(watcher, event)
+            self._queue_event(watcher, event)
 
-    def _put(self, watcher: _OpenPage, event: bytes | None) -> None:
+    def _queue_event(self, watcher: _OpenPage, event: bytes | None) -> None:
         try:
             watcher.queue.put_nowait(event)
         except asyncio.QueueFull:

@@ -61,7 +61,7 @@ def _shown_in_groups(
     remaining = list(tiles)
     while remaining:
         group = cache.first_group(remaining)
-        yield from zip(group, cache.shown(group, now), strict=True)
+        yield from zip(group, cache.read_tiles(group, now), strict=True)
         remaining = remaining[len(group) :]
 
 
@@ -123,15 +123,15 @@ def _view_tile(
             ahead = route[grid.tile_of(route // grid.SECTORS) == tile]
             found = fusion.slots_of(ahead // grid.SECTORS, ahead % grid.SECTORS)
             passed = found[found >= 0]
-        cells = cache.seen(cache.public(passed, now), now)
+        cells = cache.read_cells(cache.public_slots(passed, now), now)
         if query.basis == "borrowed":
             known = slots
             if route is not None:
                 along = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
                 known = np.union1d(slots, along[along >= 0])
-            known = cache.public(known, now)
+            known = cache.public_slots(known, now)
             borrowed = impute_cells(cache.source, tile, known, route, now)
-            cells = join_views(cells, cache.coarse(borrowed))
+            cells = join_views(cells, cache.coarsen(borrowed))
     return used_once(cells, now)
 
 

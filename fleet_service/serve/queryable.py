@@ -175,7 +175,7 @@ class MapQueryable:
         elif cost <= LIGHT and self._light.take(cost):
             self._reply(request, map_query)
         else:
-            self._queue(request, map_query, cost)
+            self._queue_query(request, map_query, cost)
 
     def _estimate_cost(self, request: zenoh.Query, map_query: MapQuery) -> float:
         """Return the estimated cost of the answer to a query about the present map.
@@ -217,7 +217,7 @@ class MapQueryable:
         finally:
             self._past_waiting.release()
 
-    def _queue(self, request: zenoh.Query, map_query: MapQuery, cost: float) -> None:
+    def _queue_query(self, request: zenoh.Query, map_query: MapQuery, cost: float) -> None:
         self._counts.heavy_queries += 1
         with self._has_queued:
             rank = time.monotonic() + cost / PER_S
@@ -231,7 +231,7 @@ class MapQueryable:
             self._has_queued.notify()
             if self._worker is None or not self._worker.is_alive():
                 self._worker = threading.Thread(
-                    target=self._work, name="heavy answers", daemon=True
+                    target=self._answer_queued, name="heavy answers", daemon=True
                 )
                 self._worker.start()
         if dropped is not None:
@@ -245,20 +245,20 @@ class MapQueryable:
                 ),
             )
 
-    def _work(self) -> None:
+    def _answer_queued(self) -> None:
         while True:
             with self._has_queued:
                 self._has_queued.wait_for(lambda: self._heavy)
                 first = heapq.heappop(self._heavy)
             began = self._busy_since = time.monotonic()
-            goes_on = self._goes_on(first)
+            goes_on = self._answer_next_tile(first)
             self._busy_since = None
             if goes_on:
                 with self._has_queued:
                     heapq.heappush(self._heavy, first)
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
-    def _goes_on(self, heavy: _QueuedQuery) -> bool:
+    def _answer_next_tile(self, heavy: _QueuedQuery) -> bool:
         """Answer a queued map query with one more tile; return True if further tiles may follow."""
         request = heavy.request
         with self._reply_to(request) as answered:

@@ -97,16 +97,16 @@ class TileCache:
         """
         self._acknowledged = self.state.change
 
-    def shown(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
+    def read_tiles(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
         """Return tiles that are recent enough for a query at `now` [ns]. Each is from the cache, or
         newly made.
         """
-        found = {tile: self._recent(tile, now) for tile in tiles}
+        found = {tile: self._recent_tile(tile, now) for tile in tiles}
         missing = [tile for tile, kept in found.items() if kept is None]
-        made = dict(zip(missing, self.make(missing, now), strict=True))
+        made = dict(zip(missing, self.make_tiles(missing, now), strict=True))
         return [found[tile] or made[tile] for tile in tiles]
 
-    def _recent(self, tile: int, now: int) -> ShownTile | None:
+    def _recent_tile(self, tile: int, now: int) -> ShownTile | None:
         cached = self._kept.get(tile)
         if cached is None or not 0 <= now - cached.made <= SHOWN_NS:
             return None
@@ -120,7 +120,7 @@ class TileCache:
         counts = [self.state.count(tile) for tile in tiles[:TILES_TOGETHER]]
         return tiles[: max(int((np.cumsum(counts) <= CELLS_TOGETHER).sum()), 1)]
 
-    def make(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
+    def make_tiles(self, tiles: Sequence[int], now: int) -> list[ShownTile]:
         """Make tiles from the state of the map at `now` [ns], and store them in the cache. The
         beliefs of all tiles are read and encoded together, because for a single small tile most of
         the time would be the overhead of the calls.
@@ -130,8 +130,8 @@ class TileCache:
         with self.guard:
             change = self.state.change
             slots = np.concatenate([self.state.slots(tile) for tile in tiles])
-            slots, owners = self._by_tile_from_south(self.public(slots, now))
-            cells = self.seen(slots, now)
+            slots, owners = self._by_tile_from_south(self.public_slots(slots, now))
+            cells = self.read_cells(slots, now)
         batch = batch_of(cells, now)
         first, last = (np.searchsorted(owners, tiles, side) for side in ("left", "right"))
         made = []
@@ -145,11 +145,11 @@ class TileCache:
             self._keep(tile, made[-1])
         return made
 
-    def seen(self, slots: IntArray, now: int) -> CellView:
+    def read_cells(self, slots: IntArray, now: int) -> CellView:
         """Return the cells of public slots (one per cell and heading sector) in the form that
         readers see.
         """
-        return self.coarse(view_cells(self.source, slots, now))
+        return self.coarsen(view_cells(self.source, slots, now))
 
     @property
     def source(self) -> Readable:
@@ -158,14 +158,14 @@ class TileCache:
         """
         return self.state.fusion if self._public is None else self._public
 
-    def coarse(self, cells: CellView) -> CellView:
+    def coarsen(self, cells: CellView) -> CellView:
         """Return the cells as readers may see them. If the cache has a public copy of the cells
         (for privacy), counts of vehicles and observations and their times are rounded down. Without
         a public copy, the cells are returned unchanged.
         """
         return cells if self._public is None else coarsen_cells(cells)
 
-    def public(self, slots: IntArray, now: int) -> IntArray:
+    def public_slots(self, slots: IntArray, now: int) -> IntArray:
         """Return those of the slots that are public at `now` [ns]."""
         slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
         return slots if self._public is None else self._public.select(slots, now)

@@ -63,13 +63,13 @@ class _Map:
         )
         for vehicle in range(1, LEAST + 3):
             self._visit(vehicle, 0.0)
-        shown = self._tiles.public(self._slots, START + 2 * PERIOD_NS)
+        shown = self._tiles.public_slots(self._slots, START + 2 * PERIOD_NS)
         assert len(shown) == CELLS, "all cells are public"
         self.drive()
 
     def read(self) -> None:
         """Read all published cells, as a reader of the map does."""
-        self._tiles.seen(self._slots, _NOW)
+        self._tiles.read_cells(self._slots, _NOW)
 
     def drive(self) -> None:
         """Let one further vehicle visit all cells of the map."""

@@ -83,11 +83,11 @@ def test_client_with_many_requests_waits_while_another_is_answered() -> None:
 def test_full_page_takes_a_stream_from_the_client_with_most() -> None:
     async def run() -> list[int]:
         watchers = Watchers(MapMirror(), dict, most=6)
-        greedy = [watchers.enter(VIEW, "greedy") for _ in range(6)]
+        greedy = [watchers.add_watcher(VIEW, "greedy") for _ in range(6)]
         for _ in range(3):
-            watchers.enter(VIEW, "other")
+            watchers.add_watcher(VIEW, "other")
         with pytest.raises(TooManyWatchersError):
-            watchers.enter(VIEW, "other")
+            watchers.add_watcher(VIEW, "other")
         ended = 0
         for stream in greedy[:3]:
             events = [event async for event in stream]

@@ -276,14 +276,14 @@ def test_a_slow_watcher_is_told_to_reload_and_nothing_else_piles_up() -> None:
     async def slow() -> list[bytes]:
         world = MapMirror()
         watchers = Watchers(world, dict, most=1)
-        stream = watchers.enter(WORLD)
+        stream = watchers.add_watcher(WORLD)
         with pytest.raises(TooManyWatchersError):
-            watchers.enter(WORLD)
+            watchers.add_watcher(WORLD)
         fusion = Fusion(120.0)
         for k in range(2 * WAITING):
             fusion.update(observations([float(k)], [k], value([0.3 if k % 2 else 0.8])))
             world.take_tile(TILE, cell_table(fusion, np.arange(1), START), 1.0 + k)
-            watchers.push(world.changes())
+            watchers.send_changes(world.changes())
         assert watchers.reloads
         watchers.close()
         return [event async for event in _all(stream)]

@@ -39,16 +39,16 @@ def state() -> MapState:
 
 
 def vehicles(made: TileCache, now: int, tile: int = TILE) -> list[int]:
-    return [int(n) for n in made.shown([tile], now)[0].columns["vehicles"]]
+    return [int(n) for n in made.read_tiles([tile], now)[0].columns["vehicles"]]
 
 
 def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
-    first = made.shown([TILE], NOW)[0]
-    assert made.shown([TILE], NOW + tile_cache.SHOWN_NS)[0] is first
-    later = made.shown([TILE], NOW + tile_cache.SHOWN_NS + 1)[0]
+    first = made.read_tiles([TILE], NOW)[0]
+    assert made.read_tiles([TILE], NOW + tile_cache.SHOWN_NS)[0] is first
+    later = made.read_tiles([TILE], NOW + tile_cache.SHOWN_NS + 1)[0]
     assert later.cells["age_s"][0].as_py() > first.cells["age_s"][0].as_py()
-    assert made.shown([TILE], NOW - 1)[0] is not later  # the clock was set back
+    assert made.read_tiles([TILE], NOW - 1)[0] is not later  # the clock was set back
 
 
 def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: MapState) -> None:
@@ -65,10 +65,10 @@ def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: Ma
 
 def test_a_promise_about_another_tile_does_not_make_this_one_anew(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
-    first = made.shown([TILE], NOW)[0]
+    first = made.read_tiles([TILE], NOW)[0]
     visit(state, 2, (TILE + 1) << 14)
     made.acknowledge()
-    assert made.shown([TILE], NOW)[0] is first
+    assert made.read_tiles([TILE], NOW)[0] is first
     assert vehicles(made, NOW, TILE + 1) == [1]
 
 
@@ -84,20 +84,20 @@ def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(
     state: MapState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = TileCache(state, nullcontext(), 1)
-    one = len(made.shown([TILE], NOW)[0].payload)
+    one = len(made.read_tiles([TILE], NOW)[0].payload)
     monkeypatch.setattr(tile_cache, "KEPT_BYTES", 2 * one)
     for tile in (TILE + 1, TILE + 2):
         visit(state, 1, tile << 14)
-        made.shown([tile], NOW)
-    young = made.shown([TILE + 2], NOW)[0]
-    assert made.shown([TILE + 2], NOW)[0] is young
-    assert made.shown([TILE], NOW)[0] is not made.shown([TILE + 1], NOW)[0]
+        made.read_tiles([tile], NOW)
+    young = made.read_tiles([TILE + 2], NOW)[0]
+    assert made.read_tiles([TILE + 2], NOW)[0] is young
+    assert made.read_tiles([TILE], NOW)[0] is not made.read_tiles([TILE + 1], NOW)[0]
     # Two newer tiles have displaced it from the cache.
-    assert made.shown([TILE + 2], NOW)[0] is not young
+    assert made.read_tiles([TILE + 2], NOW)[0] is not young
 
 
 def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:
-    made = TileCache(state, nullcontext(), 1).shown([TILE], NOW)[0]
+    made = TileCache(state, nullcontext(), 1).read_tiles([TILE], NOW)[0]
     before = np.array(made.columns["vehicles"])
     visit(state, 2)
     assert (made.columns["vehicles"] == before).all()
@@ -110,7 +110,7 @@ def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
         for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):
             visit(state, vehicle, int(cell))
     made = TileCache(state, nullcontext(), 1)
-    cells = made.shown([TILE], NOW)[0].cells.to_pylist()
+    cells = made.read_tiles([TILE], NOW)[0].cells.to_pylist()
     west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
     lengths = set()
     for _ in range(200):
@@ -149,9 +149,9 @@ def three_tiles() -> MapState:
 def test_tiles_that_are_made_together_equal_tiles_that_are_made_alone(least: int) -> None:
     state = three_tiles()
     tiles = [TILE + 2, TILE, TILE + 7, TILE + 1]  # one of them has no cells
-    together = TileCache(state, nullcontext(), least).make(tiles, NOW)
+    together = TileCache(state, nullcontext(), least).make_tiles(tiles, NOW)
     for tile, one in zip(tiles, together, strict=True):
-        (alone,) = TileCache(state, nullcontext(), least).make([tile], NOW)
+        (alone,) = TileCache(state, nullcontext(), least).make_tiles([tile], NOW)
         assert decode_tile(one.payload).equals(decode_tile(alone.payload))
         assert one.least == alone.least
         assert one.common == alone.common
@@ -160,8 +160,8 @@ def test_tiles_that_are_made_together_equal_tiles_that_are_made_alone(least: int
 
 def test_a_recent_tile_is_not_made_again_with_others() -> None:
     made = TileCache(three_tiles(), nullcontext(), 1)
-    (first,) = made.shown([TILE], NOW)
-    again, other = made.shown([TILE, TILE + 1], NOW + 1)
+    (first,) = made.read_tiles([TILE], NOW)
+    again, other = made.read_tiles([TILE, TILE + 1], NOW + 1)
     assert again is first
     assert other.made == NOW + 1
 
@@ -169,13 +169,13 @@ def test_a_recent_tile_is_not_made_again_with_others() -> None:
 def test_a_query_for_the_whole_map_gets_every_tile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     state = three_tiles()
     groups: list[list[int]] = []
-    make = TileCache.make
+    make = TileCache.make_tiles
 
     def noted(self: TileCache, tiles: list[int], now: int) -> list[ShownTile]:
         groups.append(list(tiles))
         return make(self, tiles, now)
 
-    monkeypatch.setattr(TileCache, "make", noted)
+    monkeypatch.setattr(TileCache, "make_tiles", noted)
     for tiles_together, cells_together, sizes in (
         (32, 2000, [3]),
         (2, 2000, [2, 1]),
