@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import gc
+import logging
 import os
 import sys
 import threading
@@ -62,40 +63,25 @@ def run(arguments: argparse.Namespace) -> int:
         from fleet_service.app.native_library import use_service_library
 
         use_service_library()
-        from fleet_service.app.precompile import warm_up
-        from fleet_service.app.service import Service
-        from schemas.config import ServiceConfig, load
+        import fleet_service.app.service  # noqa: F401 loads the kernels behind the status line
 
     stop = stop_on_signals()
     os.umask(os.umask(0o077) | PRIVATE)
-    config = load(arguments.config, ServiceConfig)
+    config = _read_config(arguments)
     log_warnings(config.log, sys.stderr, service=config.name)
     root = arguments.archive or config.archive.path
     if root is None:
         raise InputError(
             "archive", "is missing", "give --archive DIR, or archive.path in the configuration"
         )
-    if arguments.standby:
-        config = config.model_copy(update={"standby": True})
-    if arguments.weather is not None:
-        config = config.model_copy(update={"weather": arguments.weather})
+    events = event_logger("service", config.log, sys.stdout, service=config.name)
     try:
-        events = event_logger("service", config.log, sys.stdout, service=config.name)
-        if config.standby:
-            with progress_messages.show_status("compiling"):
-                warm_up()  # so that a take-over does not wait for compilation
-        holding = _open_archive(config, root, stop, events.info)
-        if holding is None:
-            return 0
-        try:
-            with progress_messages.show_status("starting"):
-                service = Service(config, root, events, holding)
-        except BaseException:
-            holding.close()
-            raise
+        service = _start_service(config, root, stop, events)
     except OSError as error:
         problem = f"cannot use {error.filename or root} ({error.strerror or error})"
         raise InputError("archive", problem, "give a folder that you may read and write") from error
+    if service is None:
+        return 0
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
     # Objects loaded from the archive are never garbage. A collection over them would delay alerts.
@@ -107,6 +93,41 @@ def run(arguments: argparse.Namespace) -> int:
     service.run(stop)
     stopped.set()
     return service.exit_code
+
+
+def _read_config(arguments: argparse.Namespace) -> ServiceConfig:
+    """Return the configuration, with the settings that the command's options replace."""
+    from schemas.config import ServiceConfig, load
+
+    config = load(arguments.config, ServiceConfig)
+    if arguments.standby:
+        config = config.model_copy(update={"standby": True})
+    if arguments.weather is not None:
+        config = config.model_copy(update={"weather": arguments.weather})
+    return config
+
+
+def _start_service(
+    config: ServiceConfig, root: Path, stop: threading.Event, events: logging.Logger
+) -> Service | None:
+    """Wait until the archive in the folder `root` is available, and return a service with this
+    archive; return None if `stop` is set first.
+    """
+    from fleet_service.app.precompile import warm_up
+    from fleet_service.app.service import Service
+
+    if config.standby:
+        with progress_messages.show_status("compiling"):
+            warm_up()  # so that a take-over does not wait for compilation
+    holding = _open_archive(config, root, stop, events.info)
+    if holding is None:
+        return None
+    try:
+        with progress_messages.show_status("starting"):
+            return Service(config, root, events, holding)
+    except BaseException:
+        holding.close()
+        raise
 
 
 def _open_archive(
