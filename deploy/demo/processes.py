@@ -65,14 +65,14 @@ class ManagedProcess:
         """Return the lines that this process of the demo has printed so far."""
         return self.log.read_text().splitlines()
 
-    def line_with(self, start: str, patience_s: float = START_S) -> str:
+    def line_with(self, start: str) -> str:
         """Wait for the first line of the process's output that begins with `start`, and return this
         line.
 
         Raises:
-            DemoError: the process ended, or did not print such a line within `patience_s` seconds.
+            DemoError: the process ended, or did not print such a line within START_S seconds.
         """
-        deadline = time.monotonic() + patience_s
+        deadline = time.monotonic() + START_S
         while time.monotonic() < deadline:
             for line in self.lines():
                 if line.startswith(start):

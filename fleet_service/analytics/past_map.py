@@ -29,14 +29,12 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
     return cell_table(fusion, slots, at)
 
 
-def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
+def map_at(root: Path, part: Extract) -> pa.Table:
     """Return the map at the time `part.until` and in the box `part.bbox`, as a GeoParquet table.
     The map is computed again from all reports in the archive that were received until this time.
-
-    `lateness_s` is the allowed delay of observations [s], a setting of the service.
     """
     return snapshot_table(
-        visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox),
+        visited_cells(past_fusion(root, LATENESS_S, part.until, part.bbox), part.until, part.bbox),
         part.until,
     )
 

@@ -118,11 +118,12 @@ class DeploymentSize(NamedTuple):
     network_bytes_per_s: float
 
 
-def estimate_size(fleet: PlannedFleet, costs: Costs = COSTS) -> DeploymentSize:
+def estimate_size(fleet: PlannedFleet) -> DeploymentSize:
     """Return the size of a deployment for a fleet. The estimate assumes that no vehicle visits a
     cell twice within hours. Its number of pairs of vehicle and cell is therefore an upper limit.
     """
     rate = fleet.vehicles * fleet.rate_hz
+    costs = COSTS
     pairs = remembered_pairs(rate, costs.values)
     waiting = rate * (fleet.lateness_s + _EPOCH_S / 2)
     parts = split_memory(MemoryContent(fleet.vehicles, fleet.cells, pairs, waiting), costs)

@@ -213,7 +213,7 @@ def weather_files(root: Path) -> list[Path]:
     return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
 
 
-def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
+def join_daily_files(root: Path) -> int:
     """Join the weather reports of each day into one file; return the reduction in the number of
     files.
 
@@ -227,7 +227,9 @@ def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
         days.setdefault(_written_day(path), []).append(path)
     saved = 0
     for paths in (paths for paths in days.values() if len(paths) > 1):
-        found = [(p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged)) for p in paths]
+        found = [
+            (p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=skip_damaged)) for p in paths
+        ]
         whole = [(path, table) for path, table in found if table is not None]
         if len(whole) > 1:
             newest = whole[-1][0]

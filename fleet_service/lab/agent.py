@@ -110,7 +110,7 @@ class Errors:
 
 
 class Passes(NamedTuple):
-    """Properties of n visits (passages of cells), arrays (n,).
+    """Properties of n visits, arrays (n,).
 
     Attributes:
         vehicle: number of the vehicle.
@@ -204,10 +204,10 @@ def reading_likelihood(
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
 
 
-def overconfident_likelihood(
-    claim: FloatArray | float, std: float = OVERCONFIDENT_STD
-) -> FloatArray:
+def overconfident_likelihood(claim: FloatArray | float) -> FloatArray:
     """Return the normal log-likelihoods (n, 32) that a misbehaving vehicle sends if it claims the
-    friction `claim` (n,) with the standard deviation `std`, although its error is larger.
+    friction `claim` (n,) with the standard deviation OVERCONFIDENT_STD, although its error is
+    larger.
     """
-    return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))
+    deviation = (mugrid.CENTRES - np.reshape(claim, (-1, 1))) / OVERCONFIDENT_STD
+    return np.asarray(-0.5 * np.square(deviation))

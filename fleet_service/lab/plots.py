@@ -16,13 +16,12 @@ from schemas.runtime.installing import install_command
 from schemas.runtime.palette import ESTIMATORS
 
 SIZE = (5.5, 4.2)
+FORMATS = ("png", "svg", "pdf")
 
 
-def draw_plots(
-    found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")
-) -> list[Path]:
-    """Draw four plots from the figures `found`, and write each into `folder` in all file formats
-    `forms`. Return the paths of the files. The plots are:
+def draw_plots(found: Sequence[Figure], folder: Path) -> list[Path]:
+    """Draw four plots from the figures `found`, and write each into `folder` in the file formats
+    FORMATS. Return the paths of the files. The plots are:
 
     - reliability: share of true μ below the stated quantiles, for a fleet without faulty vehicles.
     - rmse: error of the median of μ by the number of vehicles that used grip in the cell.
@@ -51,7 +50,7 @@ def draw_plots(
         canvas = Canvas(figsize=SIZE, layout="constrained")
         axes = canvas.subplots()
         plot(axes, values)
-        for form in forms:
+        for form in FORMATS:
             paths.append(folder / f"{name}.{form}")
             canvas.savefig(paths[-1], dpi=130)
     return paths

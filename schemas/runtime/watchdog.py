@@ -25,7 +25,7 @@ def notify_alive() -> None:
     _notify_systemd()
 
 
-def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
+def notify_waiting() -> Callable[[], None]:
     """Start a thread that repeatedly notifies systemd that the process works. Use it while the
     process (a standby service, for example) waits and cannot call `notify_alive` regularly.
 
@@ -33,7 +33,7 @@ def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
         a function "beat" that the waiting code must call repeatedly.
 
     The thread ends in two cases. First, the process calls `notify_alive`, because the wait is over.
-    Second, "beat" has not been called for `most_s` seconds, because the waiting code hangs; systemd
+    Second, "beat" has not been called for LONG_S seconds, because the waiting code hangs; systemd
     then restarts the process.
     """
     last = time.monotonic()
@@ -44,7 +44,7 @@ def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
         last = time.monotonic()
 
     def keep() -> None:
-        while not _at_work.wait(every_s) and time.monotonic() - last < most_s:
+        while not _at_work.wait(every_s) and time.monotonic() - last < LONG_S:
             _notify_systemd()
 
     _at_work.clear()

@@ -1,4 +1,4 @@
-"""Loops that copy and clear small arrays in compiled code.
+"""Loops that copy and clear vectors in compiled code.
 
 They replace slice assignments, because each slice assignment adds seconds of compile time.
 """
@@ -17,23 +17,7 @@ def copy_vector(target: FloatArray, source: FloatArray) -> None:
 
 
 @compiled
-def put_square(target: FloatArray, source: FloatArray) -> None:
-    """Copy the square matrix `source` (n, n) to `target` (n, n)."""
-    for i in range(target.shape[0]):
-        for j in range(target.shape[1]):
-            target[i, j] = source[i, j]
-
-
-@compiled
 def clear_vector(target: FloatArray) -> None:
     """Set all elements of the vector `target` (n,) to zero."""
     for i in range(target.shape[0]):
         target[i] = 0.0
-
-
-@compiled
-def clear_rows(target: FloatArray) -> None:
-    """Set all elements of the matrix `target` (m, n) to zero."""
-    for i in range(target.shape[0]):
-        for j in range(target.shape[1]):
-            target[i, j] = 0.0

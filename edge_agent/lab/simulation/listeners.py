@@ -5,7 +5,7 @@ drivers, and passes warnings to the drivers.
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -71,20 +71,14 @@ class WarnedDrivers:
         """
         self._warnings.put((self._number[name], warning))
 
-    def heeding(
-        self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None
-    ) -> Iterator[Block]:
+    def heeding(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Yield the blocks of samples of a source unchanged, and pass the stored warnings to the
         simulated drivers after each block.
-
-        The argument `hear` is a function of the caller, not the method of this class. It is called
-        just before the warnings are passed, so that it can store new ones.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
                 self.refresh()
             yield block
-            hear()
             self.act()
 
     def refresh(self) -> None:

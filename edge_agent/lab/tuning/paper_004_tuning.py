@@ -16,7 +16,7 @@ both are .1, .05 and .01 in turn (section IV.A). Objectives, larger is better:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -160,10 +160,9 @@ def tune(
     ants: int,
     iterations: int,
     seed: int,
-    habits: Habits | None = None,
 ) -> PaperTuning:
-    """Tune the lower vertices with the ant colony; the objective is averaged over all
-    noise levels.
+    """Tune the lower vertices with the ant colony; the objective is averaged over all noise
+    levels.
     """
     score = OBJECTIVES[objective]
     laid: list[FloatArray] = []
@@ -178,6 +177,6 @@ def tune(
         ants=ants,
         iterations=iterations,
         rng=np.random.default_rng([seed, 7]),
-        habits=replace(habits or Habits(), trace=laid.append),
+        habits=Habits(trace=laid.append),
     )
     return PaperTuning(LowerVertices.from_vector(result.best), result, laid[-1])

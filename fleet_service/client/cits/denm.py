@@ -51,6 +51,7 @@ LEAST: Final = {
 DELTA_BITS: Final = 18 + 18 + 15  # bits of a position difference: north, east, height
 TRACES: Final = 7
 TRACE_POINTS: Final = 40
+APPROACH_M: Final = (100.0, 300.0, 600.0)  # [m] points of a trace before the event
 # positions in the enumerations of `denm.asn`
 LESS_THAN_5_KM: Final = 5
 ALL_DIRECTIONS: Final = 0
@@ -285,16 +286,14 @@ def _decode_delta(origin: Point, delta: Mapping[str, int]) -> Point:
     return origin[0] + delta["deltaLatitude"] / UNITS, origin[1] + delta["deltaLongitude"] / UNITS
 
 
-def approach_points(
-    position: Point, heading: float, metres: tuple[float, ...] = (100.0, 300.0, 600.0)
-) -> tuple[Point, ...]:
+def approach_points(position: Point, heading: float) -> tuple[Point, ...]:
     """Return points (latitude, longitude) on the road before a hazard event, for traffic with the
-    given heading [deg from north], at the given distances [m], nearest first.
+    given heading [deg from north], at the distances APPROACH_M, nearest first.
     """
     north = math.cos(math.radians(heading))
     east = math.sin(math.radians(heading))
     width = METRES_PER_DEGREE * math.cos(math.radians(position[0]))
     return tuple(
         (position[0] - far * north / METRES_PER_DEGREE, position[1] - far * east / width)
-        for far in metres
+        for far in APPROACH_M
     )
