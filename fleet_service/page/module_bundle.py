@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from graphlib import TopologicalSorter
 from typing import Final
 
-_IMPORT: Final = re.compile(r'^import \{ (.+) \} from "\./(\w+)\.js";$', re.MULTILINE)
+_IMPORT: Final = re.compile(r'^import \{\s+([^}]+?),?\s+\} from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT: Final = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 _OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
@@ -41,7 +41,7 @@ def bundle_modules(modules: Mapping[str, str], main: str) -> str:
         needs[name] = [module for _, module in found]
         waiting += needs[name]
         for names, module in found:
-            imported_names[module] |= {one.split(" as ")[0] for one in names.split(", ")}
+            imported_names[module] |= {one.split(" as ")[0] for one in _split_names(names)}
     return "".join(
         _strip_imports(modules[name])
         if name == main
@@ -54,12 +54,20 @@ def _wrap_module(name: str, body: str, exported: list[str]) -> str:
     return f"const from_{name} = (() => {{\n{body}return {{ {', '.join(exported)} }};\n}})();\n"
 
 
+def _split_names(names: str) -> list[str]:
+    """Return the names of an import, which may be on several lines; "a as b" is one of them."""
+    return re.split(r",\s+", names)
+
+
 def _strip_imports(text: str) -> str:
     """Return a module's text with its imports replaced by constants, and without the keyword
     `export`.
     """
     text = _IMPORT.sub(
-        lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text)
+        lambda m: (
+            f"const {{ {', '.join(_split_names(m[1])).replace(' as ', ': ')} }} = from_{m[2]};"
+        ),
+        _EXPORT.sub("", text),
     )
     if other := _OTHER.search(text):
         raise ValueError(f"{other[0]!r} cannot be joined into one script")

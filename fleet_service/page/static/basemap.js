@@ -1,5 +1,7 @@
-// The operator's own raster tiles below the cells. There are none unless the server was started with --base-map.
-const MOST = 300, LEAST_PX = 128;
+// The operator's own raster tiles below the cells. There are none unless the server was started
+// with --base-map.
+const MOST = 300;
+const LEAST_PX = 128;
 
 export class BaseMap {
   constructor({ address, zooms }, changed) {
@@ -7,13 +9,19 @@ export class BaseMap {
   }
 
   paint(pen, view) {
-    const [least, most] = this.zooms, z = Math.max(least, Math.min(most, Math.round(view.zoom))), n = 2 ** z, px = view.scale / n, { west, east, north, south } = view.box;
-    if (px < LEAST_PX) return;  // the tile file begins at a nearer zoom, which would need hundreds of tiles
-    pen.globalAlpha = .55;  // the cells' colours must stand out
+    const [least, most] = this.zooms;
+    const z = Math.max(least, Math.min(most, Math.round(view.zoom)));
+    const n = 2 ** z;
+    const px = view.scale / n;
+    const { west, east, north, south } = view.box;
+    // the tile file begins at a nearer zoom, which would need hundreds of tiles
+    if (px < LEAST_PX) return;
+    pen.globalAlpha = 0.55; // the cells' colours must stand out
     for (let x = Math.max(0, Math.floor(west * n)); x < Math.min(n, east * n); x++)
       for (let y = Math.max(0, Math.floor(north * n)); y < Math.min(n, south * n); y++) {
         const picture = this.picture(z, x, y);
-        if (picture.complete && picture.naturalWidth) pen.drawImage(picture, view.left(x / n), view.top(y / n), px + .5, px + .5);
+        if (picture.complete && picture.naturalWidth)
+          pen.drawImage(picture, view.left(x / n), view.top(y / n), px + 0.5, px + 0.5);
       }
     pen.globalAlpha = 1;
   }

@@ -13,8 +13,16 @@ function fill(element, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else if (name === "style") Object.assign(element.style, value);
-    else if (name === "checked" || name === "disabled" || name === "hidden" || name === "value" || name === "selected") element[name] = value;
-    else if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value);
+    else if (
+      name === "checked" ||
+      name === "disabled" ||
+      name === "hidden" ||
+      name === "value" ||
+      name === "selected"
+    )
+      element[name] = value;
+    else if (value !== null && value !== undefined && value !== false)
+      element.setAttribute(name, value);
   }
   element.append(...children.filter(child => child !== null && child !== undefined));
   return element;

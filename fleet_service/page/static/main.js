@@ -18,9 +18,12 @@ import { Timeline } from "./timeline.js";
 import { Updates } from "./updates.js";
 import { START, boxOf, levelOf } from "./view.js";
 
-// As in style.css: width of the panel beside the map, or share of a phone's screen that the panel below it takes.
-const PHONE_PX = 800, SIDE_PX = 400, SHEET = .44;
-const BARE_MS = 300;  // longest time for which the first picture may delay the buttons
+// As in style.css: width of the panel beside the map, or share of a phone's screen that the panel
+// below it takes.
+const PHONE_PX = 800;
+const SIDE_PX = 400;
+const SHEET = 0.44;
+const BARE_MS = 300; // longest time for which the first picture may delay the buttons
 
 /** The page: state, map, panels, updates from the server, and timeline. */
 class Page {
@@ -34,7 +37,12 @@ class Page {
     this.state = new State(now);
     this.panels = new Panels(this);
     this.updates = new Updates(this);
-    this.live = new Live({ blocks: found => this.updates.blocks(found), alerts: found => this.updates.alerts(found), beat: told => this.updates.beat(told), reload: () => this.updates.reload() });
+    this.live = new Live({
+      blocks: found => this.updates.blocks(found),
+      alerts: found => this.updates.alerts(found),
+      beat: told => this.updates.beat(told),
+      reload: () => this.updates.reload(),
+    });
     this.map = new MapWindow(this);
     this.timeline = new Timeline(byId("timeline"), this);
     now.changed = () => this.map.draw();
@@ -42,7 +50,8 @@ class Page {
 
   /** Show the first picture, and then load the parts that it does not need. */
   async start() {
-    const { map, panels, state, updates } = this, words = fromHash(location.hash);
+    const { map, panels, state, updates } = this;
+    const words = fromHash(location.hash);
     const isPast = words.at !== undefined || words.compare !== undefined;
     updates.firstRoads = this.settings.roads ? updates.loadRoads() : null;
     if (words.x && !isPast) await this.drawFirst(words);
@@ -64,15 +73,23 @@ class Page {
     panels.refresh();
   }
 
-  /** Draw the place of a link before the buttons and panels exist, unless its cells take too long. */
+  /**
+   * Draw the place of a link before the buttons and panels exist, unless its cells take too long.
+   */
   async drawFirst(words) {
     this.state.restore(words, TABS);
     applyTheme(this);
     this.map.resize();
-    await Promise.race([this.map.drawFirst(...placeOf(words)), new Promise(resolve => setTimeout(resolve, BARE_MS))]);
+    await Promise.race([
+      this.map.drawFirst(...placeOf(words)),
+      new Promise(resolve => setTimeout(resolve, BARE_MS)),
+    ]);
   }
 
-  /** Listen to window events: size, theme, links, dropped files, and the key that goes to the first alert. */
+  /**
+   * Listen to window events: size, theme, links, dropped files, and the key that goes to the first
+   * alert.
+   */
   listen() {
     onDeviceTheme(() => dress(this));
     new ResizeObserver(() => this.map.resize()).observe(byId("map"));
@@ -81,9 +98,14 @@ class Page {
     document.addEventListener("drop", e => {
       e.preventDefault();
       const file = e.dataTransfer.files[0];
-      if (file) { this.panels.open("route"); readFile(this, file); }
+      if (file) {
+        this.panels.open("route");
+        readFile(this, file);
+      }
     });
-    byId("map").addEventListener("keydown", e => { if (e.key === "a" && this.state.alerts.length) jumpTo(this, this.state.alerts[0]); });
+    byId("map").addEventListener("keydown", e => {
+      if (e.key === "a" && this.state.alerts.length) jumpTo(this, this.state.alerts[0]);
+    });
   }
 
   /** Restore the state of a link, given as the parts of the address after "#". */
@@ -93,10 +115,21 @@ class Page {
     dress(this);
     map.view.go(...placeOf(words));
     if (state.route.length > 1) setRoute(this, state.route);
-    if (words.at !== undefined) { timeline.put(numberIn(words, "at", null)); await goToMoment(this, timeline.at); }
-    if (words.compare !== undefined) await compareMoments(this, true, words.compare === "now" ? state.now : new Cells(numberIn(words, "compare", 0)));
+    if (words.at !== undefined) {
+      timeline.put(numberIn(words, "at", null));
+      await goToMoment(this, timeline.at);
+    }
+    if (words.compare !== undefined)
+      await compareMoments(
+        this,
+        true,
+        words.compare === "now" ? state.now : new Cells(numberIn(words, "compare", 0)),
+      );
     await map.look();
-    if (words.cell !== undefined) { const cell = numberIn(words, "cell", 0); this.choose(tileOfCell(cell), localOfCell(cell)); }
+    if (words.cell !== undefined) {
+      const cell = numberIn(words, "cell", 0);
+      this.choose(tileOfCell(cell), localOfCell(cell));
+    }
     panels.open(state.tab);
   }
 
@@ -109,26 +142,39 @@ class Page {
   }
 
   /** Write the state into the address, so that the address is a link to this view. */
-  remember() { if (this.map.view.gone || this.state.cells.known.size) history.replaceState(null, "", linkTo(this)); }
+  remember() {
+    if (this.map.view.gone || this.state.cells.known.size)
+      history.replaceState(null, "", linkTo(this));
+  }
 }
 
 // Return the place and zoom of a link.
 const placeOf = words => ["x", "y", "zoom"].map(name => numberIn(words, name, START[name]));
 
-// Request the cells of a link before the map has a size; they arrive while the page is set up. Cells that the panel
-// will cover are not requested.
+// Request the cells of a link before the map has a size; they arrive while the page is set up.
+// Cells that the panel will cover are not requested.
 function askEarly(now, words) {
   if (!words.x || [words.at, words.compare, words.borrowed].some(one => one !== undefined)) return;
   const [x, y, zoom] = placeOf(words);
-  const isPhone = innerWidth <= PHONE_PX, width = isPhone ? innerWidth : innerWidth - SIDE_PX, height = isPhone ? innerHeight * (1 - SHEET) : innerHeight;
+  const isPhone = innerWidth <= PHONE_PX;
+  const width = isPhone ? innerWidth : innerWidth - SIDE_PX;
+  const height = isPhone ? innerHeight * (1 - SHEET) : innerHeight;
   now.show(boxOf({ x, y, zoom, width, height }), levelOf(zoom)).catch(() => {});
 }
 
-const now = new Cells(), listed = now.list();
-listed.then(() => askEarly(now, fromHash(location.hash)), () => {});
-const [settings] = await Promise.all([fetch("/settings").then(answer => answer.json()), loadTexts(), listed]);
+const now = new Cells();
+const listed = now.list();
+listed.then(
+  () => askEarly(now, fromHash(location.hash)),
+  () => {},
+);
+const [settings] = await Promise.all([
+  fetch("/settings").then(answer => answer.json()),
+  loadTexts(),
+  listed,
+]);
 document.title = say("title");
 setColours(settings);
 const page = new Page(settings, now);
-globalThis.gripmap = page;  // for use in the browser's console
+globalThis.gripmap = page; // for use in the browser's console
 await page.start();

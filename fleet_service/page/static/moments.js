@@ -8,13 +8,15 @@ import { byId } from "./elements.js";
  * @param {?number} at moment [s since 1970]; null for now
  */
 export async function goToMoment(page, at) {
-  const { state, map } = page, before = state.past, past = at === null ? null : new Cells(at);
+  const { state, map } = page;
+  const before = state.past;
+  const past = at === null ? null : new Cells(at);
   if (past) {
     past.changed = () => map.draw();
     await past.list();
     await past.show(map.view.box, map.view.level);
   }
-  if (state.past !== before) return;  // the user chose another moment meanwhile
+  if (state.past !== before) return; // the user chose another moment meanwhile
   state.past = past;
   if (state.chosen) page.choose(state.chosen.tile, state.chosen.local, state.chosen.sector);
   page.panels.tick();
@@ -24,7 +26,8 @@ export async function goToMoment(page, at) {
 }
 
 /**
- * Begin or end a comparison. The moment that is shown now stays on the right, and the slider changes the left side.
+ * Begin or end a comparison. The moment that is shown now stays on the right, and the slider
+ * changes the left side.
  * @param {Page} page the page
  * @param {boolean} on true to begin
  * @param {Cells} pinned cells for the right side

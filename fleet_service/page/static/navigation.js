@@ -2,11 +2,17 @@
 import { byId } from "./elements.js";
 import { worldX, worldY } from "./grid.js";
 
-const PLACE_ZOOM = 18, ALERT_ZOOM = 17.5, ROUNDS = 8;
-const DOT_PX = .1, DOT_ZOOM = 16, FAR = 1e-3;  // share of the world's width: about 40 km
+const PLACE_ZOOM = 18;
+const ALERT_ZOOM = 17.5;
+const ROUNDS = 8;
+const DOT_PX = 0.1;
+const DOT_ZOOM = 16;
+const FAR = 1e-3; // share of the world's width: about 40 km
 
 /** Show a point [deg], at a zoom at which streets are legible. */
-export function goTo({ map: { view } }, longitude, latitude) { view.go(worldX(longitude), worldY(latitude), Math.max(view.zoom, ALERT_ZOOM)); }
+export function goTo({ map: { view } }, longitude, latitude) {
+  view.go(worldX(longitude), worldY(latitude), Math.max(view.zoom, ALERT_ZOOM));
+}
 
 /** Show the place of an alert, and move the keyboard focus to the map. */
 export function jumpTo(page, alert) {
@@ -22,23 +28,38 @@ export function showPlace({ map }, x, y) {
 
 /** Show an area: its box is west, south, east, north [deg]. */
 export function showArea({ map }, { box: [west, south, east, north] }) {
-  map.view.fit({ west: worldX(west), east: worldX(east), north: worldY(north), south: worldY(south) });
+  map.view.fit({
+    west: worldX(west),
+    east: worldX(east),
+    north: worldY(north),
+    south: worldY(south),
+  });
 }
 
 /** Show all points of a line: pairs of longitude and latitude [deg]. */
 export function fitTo({ map }, points) {
-  const xs = points.map(point => worldX(point[0])), ys = points.map(point => worldY(point[1]));
-  map.view.fit({ west: Math.min(...xs), east: Math.max(...xs), north: Math.min(...ys), south: Math.max(...ys) });
+  const xs = points.map(point => worldX(point[0]));
+  const ys = points.map(point => worldY(point[1]));
+  map.view.fit({
+    west: Math.min(...xs),
+    east: Math.max(...xs),
+    north: Math.min(...ys),
+    south: Math.max(...ys),
+  });
 }
 
 /** Show all cells, including new ones, until the user moves the map. */
 export async function showAll({ map, state }) {
   // Several rounds, because the first ones may know only tiles or squares instead of cells.
   for (let before = null, k = 0; k < ROUNDS; k++) {
-    const { extent } = state.cells, now = JSON.stringify(extent);
+    const { extent } = state.cells;
+    const now = JSON.stringify(extent);
     if (now === before) return;
     before = now;
-    if (extent) { map.view.fit(extent); map.view.gone = false; }
+    if (extent) {
+      map.view.fit(extent);
+      map.view.gone = false;
+    }
     await map.look();
     if (map.view.gone) return;
   }
@@ -46,18 +67,38 @@ export async function showAll({ map, state }) {
 
 /** Show the area with most alerts if there are several distant areas, else the whole map. */
 export async function showFirst(page) {
-  const { map, state } = page, { extent } = state.now;
+  const { map, state } = page;
+  const { extent } = state.now;
   if (extent && extent.east - extent.west > FAR) await page.updates.loadAreas();
-  if (state.areas.length < 2) { await showAll(page); return; }
+  if (state.areas.length < 2) {
+    await showAll(page);
+    return;
+  }
   showArea(page, state.areas[0]);
   await map.look();
 }
 
 /** Extend the view to new cells, unless the user has moved the map. */
 export function followCells(page) {
-  const { map: { view }, state } = page, { box } = view, extent = view.gone || state.past ? null : state.now.extent;
+  const {
+    map: { view },
+    state,
+  } = page;
+  const { box } = view;
+  const extent = view.gone || state.past ? null : state.now.extent;
   if (!extent) return;
-  const size = Math.max((extent.east - extent.west) / view.width, (extent.south - extent.north) / view.height) * view.scale;
-  const isDot = view.zoom < DOT_ZOOM && size < DOT_PX;  // the cells are a dot on a map of the world
-  if (isDot || extent.west < box.west || extent.east > box.east || extent.north < box.north || extent.south > box.south) showFirst(page);
+  const size =
+    Math.max(
+      (extent.east - extent.west) / view.width,
+      (extent.south - extent.north) / view.height,
+    ) * view.scale;
+  const isDot = view.zoom < DOT_ZOOM && size < DOT_PX; // the cells are a dot on a map of the world
+  if (
+    isDot ||
+    extent.west < box.west ||
+    extent.east > box.east ||
+    extent.north < box.north ||
+    extent.south > box.south
+  )
+    showFirst(page);
 }

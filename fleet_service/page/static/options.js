@@ -5,7 +5,11 @@ import { beep } from "./sound.js";
 export function setOption(page, name, value) {
   const { state, updates, panels, map } = page;
   state.show[name] = value;
-  if (name === "borrowed") { state.now.borrowed = value; updates.reload(); panels.refresh(); }
+  if (name === "borrowed") {
+    state.now.borrowed = value;
+    updates.reload();
+    panels.refresh();
+  }
   if (name === "sound" && value) beep();
   page.remember();
   map.draw();

@@ -11,8 +11,19 @@ import { sharePanel } from "./share.js";
 import { stateCard } from "./states.js";
 import { say } from "./texts.js";
 
-const MAKERS = { now: overviewPanel, legend, cell: placePanel, alerts: alertsPanel, route: routePanel, health: healthPanel, share: sharePanel };
-const CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000, NOTE_MS = 10000;
+const MAKERS = {
+  now: overviewPanel,
+  legend,
+  cell: placePanel,
+  alerts: alertsPanel,
+  route: routePanel,
+  health: healthPanel,
+  share: sharePanel,
+};
+const CLOCK_MS = 500;
+const HEALTH_MS = 3000;
+const LIST_MS = 15000;
+const NOTE_MS = 10000;
 
 /** Names of the tabs, in their order. */
 export const TABS = Object.keys(MAKERS);
@@ -20,7 +31,9 @@ export const TABS = Object.keys(MAKERS);
 /** Panels of the page, of which one is open. */
 export class Panels {
   /** @param {Page} page the page, whose state the panels describe */
-  constructor(page) { this.page = page; }
+  constructor(page) {
+    this.page = page;
+  }
 
   /** Open a panel by the name of its tab. */
   open(name) {
@@ -32,8 +45,13 @@ export class Panels {
 
   /** Build the open panel again, and replace the shown one if it differs. */
   async refresh() {
-    const { state } = this.page, name = state.tab, made = await MAKERS[name](this.page);
-    const held = byId("panel"), same = held.childNodes.length === made.length && made.every((one, k) => one.isEqualNode(held.childNodes[k]));
+    const { state } = this.page;
+    const name = state.tab;
+    const made = await MAKERS[name](this.page);
+    const held = byId("panel");
+    const same =
+      held.childNodes.length === made.length &&
+      made.every((one, k) => one.isEqualNode(held.childNodes[k]));
     if (name === state.tab && !same) held.replaceChildren(...made);
   }
 
@@ -46,7 +64,9 @@ export class Panels {
 
   /** Show whether the map is live. Show a card if there is no map. */
   tick() {
-    const { live, state } = this.page, words = live.words(state.past?.at ?? null), place = byId("live");
+    const { live, state } = this.page;
+    const words = live.words(state.past?.at ?? null);
+    const place = byId("live");
     if (place.textContent !== words) place.textContent = words;
     stateCard(this.page);
     place.dataset.state = words === say("live") ? "live" : "late";
@@ -56,7 +76,13 @@ export class Panels {
   keepFresh() {
     const { state, timeline, updates } = this.page;
     setInterval(() => this.tick(), CLOCK_MS);
-    setInterval(() => ["health", "now"].includes(state.tab) && !document.activeElement?.closest("#panel > *") && this.refresh(), HEALTH_MS);
+    setInterval(
+      () =>
+        ["health", "now"].includes(state.tab) &&
+        !document.activeElement?.closest("#panel > *") &&
+        this.refresh(),
+      HEALTH_MS,
+    );
     setInterval(() => {
       state.now.list().catch(() => {});
       timeline.load();

@@ -6,18 +6,44 @@ export class State {
   /** @param {Cells} now cells of the live map */
   constructor(now) {
     Object.assign(this, {
-      now, past: null, comparing: false, pinned: null,  // pinned: cells on the right side of a comparison
-      alerts: [], away: [], areas: [], roads: null, truth: null, hasAlerts: false, isServed: null,
-      route: [], routeFound: null, routeError: "", chosen: null, tab: "now", theme: null, swipe: .5,
+      now,
+      past: null,
+      comparing: false,
+      pinned: null, // pinned: cells on the right side of a comparison
+      alerts: [],
+      away: [],
+      areas: [],
+      roads: null,
+      truth: null,
+      hasAlerts: false,
+      isServed: null,
+      route: [],
+      routeFound: null,
+      routeError: "",
+      chosen: null,
+      tab: "now",
+      theme: null,
+      swipe: 0.5,
     });
-    this.show = { roads: true, bounds: true, overlay: false, borrowed: false, recent: 0, sound: false };
+    this.show = {
+      roads: true,
+      bounds: true,
+      overlay: false,
+      borrowed: false,
+      recent: 0,
+      sound: false,
+    };
   }
 
   /** Cells on the large map: those of the past moment, or of now. */
-  get cells() { return this.past ?? this.now; }
+  get cells() {
+    return this.past ?? this.now;
+  }
 
   /** Return the name of the road near a point [deg]; "" if no road is near. */
-  roadAt(longitude, latitude) { return this.roads?.nearest(worldX(longitude), worldY(latitude)) ?? ""; }
+  roadAt(longitude, latitude) {
+    return this.roads?.nearest(worldX(longitude), worldY(latitude)) ?? "";
+  }
 
   /**
    * Choose the place whose records are shown.
@@ -26,11 +52,20 @@ export class State {
    * @param {?number} sector heading to show first; null without one
    */
   choose(tile, local, sector = null) {
-    const level = this.cells.tiles.get(tile)?.block.level ?? CELL_LEVEL, side = 2 ** (CELL_LEVEL - level) / CELLS;
+    const level = this.cells.tiles.get(tile)?.block.level ?? CELL_LEVEL;
+    const side = 2 ** (CELL_LEVEL - level) / CELLS;
     const { x, y } = middleOf(cellOf(tile, local));
     this.chosen = {
-      tile, local, sector, level, side, records: this.cells.at_place(tile, local),
-      x: Math.floor(x / side) * side, y: Math.floor(y / side) * side, middleX: x, middleY: y,
+      tile,
+      local,
+      sector,
+      level,
+      side,
+      records: this.cells.at_place(tile, local),
+      x: Math.floor(x / side) * side,
+      y: Math.floor(y / side) * side,
+      middleX: x,
+      middleY: y,
     };
   }
 
@@ -55,9 +90,13 @@ export class State {
     this.theme = words.theme ?? this.theme;
     this.now.borrowed = this.show.borrowed;
     this.tab = tabs.includes(words.tab) ? words.tab : this.tab;
-    this.route = (words.route ?? "").split("|").map(point => point.split(",").map(Number)).filter(point => point.length === 2 && point.every(Number.isFinite));
+    this.route = (words.route ?? "")
+      .split("|")
+      .map(point => point.split(",").map(Number))
+      .filter(point => point.length === 2 && point.every(Number.isFinite));
   }
 }
 
 /** Return a number from the parts of a link, or `other` if it is missing or not finite. */
-export const numberIn = (words, name, other) => words[name] !== undefined && Number.isFinite(Number(words[name])) ? Number(words[name]) : other;
+export const numberIn = (words, name, other) =>
+  words[name] !== undefined && Number.isFinite(Number(words[name])) ? Number(words[name]) : other;

@@ -1,8 +1,11 @@
-// States without a map: loading, empty, no service, no network, no answer. Each has a text and the next step.
+// States without a map: loading, empty, no service, no network, no answer. Each has a text and the
+// next step.
 import { byId, make } from "./elements.js";
 import { say } from "./texts.js";
 
-const SILENT_MS = 6000, SLOW_MS = 800;  // silence that counts as an error; time after which a starting page shows "loading"
+const SILENT_MS = 6000;
+// silence that counts as an error; time after which a starting page shows "loading"
+const SLOW_MS = 800;
 
 export function stateOf({ live, state: { now }, map: { asked } }) {
   if (!asked) return performance.now() > SLOW_MS ? "loading" : null;
@@ -14,10 +17,23 @@ export function stateOf({ live, state: { now }, map: { asked } }) {
 }
 
 export function stateCard(page) {
-  const state = stateOf(page), card = byId("card");
+  const state = stateOf(page);
+  const card = byId("card");
   if (card.dataset.state === (state ?? "")) return;
   card.dataset.state = document.body.dataset.state = state ?? "";
   card.hidden = !state;
-  const words = { loading: ["card.loading"], error: [null, "card.error"] }[state] ?? [`card.${state}`, `card.${state}.text`, `card.${state}.command`];
-  card.replaceChildren(...(state ? [words[0] && make("h2", {}, say(words[0])), words[1] && make("p", {}, say(words[1])), words[2] && make("code", {}, say(words[2]))].filter(Boolean) : []));
+  const words = { loading: ["card.loading"], error: [null, "card.error"] }[state] ?? [
+    `card.${state}`,
+    `card.${state}.text`,
+    `card.${state}.command`,
+  ];
+  card.replaceChildren(
+    ...(state
+      ? [
+          words[0] && make("h2", {}, say(words[0])),
+          words[1] && make("p", {}, say(words[1])),
+          words[2] && make("code", {}, say(words[2])),
+        ].filter(Boolean)
+      : []),
+  );
 }

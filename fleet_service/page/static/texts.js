@@ -1,5 +1,5 @@
-// All texts of the page: one table per language, such as texts.en.json. The server selects it by the browser's
-// language.
+// All texts of the page: one table per language, such as texts.en.json. The server selects it by
+// the browser's language.
 let table = {};
 
 export async function loadTexts() {
@@ -7,11 +7,13 @@ export async function loadTexts() {
   document.documentElement.lang = table["language"];
 }
 
-// Fill in a text. In "{count} {count|region|regions}" the second part is the singular or the plural form.
+// Fill in a text. In "{count} {count|region|regions}" the second part is the singular or the plural
+// form.
 export function say(key, values = {}) {
   const text = table[key] ?? key;
   return text.replace(/\{(\w+)(?:\|([^|}]*)\|([^}]*))?\}/g, (_, name, one, many) =>
-    one === undefined ? String(values[name] ?? "") : values[name] === 1 ? one : many);
+    one === undefined ? String(values[name] ?? "") : values[name] === 1 ? one : many,
+  );
 }
 
 export function ago(seconds) {
@@ -23,12 +25,18 @@ export function ago(seconds) {
 }
 
 export function clock(seconds) {
-  const at = new Date(seconds * 1000), two = n => String(n).padStart(2, "0");
-  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+  const at = new Date(seconds * 1000);
+  const two = n => String(n).padStart(2, "0");
+  const date = [at.getFullYear(), two(at.getMonth() + 1), two(at.getDate())].join("-");
+  return `${date} ${[at.getHours(), at.getMinutes(), at.getSeconds()].map(two).join(":")}`;
 }
 
 // Return the browser's time zone at a moment.
 export function zone(seconds = Date.now() / 1000) {
-  const minutes = -new Date(seconds * 1000).getTimezoneOffset(), two = n => String(n).padStart(2, "0"), size = Math.abs(minutes);
-  return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "−" : "+"}${two(Math.floor(size / 60))}:${two(size % 60)}`;
+  const minutes = -new Date(seconds * 1000).getTimezoneOffset();
+  const two = n => String(n).padStart(2, "0");
+  const size = Math.abs(minutes);
+  return minutes === 0
+    ? "UTC"
+    : `UTC${minutes < 0 ? "−" : "+"}${two(Math.floor(size / 60))}:${two(size % 60)}`;
 }

@@ -1,4 +1,5 @@
-// Slider of the stored moments. Its last position is now. The shown moment is always written beside it.
+// Slider of the stored moments. Its last position is now. The shown moment is always written beside
+// it.
 import { make } from "./elements.js";
 import { compareMoments, goToMoment } from "./moments.js";
 import { clock, say, zone } from "./texts.js";
@@ -10,12 +11,33 @@ export class Timeline {
     this.page = page;
     this.moments = [];
     this.timer = null;
-    this.slider = make("input", { type: "range", id: "slider", min: "0", max: "0", value: "0", "aria-label": say("time.label"), oninput: () => this.chosen() });
+    this.slider = make("input", {
+      type: "range",
+      id: "slider",
+      min: "0",
+      max: "0",
+      value: "0",
+      "aria-label": say("time.label"),
+      oninput: () => this.chosen(),
+    });
     this.shown = make("output", { id: "moment", for: "slider" });
-    this.play = make("button", { type: "button", id: "play", onclick: () => this.timer ? this.stop() : this.start() }, say("time.play"));
-    this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => compareMoments(page, !page.state.comparing) }, say("time.compare"));
+    this.play = make(
+      "button",
+      { type: "button", id: "play", onclick: () => (this.timer ? this.stop() : this.start()) },
+      say("time.play"),
+    );
+    this.compare = make(
+      "button",
+      {
+        type: "button",
+        id: "compare",
+        "aria-pressed": "false",
+        onclick: () => compareMoments(page, !page.state.comparing),
+      },
+      say("time.compare"),
+    );
     this.none = make("span", { class: "note" }, say("time.none"));
-    addEventListener("beforeprint", () => this.say(true));  // a printed page has no clock next to it
+    addEventListener("beforeprint", () => this.say(true)); // a printed page has no clock next to it
     addEventListener("afterprint", () => this.say());
     footer.append(this.play, this.slider, this.shown, this.compare, this.none);
     this.say();
@@ -42,15 +64,21 @@ export class Timeline {
   }
 
   say(printed = false) {
-    const stamp = at => `${clock(at)} ${zone(at)}`, now = printed ? say("time.printed", { moment: stamp(this.page.live.now()) }) : say("time.now");
+    const stamp = at => `${clock(at)} ${zone(at)}`;
+    const now = printed
+      ? say("time.printed", { moment: stamp(this.page.live.now()) })
+      : say("time.now");
     const words = this.at === null ? now : say("time.shown", { moment: stamp(this.at) });
     this.shown.textContent = words;
     this.slider.setAttribute("aria-valuetext", words);
     const any = this.moments.length > 0;
     this.none.hidden = any;
     this.none.textContent = say(this.page.settings.archive ? "time.none.archive" : "time.none");
-    for (const one of [this.play, this.slider, this.compare]) Object.assign(one, { disabled: !any, hidden: !any });
-    this.compare.textContent = say(this.page.state.comparing ? "time.compare.stop" : "time.compare");
+    for (const one of [this.play, this.slider, this.compare])
+      Object.assign(one, { disabled: !any, hidden: !any });
+    this.compare.textContent = say(
+      this.page.state.comparing ? "time.compare.stop" : "time.compare",
+    );
     this.compare.setAttribute("aria-pressed", String(this.page.state.comparing));
   }
 
@@ -64,8 +92,14 @@ export class Timeline {
     this.play.textContent = say("time.stop");
     const step = async () => {
       await this.chosen();
-      if (this.at === null) { this.stop(); return; }
-      this.timer = setTimeout(() => { this.slider.value = Number(this.slider.value) + 1; step(); }, PLAY_MS);
+      if (this.at === null) {
+        this.stop();
+        return;
+      }
+      this.timer = setTimeout(() => {
+        this.slider.value = Number(this.slider.value) + 1;
+        step();
+      }, PLAY_MS);
     };
     this.timer = -1;
     step();

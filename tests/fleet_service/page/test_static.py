@@ -48,7 +48,7 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
     """
     modules = {
         "main": (
-            'import { add as sum, ONE } from "./a.js";\n'
+            'import {\n  add as sum,\n  ONE,\n} from "./a.js";\n'
             'import { two } from "./b.js";\nsay(sum(two(), ONE));\n'
         ),
         "a": (
@@ -102,6 +102,7 @@ def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
 def test_page_modules_are_short_and_take_nothing_from_elsewhere(path: Path) -> None:
     text = path.read_text()
     assert text.count("\n") <= 400
+    assert max(map(len, text.splitlines())) <= 100
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
     assert "https://" not in text
     assert "innerHTML" not in text
