@@ -47,7 +47,7 @@ class Counts:
 
 class AckSettlement:
     """Queue of received acknowledgements. The sender thread takes them from the queue and removes
-    the acknowledged batches from the outbox (store of unsent and unanswered batches).
+    the acknowledged batches from the outbox.
 
     Attributes:
         clock_behind_s: time [s] by which the vehicle's clock is behind that of the service that

@@ -49,8 +49,8 @@ class HeldBatch:
 
 @dataclass
 class _Sequence:
-    """Sequence numbers of one stream (vehicle, agent run, kind, region): the next free number, and
-    the key of each of its batches in the outbox by sequence number.
+    """Sequence numbers of one stream: the next free number, and the key of each of its batches in
+    the outbox by sequence number.
     """
 
     stream: Stream
@@ -141,21 +141,21 @@ class HeldBatches:
         self.bytes = 0
 
     def has_stream(self, stream: Stream) -> bool:
-        """Return True if the index knows the stream (vehicle, agent run, kind, region): it had
-        batches in this run of the agent, or batches of an earlier run are still in the outbox.
+        """Return True if the index knows the stream: it had batches in this run of the agent, or
+        batches of an earlier run are still in the outbox.
         """
         return stream in self._streams
 
     def next_numbers(self, stream: Stream) -> tuple[int, int]:
-        """Return two sequence numbers of a stream (vehicle, agent run, kind, region): the next free
-        number, and the lowest number of a batch in the outbox.
+        """Return two sequence numbers of a stream: the next free number, and the lowest number of a
+        batch in the outbox.
         """
         known = self._streams.get(stream) or _Sequence(stream)
         return known.next, known.first_held()
 
     def keys_within(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> set[int]:
-        """Return the keys of the batches in the outbox that belong to a stream (vehicle, agent run,
-        kind, region) and whose sequence numbers lie in one of the inclusive `ranges`.
+        """Return the keys of the batches in the outbox that belong to a stream and whose sequence
+        numbers lie in one of the inclusive `ranges`.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -177,9 +177,8 @@ class HeldBatches:
 
     def is_passed_over(self, batch: HeldBatch) -> bool:
         """Return True if the service seems to ignore this batch. That is the case if the batch is
-        the oldest one of its stream (vehicle, agent run, kind, region) in the outbox, and
-        PASSED_OVER later batches of the stream were settled (acknowledged or refused by the
-        service).
+        the oldest one of its stream in the outbox, and PASSED_OVER later batches of the stream were
+        settled (acknowledged or refused by the service).
         """
         sequence = self._streams[batch.stream]
         later = sequence.next - batch.seq - len(sequence.held)

@@ -55,22 +55,14 @@ class StoredBatch:
 
 @dataclass
 class OutboxCounts:
-    """Numbers of records that the outbox (store of batches on disk) of this process has handled:
-
-    - `stored`, and `settled`;
-    - `evicted` for lack of space, by kind;
-    - `damaged`: lost by damage of the file;
-    - `unanswered`: given up, because the service answered only later batches.
-
-    `damages` is the number of times that the file was found damaged.
-    """
+    """Numbers of records that the outbox of this process has handled, by outcome."""
 
     stored: int = 0
     settled: int = 0
+    # dropped for lack of space
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
-    damaged: int = 0  # records lost by damage of the file, as far as known
-    # records of batches that were given up, because the service answered only later batches
-    unanswered: int = 0
+    damaged: int = 0  # lost by damage of the file, as far as known
+    unanswered: int = 0  # given up, because the service answered only later batches
     damages: int = 0  # number of times that the file was found damaged
 
 

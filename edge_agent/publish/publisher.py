@@ -208,8 +208,8 @@ class Publisher:
             log.exception("%d records that cannot be sent are dropped", len(records.vehicle))
 
     def _store_and_send(self) -> None:
-        """Commit the waiting records to the outbox (file on disk), then send them. If the disk does
-        not accept the write, the next round tries again.
+        """Commit the waiting records to the outbox, then send them. If the disk does not accept the
+        write, the next round tries again.
         """
         if not self._waiting:
             return

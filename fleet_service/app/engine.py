@@ -154,8 +154,8 @@ class Engine:
             )
 
     def mark_survived(self) -> None:
-        """Record that the service has run well for a while after starting from its checkpoint
-        (saved state), so that the next start may use it too.
+        """Record that the service has run well for a while after starting from its checkpoint, so
+        that the next start may use it too.
         """
         checkpoints.mark_survived(self._root)
 

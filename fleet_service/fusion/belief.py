@@ -306,8 +306,8 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
 
 @refcount_free_inlined
 def apply_vote(p: Bins, likelihood: Bins, strength: float) -> None:
-    """Multiply a belief `p` (32) in place by the likelihood L̃ (32) of one visit (passage of the
-    cell) with strength s in [0, 1]: p ← p·(s·L̃ + 1 - s). The result is not normalised.
+    """Multiply a belief `p` (32) in place by the likelihood L̃ (32) of one visit with strength s in
+    [0, 1]: p ← p·(s·L̃ + 1 - s). The result is not normalised.
     """
     s = np.float32(strength)
     rest = np.float32(1.0 - strength)

@@ -67,14 +67,14 @@ class BeliefMap:
 
     @property
     def sector(self) -> SmallArray:
-        """Return the heading sector of every slot (stored cell and heading sector), (size,)."""
+        """Return the heading sector of every slot, (size,)."""
         return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
 
     def beliefs(self, slots: IntArray, now: int, rows: Rows | None = None) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
-        sector), (k, 32), predicted to `now` [ns]. It includes the evidence of slippery neighbouring
-        cells, which is weaker if visits to the cell itself gave no friction value. If `rows` is
-        given, read this copy of the state instead of the live one.
+        """Return the belief about the road (32 probabilities of μ) for each slot, (k, 32),
+        predicted to `now` [ns]. It includes the evidence of slippery neighbouring cells, which is
+        weaker if visits to the cell itself gave no friction value. If `rows` is given, read this
+        copy of the state instead of the live one.
         """
         rows = self.store.state.live if rows is None else rows
         rule = _rule_of(self._shape.reader, c.SILENCE, narrow=True)
@@ -82,14 +82,14 @@ class BeliefMap:
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
     def beliefs_at_last_report(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
-        sector), (k, 32), at the time of the slot's last observation.
+        """Return the belief about the road (32 probabilities of μ) for each slot, (k, 32), at the
+        time of the slot's last observation.
         """
         return self._read_for_alerts(self._shape.reader, slots)
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """Return P(slippery) for each slot (cell and heading sector), (k,), at its last
-        observation, from reports of this cell alone (without neighbours).
+        """Return P(slippery) for each slot, (k,), at its last observation, from reports of this
+        cell alone (without neighbours).
         """
         out = np.empty(len(slots))
         weights = SLIPPERY_WEIGHTS[shape_class(self._shape.reader)]
@@ -97,8 +97,8 @@ class BeliefMap:
         return out
 
     def beliefs_for_alerts(self, slots: IntArray) -> FloatArray:
-        """Return the belief about the road (32 probabilities of μ) for each slot (cell and heading
-        sector), (k, 32), at its last observation.
+        """Return the belief about the road (32 probabilities of μ) for each slot, (k, 32), at its
+        last observation.
 
         A vehicle that used little grip may report too low a friction. For alerts this error is
         assumed to be larger than for other readers, so that an alert needs stronger evidence of
@@ -107,8 +107,8 @@ class BeliefMap:
         return self._read_for_alerts(self._shape.alarm, slots)
 
     def _read_for_alerts(self, slope: float, slots: IntArray) -> FloatArray:
-        """Return the belief about the road for each slot (cell and heading sector), (k, 32), at its
-        last observation. `slope` is the assumed error of a value per unit of unused grip.
+        """Return the belief about the road for each slot, (k, 32), at its last observation. `slope`
+        is the assumed error of a value per unit of unused grip.
 
         Visits without a friction value do not weaken the evidence of neighbouring cells here. So a
         cell between icy cells gets an alert even if its own visitors gave no value.
@@ -137,7 +137,7 @@ class BeliefMap:
 
     def sources(self, slots: IntArray, side: Side, since: IntArray | int) -> IntArray:
         """Return the report times [ns] of the vehicles that reported ice or grip (`side`) in each
-        slot (cell and heading sector), (k, SOURCES), newest first.
+        slot, (k, SOURCES), newest first.
 
         Only reports after `since` [ns] by vehicles that are still trusted count. At most SOURCES
         vehicles per slot are stored; time 0 means no vehicle.
@@ -148,10 +148,9 @@ class BeliefMap:
     def find_sources(
         self, slots: IntArray, side: Side, since: IntArray | int
     ) -> tuple[IntArray, IntArray]:
-        """Return the vehicles that reported ice or grip (`side`) in the slots (one per cell and
-        heading sector), as two arrays (k, SOURCES): index of the vehicle, and time of its report
-        [ns]. The time is 0 if the service no longer trusts the vehicle, or if the report is not
-        after `since` [ns].
+        """Return the vehicles that reported ice or grip (`side`) in the slots, as two arrays (k,
+        SOURCES): index of the vehicle, and time of its report [ns]. The time is 0 if the service no
+        longer trusts the vehicle, or if the report is not after `since` [ns].
         """
         row = self.live.reporters[slots]
         reporters = self.store.state.live.reporters
@@ -174,8 +173,8 @@ def _rule_of(slope: float, silence: float, *, narrow: bool) -> ReadRule:
 def _write_slippery(
     live: Rows, weights: FloatArray, slots: IntArray, p: FloatArray, out: FloatArray
 ) -> None:
-    """Write P(slippery) of each slot (cell and heading sector) to `out` (k,). `p` (32,) is memory
-    for the belief of one slot.
+    """Write P(slippery) of each slot to `out` (k,). `p` (32,) is memory for the belief of one
+    slot.
     """
     for k in range(len(slots)):
         unpack_belief(live.belief, slots[k], p)

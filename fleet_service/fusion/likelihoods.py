@@ -88,9 +88,9 @@ def bound_by_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 @cache
 def _levelled_bounds() -> ByteArray:
-    """Return a table of log-likelihoods for visits (passages of a cell) that give only a lower
-    bound of friction, (m, 32), in steps of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to
-    UTILISED_MOST. The part above the grip used is already flat (`level_above_used`).
+    """Return a table of log-likelihoods for visits that give only a lower bound of friction, (m,
+    32), in steps of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to UTILISED_MOST. The
+    part above the grip used is already flat (`level_above_used`).
     """
     used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)

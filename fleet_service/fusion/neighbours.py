@@ -141,8 +141,8 @@ class MapParts(NamedTuple):
 
 
 class Readout(NamedTuple):
-    """Slot (cell and heading sector) whose belief is read, the time of reading [ns], and the row of
-    the prior of its region.
+    """Slot whose belief is read, the time of reading [ns], and the row of the prior of its
+    region.
     """
 
     slot: int
@@ -181,8 +181,8 @@ def road_beliefs(
     slots: IntArray,
     now: IntArray,
 ) -> FloatArray:
-    """Return the belief about the road for each slot (cell and heading sector), (k, 32), at the
-    times `now` (k,) [ns]. `table` is the hash table that finds slots by key.
+    """Return the belief about the road for each slot, (k, 32), at the times `now` (k,) [ns].
+    `table` is the hash table that finds slots by key.
     """
     parts = MapParts(live, table, weather, rule)
     out = np.empty((len(slots), _BINS))
@@ -206,8 +206,8 @@ def road_beliefs(
 def _read_beliefs(
     parts: MapParts, slots: IntArray, now: IntArray, buffers: Buffers, out: FloatArray
 ) -> None:
-    """Write the belief about the road for each slot (cell and heading sector) at the times `now`
-    (k,) [ns] to `out` (k, 32).
+    """Write the belief about the road for each slot at the times `now` (k,) [ns] to `out` (k,
+    32).
     """
     live = parts.live
     weather = parts.weather
@@ -395,7 +395,7 @@ def _choose_message(
 
 
 def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
-    """Return each slot (cell and heading sector), and the other slots that may belong to the same
+    """Return each slot, and the other slots that may belong to the same
     slippery stretch of road: slot numbers (k, 1 + 2·NEIGHBOURS + ACROSS_CELLS). First comes the
     slot itself, then those before it, those behind it, and those of the other direction of the
     road. Positions without such a slot are NONE.
@@ -487,9 +487,9 @@ def _stored_slippery(live: Rows, row: int) -> float:
 
 @refcount_free
 def _age_belief(live: Rows, weather: Weather, slot: int, now: int, buffers: Buffers) -> int:
-    """Age the belief about a slot (cell and heading sector) to `now` [ns] and write it to the row
-    BELIEF of `buffers.scratch`, or copy it if it is still kept. Return the row number of the prior
-    that the weather of the cell's region gives.
+    """Age the belief about a slot to `now` [ns] and write it to the row BELIEF of
+    `buffers.scratch`, or copy it if it is still kept. Return the row number of the prior that the
+    weather of the cell's region gives.
     """
     p = buffers.scratch[ScratchRow.BELIEF]
     place = slot % len(buffers.kept)

@@ -247,8 +247,8 @@ def _prefetch_votes(state: State, arrivals: Arrivals, votes: Votes, step: int, a
 
 @refcount_free_inlined
 def _open_window(state: State, slot: int) -> int:
-    """Open a lateness window (list of recent observations) for a slot (cell and heading sector)
-    without one. Store in it a copy of the slot's belief, and return the row number of the window.
+    """Open a lateness window for a slot without one. Store in it a copy of the slot's belief, and
+    return the row number of the window.
     """
     state.used[FREE_WINDOWS] -= 1
     window = int(state.free_windows[state.used[FREE_WINDOWS]])
@@ -269,9 +269,7 @@ def _open_window(state: State, slot: int) -> int:
 
 @refcount_free
 def _open_reporters(state: State, slot: int, window: int) -> None:
-    """Allocate a list of recent reporters for a slot (cell and heading sector) that has a window
-    (recent observations) but no such list yet.
-    """
+    """Allocate a list of recent reporters for a slot that has a window but no such list yet."""
     row = state.used[REPORTERS_USED]
     state.used[REPORTERS_USED] += 1
     state.live.cells[slot].reporters = row
@@ -416,8 +414,8 @@ def _commit_windows(
 
 @refcount_free_inlined
 def _shorten_window(state: State, slot: int, window: int, entry: int) -> None:
-    """Make `entry` the first observation of a lateness window (list of recent observations); free
-    the window if `entry` is NONE.
+    """Make `entry` the first observation of a lateness window; free the window if `entry` is
+    NONE.
     """
     windows = state.windows
     windows[window].head = entry

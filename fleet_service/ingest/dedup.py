@@ -34,7 +34,7 @@ StreamKey = tuple[int, int, Kind, int]
 
 
 class SequenceTracker:
-    """Accepted batches of one stream (vehicle, start, kind, region).
+    """Accepted batches of one stream.
 
     Attributes:
         key: name of the stream.
@@ -59,9 +59,7 @@ class SequenceTracker:
         self.runs: list[int] | tuple[int, ...] = _NONE
 
     def accepted(self, seq: int) -> bool:
-        """Return True if the batch of this stream (vehicle, start, kind, region) with this sequence
-        number was accepted before.
-        """
+        """Return True if the batch of this stream with this sequence number was accepted before."""
         # An odd number of limits up to `seq` means that it lies in a run.
         return seq <= self.low or bisect_right(self.runs, seq) % 2 == 1
 
@@ -79,8 +77,8 @@ class SequenceTracker:
         return True
 
     def add(self, seqs: list[int]) -> None:
-        """Mark sequence numbers of batches of this stream (vehicle, start, kind, region), given in
-        ascending order, as accepted.
+        """Mark sequence numbers of batches of this stream, given in ascending order, as
+        accepted.
         """
         # the most frequent case: consecutive numbers
         if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:
@@ -132,7 +130,7 @@ class ArchivedRows(NamedTuple):
 
 
 class SequenceTrackers:
-    """Accepted batches of all streams (vehicle, start, kind, region) of one service."""
+    """Accepted batches of all streams of one service."""
 
     def __init__(self) -> None:
         self._streams: dict[StreamKey, SequenceTracker] = {}

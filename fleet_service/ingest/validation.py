@@ -93,8 +93,8 @@ class Clock(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Reason for refusing a batch (message with records): name of the broken rule (for counting),
-    row number, and text for the sender.
+    """Reason for refusing a batch: name of the broken rule (for counting), row number, and text for
+    the sender.
     """
 
     rule: str

@@ -97,8 +97,8 @@ class FencedBucket:
 
     def create_key(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
         """Upload a file of the archive's secret keys to the bucket; its name must be new. There is
-        one exception. If a former service uploaded a file of this name after it had lost its lease
-        (ownership), the file belongs to rows that are not valid, and is replaced.
+        one exception. If a former service uploaded a file of this name after it had lost its lease,
+        the file belongs to rows that are not valid, and is replaced.
         """
         if self.assert_alone is None or bucket.create(name, content):
             bucket.put_new(name, content)

@@ -212,7 +212,7 @@ class Lease:
     @property
     def left_s(self) -> float:
         """Return the time [s] for which the service may still acknowledge data in the bucket
-        without another renewal of its lease (ownership); 0 or less if it may not.
+        without another renewal of its lease; 0 or less if it may not.
         """
         return (
             0.0
@@ -441,8 +441,8 @@ class _HolderWatch:
 
 
 def _check_settings(found: LeaseRecord, lease_s: float) -> None:
-    """Raise InputError if `found`, the record of a live holder's lease (ownership), states another
-    lease time than `lease_s` [s]: such a holder could still acknowledge data after a take-over.
+    """Raise InputError if `found`, the record of a live holder's lease, states another lease time
+    than `lease_s` [s]: such a holder could still acknowledge data after a take-over.
     """
     if found.lease_s not in (0.0, lease_s):
         problem = (

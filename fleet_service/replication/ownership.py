@@ -87,8 +87,8 @@ class Ownership:
             self.lease.lost = True
 
     def release(self) -> None:
-        """Release the lease (ownership) of the archive's copy, if any; the service may acknowledge
-        nothing afterwards.
+        """Release the lease of the archive's copy, if any; the service may acknowledge nothing
+        afterwards.
         """
         if self.lease is not None:
             self.lease.release(self.to if self.leaves else "")
@@ -129,8 +129,8 @@ def acquire_archive(
     log_line: Callable[[str], None],
     signs: Signs | None = None,
 ) -> Ownership | None:
-    """Lock an archive and, if it has a copy, wait for the lease (ownership) of the copy. Return the
-    ownership of both, or None if `stop` is set first.
+    """Lock an archive and, if it has a copy, wait for the lease of the copy. Return the ownership
+    of both, or None if `stop` is set first.
 
     Args:
         config: settings.
@@ -263,8 +263,8 @@ def _sync_folder(
     log_line: Callable[[str], None],
 ) -> bool:
     """Synchronise the archive's folder with its copy in the bucket. Return False if `stop` is set,
-    or if another service has the lease (ownership). A standby (waiting) service retries while the
-    bucket cannot be reached.
+    or if another service has the lease. A standby (waiting) service retries while the bucket cannot
+    be reached.
     """
     logged = ""
     while not stop.is_set():

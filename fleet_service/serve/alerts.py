@@ -89,9 +89,9 @@ class Alerts:
         }
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers of active alerts after the slots (storage of cells with heading
-        sectors) were renumbered; `place` contains the new number of each slot. A slot with an
-        active alert must not have been removed.
+        """Update the slot numbers of active alerts after the slots were renumbered; `place`
+        contains the new number of each slot. A slot with an active alert must not have been
+        removed.
         """
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 

@@ -98,7 +98,7 @@ class MapState:
 
     def rebuild(self) -> None:
         """Discard the index from tiles to cells, so that it is built again. Call this after the
-        slots (storage of cells with heading sectors) were renumbered.
+        slots were renumbered.
         """
         self._slots.clear()
         self._indexed = 0

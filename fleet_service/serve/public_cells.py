@@ -141,8 +141,8 @@ class PublicCells:
         return found
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers after the slots (storage of cells with heading sectors) were
-        renumbered; `place` contains the new numbers, -1 for removed slots.
+        """Update the slot numbers after the slots were renumbered; `place` contains the new
+        numbers, -1 for removed slots.
         """
         self.visitors.renumber(place)
         stay = np.flatnonzero(place[: self._size] >= 0)

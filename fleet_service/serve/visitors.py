@@ -67,8 +67,8 @@ class Visitors:
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
     def renumber(self, place: IntArray) -> None:
-        """Update the slot numbers of the counted visitors after the slots (storage of cells with
-        heading sectors) were renumbered; `place` contains the new numbers, -1 for removed slots.
+        """Update the slot numbers of the counted visitors after the slots were renumbered; `place`
+        contains the new numbers, -1 for removed slots.
         """
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)

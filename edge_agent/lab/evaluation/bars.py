@@ -22,8 +22,8 @@ PRIOR_WIDTH: Final = 0.9 * 1.15  # width of the 90 % interval of the uniform pri
 
 
 class EstimatorBar(NamedTuple):
-    """A figure (named number) with a target: its name, the function that reads it from the results
-    (NaN if not measured), its unit and its target.
+    """A figure with a target: its name, the function that reads it from the results (NaN if not
+    measured), its unit and its target.
     """
 
     name: str

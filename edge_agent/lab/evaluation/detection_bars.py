@@ -29,8 +29,8 @@ SHARE: Final = "1"
 
 
 class DetectionBar(NamedTuple):
-    """Definition of one figure (named number) of the detection evaluation: the drives that the
-    figure covers, the function that computes it from a tally (sums and counts), and its unit.
+    """Definition of one figure of the detection evaluation: the drives that the figure covers, the
+    function that computes it from a tally (sums and counts), and its unit.
 
     `length` is the class of drives, "short" or "long"; "" means both together. `bars` are the
     targets for "rough" cars (large sensor errors, as in real cars) and "plain" cars (small errors).
@@ -237,8 +237,8 @@ DETECTION: Final = (
 
 
 def detection_figures(results: DetectionResults) -> list[Figure]:
-    """Return the figures (named numbers) of the detection evaluation, for every entry of the list
-    DETECTION. Figures with a target come first, each with its standard error over towns.
+    """Return the figures of the detection evaluation, for every entry of the list DETECTION.
+    Figures with a target come first, each with its standard error over towns.
 
     A figure is called `NAME.KIND`, and its standard error `NAME.KIND.se`. NAME is the name in
     DETECTION. KIND is the kind of cars: "rough" (large sensor errors, as in real cars) or "plain"

@@ -117,9 +117,7 @@ class Store:
 
     @property
     def live(self) -> Cells:
-        """Return the state of all slots (one per cell and heading sector) as columns: belief,
-        counts and times.
-        """
+        """Return the state of all slots as columns: belief, counts and times."""
         if self._columns is None or self._columns[0] is not self.state.live:
             self._columns = (self.state.live, cells_of(self.state.live))
         return self._columns[1]
@@ -146,21 +144,17 @@ class Store:
         ]
 
     def slots_of(self, keys: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each key (cell and heading sector); NONE if the key
-        has no slot.
-        """
+        """Return the slot (row number) (n,) of each key; NONE if the key has no slot."""
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     @property
     def table(self) -> IntArray:
-        """Return the hash table in which compiled code finds slots (one per cell and heading
-        sector) by key.
-        """
+        """Return the hash table in which compiled code finds slots by key."""
         return self._slots
 
     def slots_for(self, keys: IntArray) -> IntArray:
-        """Return the slot (row number) (n,) of each key (cell and heading sector). An unknown key
-        gets a new slot, which begins with the prior.
+        """Return the slot (row number) (n,) of each key. An unknown key gets a new slot, which
+        begins with the prior.
         """
         slots = self.slots_of(keys)
         new = np.flatnonzero(slots == NONE)
@@ -250,8 +244,8 @@ class Store:
             self.state = rebuild_reporters(self.state, self.size, now - c.SOURCE_NS // NS - _AHEAD)
 
     def untouched(self, before: int) -> BoolArray:
-        """Return a mask of slots (one per cell and heading sector), (size,): True if the last visit
-        of a vehicle was before `before` [ns] and no other record refers to the slot.
+        """Return a mask of slots, (size,): True if the last visit of a vehicle was before `before`
+        [ns] and no other record refers to the slot.
         """
         cells = self.state.live.cells[: self.size]
         pairs = self.state.pairs
@@ -262,9 +256,9 @@ class Store:
         return np.asarray(found)
 
     def drop(self, gone: BoolArray) -> IntArray:
-        """Delete the slots (one per cell and heading sector) that the mask `gone` (size,) selects;
-        all must be `untouched` (not visited recently, and not referred to). Return the new number
-        of each slot, NONE for deleted ones.
+        """Delete the slots that the mask `gone` (size,) selects; all must be `untouched` (not
+        visited recently, and not referred to). Return the new number of each slot, NONE for deleted
+        ones.
         """
         stay = np.flatnonzero(~gone)
         place = np.full(self.size, NONE, np.int64)
@@ -287,9 +281,9 @@ class Store:
 
 
 def find_due_windows(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
-    """Return the lateness windows (recent observations of a cell) that contain observations older
-    than `before` [ns], as two arrays of row numbers: windows in which all observations are lower
-    bounds of friction, and windows with at least one measured value.
+    """Return the lateness windows that contain observations older than `before` [ns], as two arrays
+    of row numbers: windows in which all observations are lower bounds of friction, and windows with
+    at least one measured value.
     """
     found = np.empty(len(windows), np.int64)
     plain = _find_due_windows(windows, before, 0, found)
