@@ -18,8 +18,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.backfill import vehicle_file_of
 from edge_agent.app.tuned_memberships import (
@@ -34,7 +32,6 @@ from edge_agent.app.tuned_memberships import (
 from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.signal_log import read_log
-from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import (
     OBJECTIVES,
     TuningScores,
@@ -47,6 +44,7 @@ from edge_agent.lab.tuning.objectives import (
 )
 from edge_agent.lab.tuning.own_logs import own_drives
 from edge_agent.lab.tuning.search import Iteration, Objective, Problem, Progress, Result
+from edge_agent.lab.tuning.study import run_search
 from schemas.errors import InputError
 from schemas.runtime import figures
 from schemas.vehicle import load_vehicle
@@ -292,18 +290,17 @@ def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -
     name, "random" or "colony".
     """
     problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
-    results = {}
-    for stream, (way, search) in enumerate(
-        (("random", random_search.optimise), ("colony", colony.optimise))
-    ):
-        results[way] = search(
+    return {
+        way: run_search(
+            way,
             problem,
             ants=ants,
             iterations=iterations,
-            rng=np.random.default_rng([seed, stream]),
+            seed=seed,
             progress=progress_printer(way, iterations, time.monotonic, print_flushed),
         )
-    return results
+        for way in WAYS[1:]
+    }
 
 
 def print_flushed(line: str) -> None:

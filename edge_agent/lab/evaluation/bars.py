@@ -68,7 +68,7 @@ def worth_of(name: str) -> Callable[[Results], float]:
     filter variant's interval score of friction divided by that of another. For example, the score
     with fuzzy sets is divided by the score without them.
     """
-    return lambda results: worth.ratio(results.worth, name)
+    return lambda results: worth.score_ratio(results.worth, name)
 
 
 def mean(values: FloatArray | None) -> float:

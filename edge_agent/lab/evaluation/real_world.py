@@ -115,7 +115,7 @@ def in_winter(seed: int) -> bool:
     return seed % 2 == 1
 
 
-def town(
+def simulate_town(
     seed: int, cars: int, seconds: float, *, cobbles: bool = False
 ) -> tuple[DriveSet, FloatArray]:
     """Simulate cars with large sensor errors (as in real cars) in a town drawn by the seed. Return
@@ -220,7 +220,7 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
     tally.add("lost", np.abs(off["vx"]) > LOST_M_S)
 
 
-def baseline(tally: Tally, batch: DriveSet) -> None:
+def tally_baseline(tally: Tally, batch: DriveSet) -> None:
     """Add two baselines to `tally` (sums of the evaluation): the interval score of the friction
     prior, and the error of the mean wheel speed as an estimate of v_x.
     """
@@ -235,7 +235,7 @@ def baseline(tally: Tally, batch: DriveSet) -> None:
     tally.add("score", interval_score(lower, upper, batch.mu))
 
 
-def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
+def simulate_standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
     """Simulate cars of all vehicle presets that stand on a slope of `slope` [1]. Some have ordinary
     sensors, and some have large sensor errors (as real cars have) and no torque signal.
     """
@@ -249,7 +249,7 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
     return batches
 
 
-def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
+def largest_speed(estimator: str, batches: Sequence[DriveSet]) -> float:
     """Return the largest speed [m/s], in any direction, that the estimator reports for cars that
     stand.
     """
@@ -276,8 +276,8 @@ def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) ->
     tallies = {name: Tally() for name in (*estimators, "baseline")}
     world = None
     for seed in seeds[:towns]:
-        batch, used = town(seed, cars, seconds)
-        baseline(tallies["baseline"], batch)
+        batch, used = simulate_town(seed, cars, seconds)
+        tally_baseline(tallies["baseline"], batch)
         world = world or RealWorldResults({}, batch, {})
         for name in estimators:
             reported = estimates(bank_of(name, batch.vehicles), batch)
@@ -287,7 +287,7 @@ def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) ->
         raise InputError("seeds", "are none", "give at least one")
     world.found = {name: tally.means() for name, tally in tallies.items()}
     for slope in STANDING_SLOPES:
-        batches = standing(slope, seeds, 10.0 if quick else STANDING_S)
+        batches = simulate_standing(slope, seeds, 10.0 if quick else STANDING_S)
         for name in estimators:
-            world.found[name][f"standing_{100 * slope:.0f}pct.v_max"] = fastest(name, batches)
+            world.found[name][f"standing_{100 * slope:.0f}pct.v_max"] = largest_speed(name, batches)
     return world

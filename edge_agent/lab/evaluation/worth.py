@@ -41,7 +41,7 @@ from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet, join_drives
-from edge_agent.lab.evaluation.real_world import interval_score, town
+from edge_agent.lab.evaluation.real_world import interval_score, simulate_town
 from edge_agent.lab.simulation import PRESETS, DriveSetup, simulate_manoeuvre
 from edge_agent.lab.simulation.relief import ROADS
 from schemas.numeric import FloatArray
@@ -89,11 +89,11 @@ def campaign(
     """
     cars, seconds, count = (2, 5.0, 1) if quick else (CARS, TOWN_S, SEEDS)
     chosen = [seeds[0]] if quick else list(seeds[:count])
-    found = ways()
+    found = compared_designs()
     scores: dict[str, dict[str, list[float]]] = {way: {} for way in found}
     for seed in chosen:
-        rides = town(seed, cars, seconds, cobbles=seed % 2 == 1)[0]
-        batches = [rides, manoeuvres(seed, 2.0 if quick else DRIVE_S)]
+        rides = simulate_town(seed, cars, seconds, cobbles=seed % 2 == 1)[0]
+        batches = [rides, simulate_manoeuvres(seed, 2.0 if quick else DRIVE_S)]
         for way, designs in found.items():
             parts = [_score_drives(batches, design) for design in designs]
             for name in parts[0]:
@@ -110,7 +110,7 @@ def campaign(
     }
 
 
-def ways() -> dict[str, list[MixtureDesign]]:
+def compared_designs() -> dict[str, list[MixtureDesign]]:
     """Return, by the name of each filter variant, the parameter tables (`MixtureDesign`) of its
     filters. A variant whose vertices (corners of fuzzy sets) come from several searches has one
     filter per search.
@@ -139,7 +139,7 @@ def without_sets() -> MixtureDesign:
     return design._replace(fuzzy_outputs=np.zeros(SETS), rules=rules)
 
 
-def manoeuvres(seed: int, seconds: float) -> DriveSet:
+def simulate_manoeuvres(seed: int, seconds: float) -> DriveSet:
     """Simulate one drive of each manoeuvre, `seconds` [s] long, with misaligned sensors. The seed
     determines vehicle, friction and road.
     """
@@ -193,7 +193,7 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
     return found
 
 
-def ratio(scores: Scores, name: str) -> float:
+def score_ratio(scores: Scores, name: str) -> float:
     """Return the figure `name`: the mean interval score of one filter variant over all seeds,
     divided by that of another variant. RATIOS states the two variants; the result is NaN if either
     was not measured.
@@ -241,11 +241,13 @@ def barred_figures(scores: Scores) -> list[Figure]:
     """Return all figures of the comparison of filter variants: first the ratios, which have
     targets, then all others.
     """
-    barred = [Figure(name, ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()]
+    barred = [
+        Figure(name, score_ratio(scores, name), "1", bar, "less") for name, bar in BARS.items()
+    ]
     plain = [
-        Figure(name, ratio(scores, name), "1")
+        Figure(name, score_ratio(scores, name), "1")
         for name in RATIOS
-        if name not in BARS and not math.isnan(ratio(scores, name))
+        if name not in BARS and not math.isnan(score_ratio(scores, name))
     ]
     return barred + plain + figures(scores)
 

@@ -102,8 +102,8 @@ def compare_searches(
         drives = [drive._replace(seed=100 * seed + k) for k, drive in enumerate(study.HELD_OUT)]
         held_out = study.record(drives, duration)
         for name, sets in GIVEN.items():
-            searched.setdefault(name, []).append(study.overall(sets, train))
-            judged.setdefault(name, []).append(study.overall(sets, held_out))
+            searched.setdefault(name, []).append(study.mean_log_likelihood(sets, train))
+            judged.setdefault(name, []).append(study.mean_log_likelihood(sets, held_out))
         for place, (name, search) in enumerate(SEARCHES.items()):
             result = search(
                 _problem(train),
@@ -113,7 +113,7 @@ def compare_searches(
             )
             searched.setdefault(name, []).append(result.value)
             judged.setdefault(name, []).append(
-                study.overall(study.memberships_of(result.best), held_out)
+                study.mean_log_likelihood(study.memberships_of(result.best), held_out)
             )
         log_line(
             f"seed {seed}: "

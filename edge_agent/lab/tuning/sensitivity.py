@@ -36,8 +36,8 @@ from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators.friction_mixture.state.constants import Constants
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign, design_of
 from edge_agent.lab.evaluation.batch import DriveSet
-from edge_agent.lab.evaluation.real_world import SURE_GRIP, town
-from edge_agent.lab.evaluation.worth import ESTIMATOR, manoeuvres, run_filter
+from edge_agent.lab.evaluation.real_world import SURE_GRIP, simulate_town
+from edge_agent.lab.evaluation.worth import ESTIMATOR, run_filter, simulate_manoeuvres
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.thresholds import CALLED_SHARE, EXCITED_SHARE, SLIPPERY_MU
@@ -101,9 +101,9 @@ def simulate_drives(
     """
     drives = []
     for seed in seeds:
-        batch, used = town(seed, cars, town_s)
+        batch, used = simulate_town(seed, cars, town_s)
         drives.append(JudgedDrives(batch, used >= EXCITED_SHARE))
-        other = manoeuvres(seed, drive_s)
+        other = simulate_manoeuvres(seed, drive_s)
         drives.append(JudgedDrives(other, np.zeros(other.mu.shape, bool)))
     return drives
 

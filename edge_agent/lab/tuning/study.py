@@ -165,7 +165,7 @@ def _noisy(
     return noisy
 
 
-def setting(condition: Condition) -> Setting:
+def filter_setting(condition: Condition) -> Setting:
     """Return the setting of paper 004's filter for a condition: its noise R is VARIANCE times the
     condition's `scale`.
     """
@@ -176,7 +176,7 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
     """Return the scores of memberships on the drives under the condition of the measurement noise R
     called `name`.
     """
-    filters = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
+    filters = make_bank(drives.vehicles, memberships, filter_setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
     log_likelihoods = np.nan_to_num(
         reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST
@@ -190,11 +190,11 @@ def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudySco
     )
 
 
-def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
+def score_interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
     """Return (interval score, coverage) of the 90 % friction interval under the condition of the
     measurement noise called `name`.
     """
-    reported = make_bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(
+    reported = make_bank(drives.vehicles, memberships, filter_setting(CONDITIONS[name])).advance(
         drives.t, drives.signals[name]
     )
     truth = np.full(reported.mu.shape, MU)
@@ -204,7 +204,7 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
     )
 
 
-def overall(memberships: Memberships, drives: StudySet) -> float:
+def mean_log_likelihood(memberships: Memberships, drives: StudySet) -> float:
     """Return the objective of the search: the mean log-likelihood of the innovations (measurement
     minus prediction) over all conditions of the measurement noise R [nat/s].
     """
@@ -225,7 +225,7 @@ def objective_on(drives: StudySet) -> Objective:
     """Return the objective of the search on the given drives, as a function of a vector of ten
     vertices (corners of fuzzy sets).
     """
-    return lambda vector: overall(memberships_of(vector), drives)
+    return lambda vector: mean_log_likelihood(memberships_of(vector), drives)
 
 
 def problem_on(drives: StudySet, positions: int) -> Problem:
@@ -237,7 +237,7 @@ def problem_on(drives: StudySet, positions: int) -> Problem:
     )
 
 
-def search(
+def run_search(
     way: str,
     problem: Problem,
     *,

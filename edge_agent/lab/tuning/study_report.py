@@ -21,8 +21,8 @@ from edge_agent.lab.tuning.study import (
     WAYS,
     StudyScores,
     StudySet,
+    mean_log_likelihood,
     memberships_of,
-    overall,
     scores_of,
 )
 from schemas.runtime.figures import Figure
@@ -99,7 +99,7 @@ def run(
     problem = study.problem_on(done.train, positions)
     for seed in seeds:
         for way in WAYS:
-            result = study.search(
+            result = study.run_search(
                 way,
                 problem,
                 ants=ants,
@@ -125,7 +125,7 @@ def figures(done: Study) -> list[Figure]:
                 f"tuning.{name}.{way}", [scores_of(one, done.held_out, name) for one in sets]
             )
         for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
-            values = [overall(one, recorded) for one in sets]
+            values = [mean_log_likelihood(one, recorded) for one in sets]
             listed += _mean_sd(f"tuning.overall.{way}.{drives}", values, "nat/s")
             overalls[f"{way}.{drives}"] = values
     for drives in ("train", "held_out"):
@@ -196,7 +196,7 @@ def scores(done: Study, way: str) -> dict[str, Score]:
     """
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
-        intervals = [study.interval(done.best(way), recorded, name) for name in CONDITIONS]
+        intervals = [study.score_interval(done.best(way), recorded, name) for name in CONDITIONS]
         per_condition = [scores_of(done.best(way), recorded, name) for name in CONDITIONS]
         found[drives] = Score(
             interval_score=float(np.mean([score for score, _ in intervals])),

@@ -155,7 +155,9 @@ def test_memberships_of_the_papers_filter_gain_on_held_out_drives() -> None:
     default = scores["default"].held_out.log_likelihood
     colony = scores["colony"].held_out.log_likelihood
     assert colony > default + 1.0
-    found = study.overall(shipped_memberships("paper-aco-fckf"), study.record(study.HELD_OUT))
+    found = study.mean_log_likelihood(
+        shipped_memberships("paper-aco-fckf"), study.record(study.HELD_OUT)
+    )
     assert found == pytest.approx(colony, rel=0.02)
 
 

@@ -26,7 +26,7 @@ def driven() -> tuple[DriveSet, FloatArray]:
     Return also an array (T, 6): for each sample and car the largest share of the available grip
     that any wheel used.
     """
-    return real_world.town(FIGURES, 6, 40.0)
+    return real_world.simulate_town(FIGURES, 6, 40.0)
 
 
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
@@ -57,7 +57,7 @@ def test_the_prior_is_always_right_and_never_tells_anything(
 ) -> None:
     found = figures(driven, saying(driven[0], *PRIOR))
     baseline = Tally()
-    real_world.baseline(baseline, driven[0])
+    real_world.tally_baseline(baseline, driven[0])
     assert found["coverage90"] == 1.0
     assert found["width"] == found["width.all"] == pytest.approx(1.0)
     assert found["false_ice"] == found["below"] == found["rmse_vx"] == found["lost"] == 0.0
@@ -119,7 +119,7 @@ def test_every_second_town_is_in_winter() -> None:
         False,
         True,
     ]
-    batch, _ = real_world.town(FIGURES + 1, 2, 2.0)
+    batch, _ = real_world.simulate_town(FIGURES + 1, 2, 2.0)
     assert np.isfinite(batch.mu).all()
 
 
@@ -150,7 +150,7 @@ def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(
 
 
 def test_cars_stand_on_the_slope_they_were_put_on() -> None:
-    batches = real_world.standing(0.05, range(FIGURES, FIGURES + 3), 2.0)
+    batches = real_world.simulate_standing(0.05, range(FIGURES, FIGURES + 3), 2.0)
     assert len(batches) == 6
     for batch in batches:
         assert not batch.truth["true_vx"].any()

@@ -28,11 +28,13 @@ def test_worth_is_the_ratio_of_means_with_its_spread_per_surface() -> None:
         }.items()
     }
     found = {figure.name: figure for figure in worth.figures(scores)}
-    assert worth.ratio(scores, "fuzzy.worth") == pytest.approx(0.6)
-    assert worth.ratio(scores, "ants.worth") == pytest.approx(0.625)
-    assert worth.ratio(scores, "ants.worth.random") == pytest.approx(1.0)
+    assert worth.score_ratio(scores, "fuzzy.worth") == pytest.approx(0.6)
+    assert worth.score_ratio(scores, "ants.worth") == pytest.approx(0.625)
+    assert worth.score_ratio(scores, "ants.worth.random") == pytest.approx(1.0)
     assert np.isnan(
-        worth.ratio({way: scores[way] for way in ("fuzzy", "default", "colony")}, "fuzzy.worth")
+        worth.score_ratio(
+            {way: scores[way] for way in ("fuzzy", "default", "colony")}, "fuzzy.worth"
+        )
     )
     assert found["fuzzy.worth.sd"].value == pytest.approx(0.1 * np.sqrt(2.0))
     assert found["ants.worth.random.difference"].value == pytest.approx(0.0)

@@ -22,10 +22,10 @@ from edge_agent.lab.tuning.study import (
     TRAIN,
     VARIANCE,
     StudySet,
-    overall,
+    mean_log_likelihood,
     record,
+    run_search,
     scores_of,
-    search,
 )
 from schemas.runtime.figures import Figure
 from schemas.signals import S
@@ -61,7 +61,7 @@ def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: Stud
 
 def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
     scales = [
-        study.setting(CONDITIONS[name]).noise[0] / VARIANCE
+        study.filter_setting(CONDITIONS[name]).noise[0] / VARIANCE
         for name in ("right", "too-small", "too-large")
     ]
     assert scales == pytest.approx([1.0, 0.1, 10.0])
@@ -93,11 +93,11 @@ def test_search_is_reproducible_and_never_worse_than_untuned_sets(
 ) -> None:
     problem = study.problem_on(drives, positions=7)
     for way in study.WAYS:
-        first, again = (search(way, problem, ants=3, iterations=2, seed=5) for _ in range(2))
-        assert first.value >= overall(Memberships(), drives)
+        first, again = (run_search(way, problem, ants=3, iterations=2, seed=5) for _ in range(2))
+        assert first.value >= mean_log_likelihood(Memberships(), drives)
         assert np.array_equal(first.best, again.best)
         assert first.history == again.history
-        assert first.value == overall(study.memberships_of(first.best), drives)
+        assert first.value == mean_log_likelihood(study.memberships_of(first.best), drives)
 
 
 def test_the_quick_study_writes_figures_table_plot_and_a_tuned_file(
