@@ -7,7 +7,7 @@ over all drives, and the fuzzy sets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -324,47 +324,9 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
 
     values = {figure.name: figure.value for figure in figures}
     drawn, axes = plt.subplots(1, 2, figsize=(11, 4.5), sharey=True, layout="constrained")
-    estimator = line_of(DEFAULT)
     for axis, kind in zip(axes, KINDS, strict=True):
         for road, dash in (("ice", "-"), ("snow", "--")):
-            for way, limits, colour, name in (
-                ("roc", ROC_NATS, estimator.colour, f"belief of {DEFAULT}"),
-                ("flag", ROC_FLAG_MU, TRUTH.colour, "slip flag"),
-            ):
-                found = [
-                    (
-                        values.get(f"{way}.{limit:g}.false_events.{kind}"),
-                        values.get(f"{way}.{limit:g}.{road}.{kind}"),
-                    )
-                    for limit in limits
-                ]
-                known = [
-                    (events, share)
-                    for events, share in found
-                    if events is not None and share is not None
-                ]
-                if known:
-                    axis.plot(
-                        *zip(*known, strict=True),
-                        marker="o",
-                        ms=3,
-                        ls=dash,
-                        color=colour,
-                        label=f"{name}, {road}",
-                    )
-            point = (
-                values.get(f"passes.{road}.short.{kind}"),
-                values.get(f"false_events.short.{kind}"),
-            )
-            if None not in point:
-                axis.plot(
-                    point[1],
-                    point[0],
-                    "*",
-                    ms=11,
-                    color=estimator.colour,
-                    label=f"reported, {road}, short drives",
-                )
+            _draw_roc_curves(axis, values, kind, road, dash)
         oracle = values.get(f"oracle.ice.favoured.short.{kind}")
         if oracle is not None:
             axis.axhline(oracle, color="0.5", ls=":", label="oracle, excited visits on ice")
@@ -381,3 +343,47 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
     drawn.savefig(path, dpi=DPI)
     plt.close(drawn)
     return path
+
+
+def _draw_roc_curves(
+    axis: Axes, values: Mapping[str, float], kind: str, road: str, dash: str
+) -> None:
+    """Draw the curves of the estimator and of the slip flag for one kind of cars (rough or plain)
+    and one road (ice or snow), and the point of the reports. Figures that are missing in `values`
+    are left out.
+    """
+    estimator = line_of(DEFAULT)
+    for way, limits, colour, name in (
+        ("roc", ROC_NATS, estimator.colour, f"belief of {DEFAULT}"),
+        ("flag", ROC_FLAG_MU, TRUTH.colour, "slip flag"),
+    ):
+        found = [
+            (
+                values.get(f"{way}.{limit:g}.false_events.{kind}"),
+                values.get(f"{way}.{limit:g}.{road}.{kind}"),
+            )
+            for limit in limits
+        ]
+        known = [
+            (events, share) for events, share in found if events is not None and share is not None
+        ]
+        if known:
+            axis.plot(
+                *zip(*known, strict=True),
+                marker="o",
+                ms=3,
+                ls=dash,
+                color=colour,
+                label=f"{name}, {road}",
+            )
+    share = values.get(f"passes.{road}.short.{kind}")
+    events = values.get(f"false_events.short.{kind}")
+    if share is not None and events is not None:
+        axis.plot(
+            events,
+            share,
+            "*",
+            ms=11,
+            color=estimator.colour,
+            label=f"reported, {road}, short drives",
+        )
