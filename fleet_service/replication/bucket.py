@@ -36,6 +36,15 @@ class CopyError(OSError):
     """
 
 
+def unusable_copy(url: str, error: CopyError) -> InputError:
+    """Return the error with which a command ends because the bucket copy `url` does not answer."""
+    return InputError(
+        "archive.copy",
+        f"{url} cannot be used ({error})",
+        "check the network, endpoint, region and credentials, then start again; no data are lost",
+    )
+
+
 class ObjectBucket:
     """Bucket: access to the objects below a URL.
 

@@ -15,7 +15,7 @@ from typing import BinaryIO, Final, TypeVar
 from fleet_service.archive.format import layout
 from fleet_service.archive.format.files import lock_archive
 from fleet_service.archive.maintenance import compaction
-from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.bucket import CopyError, ObjectBucket, unusable_copy
 from fleet_service.replication.folder_identity import forget_holder, holder_of, save_holder
 from fleet_service.replication.lease import Lease, Standby
 from fleet_service.replication.replica import BucketReplica, open_replica
@@ -217,11 +217,7 @@ def _acquire_under_lease(
             lease.problem = problem
     except CopyError as error:
         _release_and_close(lease, copy)
-        fix = (
-            "check the network, endpoint, region and credentials, then start again; no data are "
-            "lost"
-        )
-        raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
+        raise unusable_copy(url, error) from error
     except BaseException:
         _release_and_close(lease, copy)
         raise

@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Final, NamedTuple
 
-from fleet_service.replication.bucket import CopyError, ObjectBucket
+from fleet_service.replication.bucket import CopyError, ObjectBucket, unusable_copy
 from fleet_service.replication.fence import Term, largest_epoch
 from fleet_service.replication.fenced_bucket import FencedBucket
 from fleet_service.replication.file_transfer import FileTransfer
@@ -93,13 +93,7 @@ class BucketReplica:
         try:
             return self.sync_under_lease(service)
         except CopyError as error:
-            fix = (
-                "check the network, endpoint, region and credentials, then start again; no data "
-                "are lost"
-            )
-            raise InputError(
-                "archive.copy", f"{self._url} cannot be used ({error})", fix
-            ) from error
+            raise unusable_copy(self._url, error) from error
 
     def sync_under_lease(
         self, service: str | None, term: Term | None = None, *, succeeds: bool = False
