@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.config import moment
@@ -27,10 +28,18 @@ UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def stop_on_signals() -> threading.Event:
-    """Return an event that is set by SIGTERM and Ctrl-C."""
+    """Return an event that is set by SIGTERM and Ctrl-C. The same signal again ends the process at
+    once.
+    """
     stop = threading.Event()
+
+    # `signal.signal` requires a function with these two arguments.
+    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, on_signal)
     return stop
 
 

@@ -196,6 +196,21 @@ def test_run_and_watch_as_processes_from_start_to_signal(
     )
 
 
+SIGNALLED = """
+import os, signal
+from fleet_service.cli.common import stop_on_signals
+stop = stop_on_signals()
+for _ in range(2):
+    os.kill(os.getpid(), signal.SIGTERM)
+    print(stop.is_set(), flush=True)
+"""
+
+
+def test_second_signal_ends_the_process_at_once() -> None:
+    done = subprocess.run([sys.executable, "-c", SIGNALLED], capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("True\n", -signal.SIGTERM)
+
+
 HANGS = """
 import sys, threading
 from fleet_service.app import service
