@@ -78,6 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve the live page of the map until a signal arrives."""
     from fleet_service.client import map_client
+    from schemas.runtime.zenoh_session import configuration
 
     try:
         from fleet_service.page import server
@@ -86,10 +87,12 @@ def run(arguments: argparse.Namespace) -> int:
     except ImportError as error:
         fix = install_command("page")
         raise InputError("page", f"the package {error.name} is missing", fix) from error
+    connection = map_client.connection_settings(arguments.connect, arguments.config)
+    configuration(connection)  # here, because the thread that opens the session cannot end the page
     if arguments.archive is not None:
         _check_archive(arguments.archive)
     settings = server.PageSettings(
-        connection=map_client.connection_settings(arguments.connect, arguments.config),
+        connection=connection,
         host=arguments.host,
         port=arguments.port,
         names=arguments.name,

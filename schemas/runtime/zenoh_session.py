@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +42,12 @@ _OPEN: Final = "transport/unicast/open_timeout"
 NAME: Final = "{name}"
 ENDPOINTS: Final = "connect/endpoints"
 _TLS: Final = "transport/link/tls"
-_FIX: Final = "write the protocol before it, such as tcp/127.0.0.1:7447 or tls/HOST:7447"
+# Zenoh tries an endpoint without a port, or of another protocol, again and again without success.
+_ENDPOINT: Final = re.compile(
+    r"(tcp|udp|tls|quic|quic_datagram|ws)/\S+:\d{1,5}([?#].*)?"
+    r"|(unixsock-stream|unixpipe|serial|vsock)/.+"
+)
+_FIX: Final = "write PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447 or tls/HOST:7447"
 
 log = logging.getLogger(__name__)
 
@@ -57,14 +63,17 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             vehicles, each with its own certificate.
 
     Raises:
-        InputError: Zenoh refuses a setting, a certificate that it names does not exist, or a
-            connection time limit would prevent the session from trying its second endpoint.
+        InputError: an endpoint is malformed, Zenoh refuses a setting, a certificate that it names
+            does not exist, or a connection time limit would prevent the session from trying its
+            second endpoint.
     """
     if len(settings.connect) > 1 and settings.config.get(_TIMEOUT, 0) != 0:
         problem = "with a limit Zenoh tries the first endpoint only"
         raise InputError(
             f"zenoh.config.{_TIMEOUT}", problem, "leave it out; open_session waits for a router"
         )
+    if settings.config.get("mode", CLIENT["mode"]) == CLIENT["mode"]:
+        _check_endpoints(settings.connect)
     config = zenoh.Config()
     chosen = {**CLIENT, ENDPOINTS: settings.connect, **settings.config}
     for key, value in chosen.items():
@@ -73,10 +82,6 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             config.insert_json5(key, text.replace(NAME, name))
         except zenoh.ZError as error:
             problem = f"Zenoh refuses {text[:60]}"
-            if key == ENDPOINTS:
-                raise InputError(
-                    "connect", f"{', '.join(settings.connect)[:60]} is not an endpoint", _FIX
-                ) from error
             raise InputError(
                 f"zenoh.config.{key}", problem, "see Zenoh's configuration reference"
             ) from error
@@ -89,6 +94,15 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             fix = "make it with `fleet-service certs`, or correct the path"
             raise InputError(f"zenoh.config.{_TLS}/{key}", f"there is no file {value}", fix)
     return config
+
+
+def _check_endpoints(endpoints: Sequence[str]) -> None:
+    """Raise InputError if a client could never connect: no endpoint, or one that is malformed."""
+    if not endpoints:
+        raise InputError("connect", "names no router", _FIX)
+    for endpoint in endpoints:
+        if not _ENDPOINT.fullmatch(endpoint):
+            raise InputError("connect", f"{endpoint[:60]} is not an endpoint", _FIX)
 
 
 def quality_of(topic: keys.Topic) -> dict[str, Any]:

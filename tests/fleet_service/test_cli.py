@@ -128,7 +128,7 @@ def test_a_missing_router_is_said(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_an_endpoint_without_a_protocol_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "--connect", "127.0.0.1:7447"]) == 2
-    assert "write the protocol before it, such as tcp/127.0.0.1:7447" in capsys.readouterr().err
+    assert "write PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447" in capsys.readouterr().err
 
 
 def test_parameters_parted_by_an_ampersand_are_named(capsys: pytest.CaptureFixture[str]) -> None:

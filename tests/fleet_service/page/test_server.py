@@ -26,6 +26,7 @@ import zenoh
 from fleet_service.archive.format import snapshots
 from fleet_service.cli import main
 from fleet_service.fusion import Fusion
+from fleet_service.page import server
 from fleet_service.page.files import Files
 from fleet_service.page.health import parse_metrics
 from fleet_service.page.map_mirror import MapMirror
@@ -390,3 +391,11 @@ def test_files_of_the_map_that_are_missing_are_refused(
     for words in (base, ["--roads", none + ".parquet"]):
         assert main(["page", "--connect", "tcp/127.0.0.1:1", *words]) == 2
         assert "none" in capsys.readouterr().err
+
+
+def test_connection_that_zenoh_refuses_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(server, "run", lambda *_: pytest.fail("the page is served"))
+    assert main(["page", "--connect", "localhost"]) == 2
+    assert capsys.readouterr().err.startswith("error: connect: localhost is not an endpoint; ")

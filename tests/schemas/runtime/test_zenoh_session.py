@@ -25,6 +25,23 @@ def test_a_time_limit_that_hides_the_second_endpoint_is_refused() -> None:
     zenoh_session.configuration(limited.model_copy(update={"connect": two[:1]}))
 
 
+@pytest.mark.parametrize(
+    "endpoint",
+    ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tpc/127.0.0.1:7447", "http/host:80"],
+)
+def test_an_endpoint_that_never_connects_is_refused(endpoint: str) -> None:
+    for connect in ([], [endpoint], ["tcp/127.0.0.1:1", endpoint]):
+        with pytest.raises(InputError, match="^connect: .*; write PROTOCOL/HOST:PORT"):
+            zenoh_session.configuration(ZenohSettings(connect=connect))
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tls/map.example:7447", "tcp/[::1]:1", "tcp/h:1#iface=lo", "unixsock-stream//a"]
+)
+def test_usual_endpoints_are_accepted(endpoint: str) -> None:
+    zenoh_session.configuration(ZenohSettings(connect=[endpoint]))
+
+
 def test_alerts_have_the_highest_priority_and_are_sent_at_once() -> None:
     first = zenoh_session.quality_of(keys.TOPICS["alert"])
     assert (first["priority"], first["express"]) == (zenoh.Priority.REAL_TIME, True)
