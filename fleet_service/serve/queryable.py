@@ -140,6 +140,8 @@ class MapQueryable:
     def __init__(self, answering: Answering, counts: ServiceCounts) -> None:
         self._answering = answering
         self._counts = counts
+        # Zenoh calls this object from one thread per queryable; two more kinds of threads answer.
+        self._counting = threading.Lock()
         self._past = threading.Lock()
         self._past_waiting = threading.BoundedSemaphore(PAST_WAITING)
         self._heavy: list[_QueuedQuery] = []  # heap, with the next query first
@@ -158,7 +160,8 @@ class MapQueryable:
 
     def __call__(self, request: zenoh.Query) -> None:
         """Handle one map query: answer it at once, queue it, or refuse it."""
-        self._counts.queries += 1
+        with self._counting:
+            self._counts.queries += 1
         with self._reply_to(request) as answered:
             # `zenoh.Parameters` is iterable, but its type stub does not declare this.
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment]
@@ -218,14 +221,15 @@ class MapQueryable:
             self._past_waiting.release()
 
     def _queue_query(self, request: zenoh.Query, map_query: MapQuery, cost: float) -> None:
-        self._counts.heavy_queries += 1
         with self._has_queued:
+            self._counts.heavy_queries += 1
             rank = time.monotonic() + cost / PER_S
             heapq.heappush(
                 self._heavy, _QueuedQuery(rank, self._counts.heavy_queries, request, map_query)
             )
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
+                self._counts.refused_queries += 1
                 self._heavy.remove(dropped)
                 heapq.heapify(self._heavy)
             self._has_queued.notify()
@@ -235,7 +239,6 @@ class MapQueryable:
                 )
                 self._worker.start()
         if dropped is not None:
-            self._counts.refused_queries += 1
             self._refuse(
                 dropped.request,
                 InputError(
@@ -291,7 +294,8 @@ class MapQueryable:
         # Catch every error. A query that ends without a reply would mean that there are no data.
         except Exception as error:
             answered.is_complete = True
-            self._counts.failures["answer"] += 1
+            with self._counting:
+                self._counts.failures["answer"] += 1
             log.exception("a query failed")
             with suppress(zenoh.ZError):
                 request.reply_err(
@@ -304,7 +308,8 @@ class MapQueryable:
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
         # Other field names are free text of the client, which must not become names of counters.
         field = error.field if error.field in MapQuery.model_fields else "query"
-        self._counts.bad_queries[field] += 1
+        with self._counting:
+            self._counts.bad_queries[field] += 1
         with suppress(zenoh.ZError), request:  # the session may have been closed
             request.reply_err(str(error), encoding=TEXT)
 

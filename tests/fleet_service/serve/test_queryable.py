@@ -4,10 +4,12 @@ empty map.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -241,3 +243,51 @@ def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) ->
         in answer
         for answer in refused
     )
+
+
+class BadQuery:
+    """Query with an unusable box, as Zenoh passes it to a handler."""
+
+    parameters = (("bbox", "1,2"),)
+
+    def reply_err(self, payload: str, encoding: zenoh.Encoding) -> None:
+        """Accept the error."""
+
+    def drop(self) -> None:
+        """End the query."""
+
+    def __enter__(self) -> BadQuery:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.drop()
+
+
+@pytest.fixture
+def frequent_switches() -> Iterator[None]:
+    """Let threads interrupt each other as often as possible."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("frequent_switches")
+def test_refused_queries_of_several_threads_are_all_counted() -> None:
+    request: Any = BadQuery()
+    for _ in range(400):
+        counts = ServiceCounts()
+        replies = MapQueryable(Answering(lambda *_: AnswerSize(1, 1), nothing), counts)
+        begin = threading.Barrier(4)
+
+        def call(replies: MapQueryable = replies, begin: threading.Barrier = begin) -> None:
+            begin.wait()
+            for _ in range(5):
+                replies(request)
+
+        threads = [threading.Thread(target=call) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert (counts.queries, counts.bad_queries["bbox"]) == (20, 20)
