@@ -32,9 +32,10 @@ HIDDEN: Final = ("west", "south", "east", "north", "cell")
 TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
-def format_text(table: pa.Table, question: Question) -> str:
+def format_text(table: pa.Table, question: Question, *, is_written: bool = False) -> str:
     """Return the first rows of an answer, in the order that the question defines, as a text table
-    for the terminal.
+    for the terminal. If further rows are not shown, name the option that writes them, unless
+    `is_written`.
     """
     shown = add_places(order_rows(table, question).slice(0, SHOWN_ROWS))
     names = [
@@ -52,13 +53,10 @@ def format_text(table: pa.Table, question: Question) -> str:
         "  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True))
         for row in cells
     ]
-    rest = table.num_rows - shown.num_rows
-    return "\n".join(
-        [
-            *lines,
-            f"{table.num_rows} rows" + (f", {rest} not shown (--out writes all)" if rest else ""),
-        ]
-    )
+    total = f"{table.num_rows} rows"
+    if rest := table.num_rows - shown.num_rows:
+        total += f", {rest} not shown" + ("" if is_written else " (--out writes all)")
+    return "\n".join([*lines, total])
 
 
 def format_json_lines(table: pa.Table, question: Question) -> str:

@@ -143,7 +143,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(
         output.format_json_lines(found, question)
         if arguments.json
-        else output.format_text(found, question)
+        else output.format_text(found, question, is_written=arguments.out is not None)
     )
     if arguments.out is not None:
         output.write(found, question, arguments.out)

@@ -59,6 +59,15 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else list_explained(name)
 
 
+def test_rows_not_shown_name_the_option_unless_it_was_given(
+    archive: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert analyze(archive, "grip") == 0
+    assert capsys.readouterr().out.endswith(" not shown (--out writes all)\n")
+    assert analyze(archive, "grip", "--out", str(tmp_path / "grip.csv")) == 0
+    assert capsys.readouterr().out.endswith(" not shown\n")
+
+
 # Columns of the map that map-columns.md explains; tests/deploy/test_docs.py checks it.
 MAP = {field.name for field in tables.MAP_CELL}
 
