@@ -7,9 +7,10 @@ import json
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Final, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
 
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU
@@ -17,6 +18,9 @@ from schemas.thresholds import NS, SLIPPERY_MU
 NAME_PATTERN = r"^[a-z][a-z0-9-]{2,62}$"
 REGION_PATTERN = r"^([0-3]{4}|\*)/([0-3]{3}|\*)/([0-3]{3}|\*)$"
 VehicleName = Annotated[str, Field(pattern=NAME_PATTERN)]
+# Shortest time [days] for which rows are kept. A batch may be sent again for thirty days
+# (ServiceConfig.oldest_s), and its rows are needed to recognise it.
+LEAST_RAW_DAYS: Final = 31
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
@@ -226,8 +230,8 @@ class ServiceConfig(MonitoringSettings):
     raw_days: int = Field(
         default=0,
         ge=0,
-        description="number of days for which raw rows are kept, at least 31; roll-ups are "
-        "always kept; 0: keep all",
+        description=f"number of days for which raw rows are kept, at least {LEAST_RAW_DAYS}; "
+        "roll-ups are always kept; 0: keep all",
     )
     put_to: str | None = Field(
         default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a"
@@ -264,6 +268,13 @@ class ServiceConfig(MonitoringSettings):
         description="enrolment file; reports of other vehicles are ignored, and an enrolled "
         "vehicle has full weight from its first report",
     )
+
+    @field_validator("raw_days")
+    @classmethod
+    def _check_raw_days(cls, days: int) -> int:
+        if 0 < days < LEAST_RAW_DAYS:
+            raise PydanticCustomError("raw_days", f"input should be 0 or at least {LEAST_RAW_DAYS}")
+        return days
 
     @field_validator("archive", mode="before")
     @classmethod

@@ -32,7 +32,6 @@ from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.archive.maintenance.retention import (
-    LEAST_DAYS,
     forget_period,
     forget_vehicle,
     retire_rows,
@@ -41,7 +40,7 @@ from fleet_service.ingest import weather
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
 from schemas import grid, keys, tables, wire
-from schemas.config import ServiceConfig
+from schemas.config import LEAST_RAW_DAYS, ServiceConfig
 from schemas.errors import InputError
 from schemas.weather import Report, encode
 from schemas.wire import Kind
@@ -251,10 +250,10 @@ class ServiceHistory(Lives[Sent]):
 
     def _apply_retention(self, root: Path) -> None:
         today = datetime.fromtimestamp(self._now // SECOND, UTC).date()
-        self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_DAYS - 1)
+        self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_RAW_DAYS - 1)
         with suppress(InputError):
-            retire_rows(root, LEAST_DAYS, today)
-            weather.retire_files(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
+            retire_rows(root, LEAST_RAW_DAYS, today)
+            weather.retire_files(root, self._now // layout.DAY_NS - LEAST_RAW_DAYS - 1)
 
     def _find_problems(self, root: Path, last: bool) -> list[str]:
         rows: Counter[int] = Counter()

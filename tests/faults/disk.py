@@ -31,10 +31,9 @@ from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import BackgroundJobs, archive_jobs
 from fleet_service.archive.format import reading
 from fleet_service.archive.maintenance import disk_reserve
-from fleet_service.archive.maintenance.retention import LEAST_DAYS
 from fleet_service.ingest.inbox import Message
 from schemas import wire
-from schemas.config import ServiceConfig
+from schemas.config import LEAST_RAW_DAYS, ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.thresholds import NS
 from schemas.wire import Kind
@@ -47,7 +46,9 @@ from tests.outboxes import read_batches
 SIZE_MB: Final = 24
 BALLAST: Final = "ballast"  # file that fills the disk
 VEHICLES: Final = 5
-CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
+CONFIG: Final = ServiceConfig(
+    compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_RAW_DAYS
+)
 RESERVE_MB: Final = 2  # [MB] the same share of this small disk as 64 MB of a real one
 JOBS: Final = ("compaction", "checkpoint")
 STUCK_S: Final = 60.0

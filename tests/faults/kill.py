@@ -25,9 +25,9 @@ from fleet_service.analytics import synthetic
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import layout
 from fleet_service.archive.maintenance.compaction import compact
-from fleet_service.archive.maintenance.retention import LEAST_DAYS, drop_checkpoints, due_folders
+from fleet_service.archive.maintenance.retention import drop_checkpoints, due_folders
 from fleet_service.serve.encode import cell_table
-from schemas.config import ServiceConfig
+from schemas.config import LEAST_RAW_DAYS, ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import make_figure
@@ -149,7 +149,7 @@ def begin_with_old_rows(archive: Path) -> None:
 
 def old_days(archive: Path) -> list[Path]:
     """Return the folders of the days that retention (deletion of old rows) removes."""
-    return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
+    return due_folders(archive, LEAST_RAW_DAYS, datetime.now(UTC).date())
 
 
 def _find_finished_jobs(archive: Path) -> frozenset[str]:
@@ -199,7 +199,14 @@ def _run_round(
         there.make_load([f"sim-{number:03}"], RATE, seed=number).start()
     for part in there.loads:
         part.line_with("ready: ")
-    words = ["retention", "--archive", str(there.archive), "--raw-days", str(LEAST_DAYS), "--yes"]
+    words = [
+        "retention",
+        "--archive",
+        str(there.archive),
+        "--raw-days",
+        str(LEAST_RAW_DAYS),
+        "--yes",
+    ]
     retention = Part("retention", [sys.executable, "-m", "fleet_service.cli", *words], there.folder)
     killed = 0
     began = time.time()

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import tables
-from schemas.config import AgentConfig, ServiceConfig, load
+from schemas.config import LEAST_RAW_DAYS, AgentConfig, ServiceConfig, load
 from schemas.errors import InputError
 
 
@@ -44,6 +44,16 @@ def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path)
         load(tmp_path / "nosuch.json", ServiceConfig)
     with pytest.raises(InputError, match="^fleet: cannot read .*nosuch.json"):
         load(tmp_path / "nosuch.json", Enrolment, "fleet")
+
+
+def test_raw_days_too_few_to_recognise_repeats_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "service.json"
+    for days in (0, LEAST_RAW_DAYS):
+        path.write_text(json.dumps({"raw_days": days}))
+        assert load(path, ServiceConfig).raw_days == days
+    path.write_text(json.dumps({"raw_days": LEAST_RAW_DAYS - 1}))
+    with pytest.raises(InputError, match=r"^raw_days: .* 0 or at least 31 \(got 30\);"):
+        load(path, ServiceConfig)
 
 
 @pytest.mark.parametrize("name", ["position_std", "yaw_std"])

@@ -29,13 +29,11 @@ from fleet_service.archive.identity import erasures, vehicle_ids
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.maintenance import iceberg, rollup
 from fleet_service.archive.maintenance.compaction import compact, hold_compaction_lock
+from schemas.config import LEAST_RAW_DAYS
 from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
-# Shortest time [days] for which rows are kept. A batch may be sent again for thirty days
-# (ServiceConfig.oldest_s), and its rows are needed to recognise it.
-LEAST_DAYS: Final = 31
 # With fewer vehicles in a cell, a single one could be recognised. Same as in the secure settings.
 ANONYMOUS: Final = 5
 _KEYS: Final = "keys"
@@ -85,11 +83,11 @@ def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
 
 
 def _last_to_go(raw_days: int, today: date) -> int:
-    if raw_days < LEAST_DAYS:
+    if raw_days < LEAST_RAW_DAYS:
         raise InputError(
             "raw-days",
             f"{raw_days} are too few to recognise repeated batches",
-            f"give {LEAST_DAYS} or more",
+            f"give {LEAST_RAW_DAYS} or more",
         )
     return (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
 
