@@ -79,7 +79,9 @@ def _watch_with_webhook(
     queue = AlertQueue(arguments.webhook_queue or queue_path(arguments.webhook))
     hook = Webhook(arguments.webhook, lambda line: print(line, file=sys.stderr, flush=True), queue)
     try:
-        with serve_metrics("127.0.0.1", arguments.health_port, hook.metrics, hook.health_problems):
+        with serve_metrics(
+            "127.0.0.1", arguments.health_port, hook.metrics, hook.health_problems, "health_port"
+        ):
             watch(hook.send)
     finally:
         hook.close()

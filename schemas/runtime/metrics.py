@@ -7,11 +7,12 @@ counters of its own.
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from socket import SHUT_RD, socket
+from socket import SHUT_RD, gaierror, socket
 from threading import Thread, Timer
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 from urllib.parse import urlsplit
@@ -61,7 +62,7 @@ Troubles = Callable[[], Sequence[str]]
 
 @contextmanager
 def serve_metrics(
-    host: str, port: int | None, read: Read, troubles: Troubles
+    host: str, port: int | None, read: Read, troubles: Troubles, field: str = "metrics_port"
 ) -> Iterator[str | None]:
     """Serve metrics and health until the `with` block ends; yield the address, or None if `port` is
     None. Port 0 selects a free port.
@@ -71,9 +72,11 @@ def serve_metrics(
         read: function that returns all metrics with their current values.
         troubles: function that returns one message per problem of the program; an empty list means
             that it is healthy.
+        field: name of the port's setting or option, for error messages.
 
     Raises:
-        InputError: the port is in use, or the package for the format is missing.
+        InputError: the port is in use, the host is not an address of this machine, or the
+            package for the format is missing.
     """
     if port is None:
         yield None
@@ -86,9 +89,11 @@ def serve_metrics(
     try:
         server = _MetricsServer((host, port), handler)
     except OSError as error:
-        raise InputError(
-            "metrics_port", f"cannot listen on {host}:{port} ({error.strerror})", "give another"
-        ) from error
+        problem = f"cannot listen on {host}:{port} ({error.strerror})"
+        if isinstance(error, gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            fix = "give an address of this machine"
+            raise InputError("metrics_host", problem, fix) from error
+        raise InputError(field, problem, "give another") from error
     server.daemon_threads = True
     thread = Thread(target=server.serve_forever, name="monitor", daemon=True)
     thread.start()

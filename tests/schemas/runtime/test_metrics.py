@@ -81,6 +81,14 @@ def test_a_taken_port_is_said() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"^metrics_port: cannot listen on 127.0.0.1:{port}"):
             serve_metrics("127.0.0.1", port, read_metrics, list).__enter__()
+        with pytest.raises(InputError, match="^health_port: "):
+            serve_metrics("127.0.0.1", port, read_metrics, list, "health_port").__enter__()
+
+
+@pytest.mark.parametrize("host", ["203.0.113.1", "no host"])
+def test_host_that_is_not_of_this_machine_is_named(host: str) -> None:
+    with pytest.raises(InputError, match=f"^metrics_host: cannot listen on {host}:0 "):
+        serve_metrics(host, 0, read_metrics, list).__enter__()
 
 
 def test_request_that_arrives_drop_by_drop_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
