@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
-from pydantic_core import PydanticCustomError
 
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU
@@ -234,7 +233,9 @@ class ServiceConfig(MonitoringSettings):
         "roll-ups are always kept; 0: keep all",
     )
     put_to: str | None = Field(
-        default=None, description="URI to which compacted files are copied, e.g. s3://bucket/a"
+        default=None,
+        pattern=r"^(/|[a-z][a-z0-9+.-]*://).",
+        description="URI to which compacted files are copied, e.g. s3://bucket/a",
     )
     queue_batches: int = Field(
         default=20_000,
@@ -273,7 +274,7 @@ class ServiceConfig(MonitoringSettings):
     @classmethod
     def _check_raw_days(cls, days: int) -> int:
         if 0 < days < LEAST_RAW_DAYS:
-            raise PydanticCustomError("raw_days", f"input should be 0 or at least {LEAST_RAW_DAYS}")
+            raise ValueError(f"should be 0 or at least {LEAST_RAW_DAYS}")
         return days
 
     @field_validator("archive", mode="before")
@@ -349,10 +350,11 @@ def explain(error: ValidationError, where: str, model: type[BaseModel]) -> Input
     secret = "store" in first["loc"]
     given = "…" if secret else json.dumps(first["input"], default=str)
     shown = given if len(given) <= 60 else given[:57] + "..."
-    problem = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+    text = first["msg"].removeprefix("Value error, ")
+    problem = f"{text[0].lower()}{text[1:]}"
     if first["type"] == "missing":
         problem = "is missing"
-    elif first["type"] != "json_invalid":  # there the input is the whole file
+    elif first["loc"]:  # otherwise the input is the whole file
         problem += f" (got {shown})"
     return InputError(field, problem, f"correct it in the {where}")
 

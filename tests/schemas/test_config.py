@@ -56,6 +56,14 @@ def test_raw_days_too_few_to_recognise_repeats_are_refused(tmp_path: Path) -> No
         load(path, ServiceConfig)
 
 
+@pytest.mark.parametrize("uri", ["foo", "s3://", "bucket/folder"])
+def test_uri_that_can_name_no_folder_is_refused(tmp_path: Path, uri: str) -> None:
+    path = tmp_path / "service.json"
+    path.write_text(json.dumps({"put_to": uri}))
+    with pytest.raises(InputError, match="^put_to: "):
+        load(path, ServiceConfig)
+
+
 @pytest.mark.parametrize("name", ["position_std", "yaw_std"])
 def test_an_accuracy_that_a_service_rejects_is_refused_at_the_start(
     tmp_path: Path, name: str

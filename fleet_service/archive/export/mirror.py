@@ -38,7 +38,7 @@ def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
         }
     except (pa.ArrowInvalid, OSError) as error:
         raise InputError(
-            "to", f"cannot use {uri} ({error})", "give a URI such as s3://bucket/folder"
+            "put_to", f"cannot use {uri} ({error})", "give a URI such as s3://bucket/folder"
         ) from error
     count = 0
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):

@@ -312,7 +312,7 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
     assert mirror.copy_new_files(root, there.as_uri()) == 0
     originals[0].write_bytes(originals[1].read_bytes() + b"")
     assert mirror.copy_new_files(root, there.as_uri()) == 1
-    with pytest.raises(InputError, match="^to: cannot use nonsense://x "):
+    with pytest.raises(InputError, match="^put_to: cannot use nonsense://x "):
         mirror.copy_new_files(root, "nonsense://x")
 
 

@@ -176,17 +176,17 @@ def test_what_is_no_host_is_refused(host: str) -> None:
         (
             {"routers": {"r-1": {}}, "vehicles": ["shard-0"]},
             [],
-            "error: content: value error, 'shard-0' occurs",
+            "error: content: 'shard-0' occurs twice, but a name has only one role; correct",
         ),
         (
             {"routers": {"r-1": {"hosts": ["a b"]}}},
             [],
-            "error: routers.r-1.hosts.0: value error, 'a b' is neither a host name",
+            "error: routers.r-1.hosts.0: 'a b' is neither a host name",
         ),
         (
             {"routers": {"r-1": {"hosts": [LONG]}}},
             [],
-            "error: routers.r-1.hosts.0: value error, 'aaaa",
+            "error: routers.r-1.hosts.0: 'aaaa",
         ),
         ({"routers": {"r-1": {}}, "cars": []}, [], "error: cars: "),
         ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is not a valid duration; "),
