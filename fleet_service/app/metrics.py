@@ -177,7 +177,7 @@ def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list
     if engine.copy is not None and engine.copy.backoff.trouble is not None:
         found.append(engine.copy.backoff.trouble)
     elif engine.settlement.failing:
-        found.append("segments cannot be written")
+        found.append(f"segments cannot be written ({engine.settlement.failing})")
     if not engine.holding.may_acknowledge:
         found.append("the lease is not renewed, so nothing is acknowledged")
     if pulse.queued > FULL * config.queue_batches:

@@ -45,7 +45,7 @@ class Settlement:
         counts: counts of the service.
 
     Attributes:
-        failing: True if the last segment could not be written.
+        failing: reason why the last segment was not stored, or not copied; else empty.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Settlement:
         self._holding = holding
         self._counts = counts
         self._tasks = Tasks()
-        self.failing = False
+        self.failing = ""
 
     @property
     def is_full(self) -> bool:
@@ -160,9 +160,9 @@ class Settlement:
                 self._counts.failures["copy"] = self._holding.copy.backoff.failures
             else:
                 self._counts.failures["segment"] += 1
-            self.failing = True
+            self.failing = error.strerror or str(error) or type(error).__name__
         else:
-            self.failing = False
+            self.failing = ""
             self._shared.tiles.acknowledge()
         return self._intake.acks.messages(self._intake.now) if self._holding.may_acknowledge else []
 

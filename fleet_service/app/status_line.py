@@ -42,6 +42,7 @@ class StatusLine:
         self._reported_at = now
         self._reported = counts.observations
         behind = self._clock.lag() * 1e-9
+        failing = self._engine.settlement.failing
         rest = ", ".join(
             f"{name} {n}"
             for name, n in sorted(counts.as_dict().items())
@@ -52,6 +53,7 @@ class StatusLine:
             f"{self._engine.state.fusion.size} cells, {self._engine.alerts.count} alerts, queue "
             f"{len(self._inbox)}"
             + (f"; {rest}" if rest else "")
+            + (f"; nothing is acknowledged: {failing}" if failing else "")
             + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
             + (
                 f"; the system clock jumped {-behind:.0f} s ahead, and no report confirms this"

@@ -100,13 +100,13 @@ def test_each_trouble_is_told(tmp_path: Path) -> None:
     engine = Engine(config, tmp_path)
     well = Pulse(turn_age_s=0.1, queued=3, routers=1, clock_lag_s=0.0)
     assert metrics.health_problems(engine, well, config) == []
-    engine.settlement.failing = True
+    engine.settlement.failing = "No space left on device"
     ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0, answer_s=60.0)
     assert metrics.health_problems(engine, ill, config) == [
         "no router is connected",
         "the worker has been idle for 60 s",
         "a tile of an answer has been in progress for 60 s",
-        "segments cannot be written",
+        "segments cannot be written (No space left on device)",
         "the queue is full",
     ]
     engine.close()
