@@ -18,7 +18,7 @@ import numpy as np
 
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
-from schemas.thresholds import METRES_PER_DEGREE, NS
+from schemas.thresholds import METRES_PER_DEGREE, NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 State = Literal["raised", "changed", "cleared"]
@@ -74,11 +74,14 @@ class StretchAlert:
     def to_line(self) -> str:
         """Return the alert of the road stretch as one line of text."""
         word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
+        # The reason of an active alert is that of its newest cell, not of the cell with this mu.
+        probability = f"P(mu < {SLIPPERY_MU}) = {self.p_slippery:.2f}"
+        why = self.reason if self.state == "cleared" else probability
         return (
             f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m "
             f"{self.direction}, heading {' and '.join(self.headings)}; mu {self.mu:.2f} "
             f"[{self.mu_lower:.2f}, {self.mu_upper:.2f}], {self.vehicles} vehicles; since "
-            f"{format_time(self.since)}, state of {format_time(self.time)}; {self.reason}; id "
+            f"{format_time(self.since)}, state of {format_time(self.time)}; {why}; id "
             f"{self.id}"
         )
 

@@ -13,6 +13,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,14 @@ def test_end_of_a_stretch_states_its_own_time_and_reason() -> None:
     (ended,) = take_alerts(road, alert(0, raised=False, at=5), alert(100, at=1))
     assert (ended.state, ended.time) == ("cleared", (1_800_000_000 + 5) * SECOND)
     assert ended.reason == "later visits measured good grip"
+
+
+def test_line_of_a_stretch_has_the_values_of_one_cell() -> None:
+    ice = replace(alert(0, at=0, mu=0.14), p_slippery=0.999, reason="P(mu < 0.4) = 0.95 > 0.9")
+    snow = replace(alert(1, at=9, mu=0.35), p_slippery=0.91, reason="P(mu < 0.4) = 0.91 > 0.9")
+    (stretch,) = take_alerts(Stretches(), ice, snow)
+    assert "mu 0.14" in stretch.to_line()
+    assert "; P(mu < 0.4) = 1.00; " in stretch.to_line()
 
 
 @contextmanager
