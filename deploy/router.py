@@ -12,8 +12,10 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from socket import socket, socketpair
 
 import zenoh
 
@@ -118,27 +120,41 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run a router with parsed options until a signal ends it; return the exit code."""
-    # Zenoh's threads inherit the signal mask. A signal that one of them received would never wake
-    # Python's main thread.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
-        session, endpoints = open_router(args.config, args.listen)
-        with serve_metrics(
-            args.metrics_host, args.metrics_port, lambda: router_metrics(session), lambda: ()
-        ) as address:
-            print(f"router: {' '.join(endpoints)}", flush=True)
-            if address:
-                print(f"metrics: {address}/metrics", flush=True)
-            signal.sigwait(ENDING)
+        with _catch_signals() as signals:
+            session, endpoints = open_router(args.config, args.listen)
+            with serve_metrics(
+                args.metrics_host, args.metrics_port, lambda: router_metrics(session), lambda: ()
+            ) as address:
+                print(f"router: {' '.join(endpoints)}", flush=True)
+                if address:
+                    print(f"metrics: {address}/metrics", flush=True)
+                signals.recv(1)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     closing = threading.Thread(target=session.close, daemon=True)
     closing.start()
     closing.join(CLOSE_S)
     return 0
+
+
+@contextmanager
+def _catch_signals() -> Iterator[socket]:
+    """Yield a socket that receives a byte for each SIGINT or SIGTERM, whichever thread of the
+    process the signal reaches. At the end, restore the former handling.
+    """
+    reader, writer = socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        handlers = [signal.signal(number, lambda *_: None) for number in ENDING]
+        descriptor = signal.set_wakeup_fd(writer.fileno())
+        try:
+            yield reader
+        finally:
+            signal.set_wakeup_fd(descriptor)
+            for number, handler in zip(ENDING, handlers, strict=True):
+                signal.signal(number, handler)
 
 
 if __name__ == "__main__":

@@ -40,11 +40,12 @@ def test_clients_of_a_router_hear_each_other() -> None:
 
 def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
     command = [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("router: tcp/127.0.0.1:")
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_S) == 0
+    for _ in range(8):  # a signal directly after the line must not kill the process
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("router: tcp/127.0.0.1:")
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_wrong_configuration_names_the_field_and_the_fix(
@@ -52,11 +53,9 @@ def test_a_wrong_configuration_names_the_field_and_the_fix(
 ) -> None:
     path = tmp_path / "router.json5"
     path.write_text("{ mode: 'wanderer' }")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    before = signal.getsignal(signal.SIGTERM)
     assert router.main(["--config", str(path)]) == 2
-    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, (
-        "who called it hears signals as before"
-    )
+    assert signal.getsignal(signal.SIGTERM) == before, "who called it hears signals as before"
     assert capsys.readouterr().err.startswith("error: config: cannot use")
 
 
