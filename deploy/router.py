@@ -24,7 +24,7 @@ from schemas.runtime import commandline
 from schemas.runtime.link_watch import router_metrics
 from schemas.runtime.metrics import serve_metrics
 from schemas.runtime.process import force_exit
-from schemas.runtime.zenoh_session import error_reason
+from schemas.runtime.zenoh_session import check_certificates, error_reason
 
 CLOSE_S = 2.0
 ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -70,17 +70,21 @@ def open_router(
     listens.
 
     Raises:
-        InputError: the configuration is invalid, or an endpoint is used by another process.
+        InputError: the configuration is invalid, names a certificate that does not exist, or an
+            endpoint is used by another process.
     """
     settings = load_configuration(config, listen)
+    check_certificates(settings)
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:
-        raise InputError(
-            "listen",
-            f"the router cannot start ({error_reason(error)})",
-            "free the port or choose another",
-        ) from error
+        reason = error_reason(error)
+        fix = (
+            "free the port or choose another"
+            if "in use" in reason
+            else f"correct the endpoint, or {config}"
+        )
+        raise InputError("listen", f"the router cannot start ({reason})", fix) from error
     if listen is None:
         return session, list(json.loads(settings.get_json("listen/endpoints")))
     reply = next(iter(session.get(f"@/{session.zid()}/router"))).ok

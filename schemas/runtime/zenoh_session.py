@@ -85,6 +85,14 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             raise InputError(
                 f"zenoh.config.{key}", problem, "see Zenoh's configuration reference"
             ) from error
+    check_certificates(config, "zenoh.config.")
+    return config
+
+
+def check_certificates(config: zenoh.Config, section: str = "") -> None:
+    """Raise InputError if a certificate or private key in a configuration does not exist. `section`
+    stands before the name of the setting in the message.
+    """
     for key, value in json.loads(config.get_json(_TLS)).items():
         if (
             key.endswith(("certificate", "private_key"))
@@ -92,8 +100,7 @@ def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
             and not Path(value).is_file()
         ):
             fix = "make it with `fleet-service certs`, or correct the path"
-            raise InputError(f"zenoh.config.{_TLS}/{key}", f"there is no file {value}", fix)
-    return config
+            raise InputError(f"{section}{_TLS}/{key}", f"there is no file {value}", fix)
 
 
 def _check_endpoints(endpoints: Sequence[str]) -> None:
@@ -115,10 +122,10 @@ def quality_of(topic: keys.Topic) -> dict[str, Any]:
 
 
 def error_reason(error: zenoh.ZError) -> str:
-    """Return the message of an error of Zenoh without its end, which is a path of the machine that
-    built Zenoh.
+    """Return the message of an error of Zenoh as one line, without its end, which is a path of the
+    machine that built Zenoh.
     """
-    return str(error).partition(" at /")[0].strip()
+    return " ".join(str(error).partition(" at /")[0].split())
 
 
 def connected_routers(session: zenoh.Session) -> frozenset[str]:

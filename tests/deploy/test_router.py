@@ -4,6 +4,7 @@ can be read and contain only settings that Zenoh knows.
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -52,11 +53,13 @@ def test_a_wrong_configuration_names_the_field_and_the_fix(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "router.json5"
-    path.write_text("{ mode: 'wanderer' }")
+    path.write_text("{\n mode: 'wanderer' \n")
     before = signal.getsignal(signal.SIGTERM)
     assert router.main(["--config", str(path)]) == 2
     assert signal.getsignal(signal.SIGTERM) == before, "who called it hears signals as before"
-    assert capsys.readouterr().err.startswith("error: config: cannot use")
+    err = capsys.readouterr().err
+    assert err.startswith("error: config: cannot use")
+    assert err.count("\n") == 1
 
 
 def test_an_address_that_is_no_endpoint_names_the_form() -> None:
@@ -66,8 +69,22 @@ def test_an_address_that_is_no_endpoint_names_the_form() -> None:
 
 def test_a_taken_port_is_said() -> None:
     session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
-    with session, pytest.raises(InputError, match="^listen: "):
+    with session, pytest.raises(InputError, match="^listen: .*; free the port"):
         router.open_router(listen=endpoints[0])
+
+
+def test_a_failure_other_than_a_taken_port_has_another_fix() -> None:
+    with pytest.raises(InputError, match="^listen: .*; correct the endpoint"):
+        router.open_router(listen="tcp/127.0.0.1")
+
+
+def test_a_missing_key_of_the_router_is_named(tmp_path: Path) -> None:
+    key = tmp_path / "router-a.key"
+    config = tmp_path / "router.json5"
+    tls = {"listen_private_key": str(key)}
+    config.write_text(json.dumps({"mode": "router", "transport": {"link": {"tls": tls}}}))
+    with pytest.raises(InputError, match=f"listen_private_key: there is no file {key}; "):
+        router.open_router(config)
 
 
 @pytest.mark.parametrize(
