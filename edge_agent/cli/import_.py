@@ -7,7 +7,8 @@ from __future__ import annotations
 import argparse
 import difflib
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from edge_agent.inputs.merge import Merged
     from edge_agent.inputs.profile import Profile
     from edge_agent.inputs.recording import Recording
+    from schemas.numeric import FloatArray
     from schemas.vehicle import Vehicle
 
 MOST_NAMES = 30  # maximum number of signal names in an error message
@@ -57,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert the recordings to a signal log, write a draft of a profile, or list the known
-    profiles, as the options ask. Return 1 if the log has none of the signals that the estimators
-    need, else 0.
+    profiles, as the options ask. Return 1 if the log lacks a channel that the estimators need,
+    else 0.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import read_source, write_log
@@ -83,22 +85,25 @@ def run(args: argparse.Namespace) -> int:
     _check_shifts(shifts, recordings)
     for path, recording in zip(args.source, recordings, strict=True):
         require_no_estimates(path, recording.signals)
+    draft_path = args.draft or out.with_suffix(".profile.json")
+    draft = None
     if profile is None:
-        profile = _write_draft(recordings, out, args.draft or out.with_suffix(".profile.json"))
+        profile = draft = _make_draft(recordings, out, draft_path)
     with bounded_memory(args.source[0]):  # a clock that jumps by years gives too many rows
         merged, profile = _merge(recordings, profile, vehicle, shifts)
     write_log(out, merged, profile, [source.name for source in args.source])
+    if draft is not None:
+        draft_path.write_text(draft.to_json(), encoding="utf-8")
+        drafted = f"drafted from names, {len(draft.channels)} channels; check it before use"
+        print(f"{draft_path}: {drafted}")
     lacking = _lacking_channels(merged.columns)
     for note in [*merged.notes, *_missing_signals(lacking, profile, recordings)]:
         print(f"note: {note}")
-    if lacking:
-        print(
-            f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the "
-            "profile"
-        )
     print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
-    has_none = len(lacking) == len(_lacking_channels(()))
-    return commandline.FAILED if has_none else 0
+    if lacking:
+        where = args.profile or draft_path
+        print(_warn_lacking(lacking, where, profile, recordings), file=sys.stderr)
+    return commandline.FAILED if lacking else 0
 
 
 def _check_paths(args: argparse.Namespace) -> None:
@@ -125,9 +130,12 @@ def _check_shifts(shifts: Iterable[str], recordings: Sequence[Recording]) -> Non
             )
 
 
-def _write_draft(recordings: Sequence[Recording], out: Path, target: Path) -> Profile:
-    """Draft a profile for the recordings from the names of their signals, write it to `target`, and
-    return it. `out` is the signal log to write.
+def _make_draft(recordings: Sequence[Recording], out: Path, target: Path) -> Profile:
+    """Return a draft of a profile for the recordings, from the names of their signals. `out` is the
+    signal log to write, and `target` the file that will contain the draft.
+
+    Raises:
+        InputError: no signal has a known name, or `target` cannot be written or was edited.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.names import draft_profile
@@ -152,8 +160,6 @@ def _write_draft(recordings: Sequence[Recording], out: Path, target: Path) -> Pr
             f"{target} exists and may have been edited",
             "use it with --profile, or name another file with --draft",
         )
-    target.write_text(profile.to_json(), encoding="utf-8")
-    print(f"{target}: drafted from names, {len(profile.channels)} channels; check it before use")
     return profile
 
 
@@ -181,13 +187,26 @@ def _merge(
     return align_import(merge_with(profile), profile, vehicle, merge_with)
 
 
-def _lacking_channels(columns: Collection[str]) -> list[str]:
-    """Return the channels that the estimators need and that are not among `columns`."""
+def _lacking_channels(columns: Mapping[str, FloatArray]) -> list[str]:
+    """Return the channels that the estimators need and that have no reading in `columns`."""
     from edge_agent.inputs.log_columns import FRONT_STEERING, NEEDED
 
-    lacking = [name for name in NEEDED if name not in columns]
-    is_steered = any(name in columns for name in FRONT_STEERING)
-    return lacking if is_steered else [*lacking, FRONT_STEERING[0]]
+    read = {name for name, values in columns.items() if any(map(math.isfinite, values))}
+    lacking = [name for name in NEEDED if name not in read]
+    return [*lacking, *FRONT_STEERING[:1]] if read.isdisjoint(FRONT_STEERING) else lacking
+
+
+def _warn_lacking(
+    lacking: Iterable[str], where: object, profile: Profile, recordings: Iterable[Recording]
+) -> str:
+    """Return the warning that a log lacks channels. `where` is the profile that must name them."""
+    recorded = {name for recording in recordings for name in recording.signals}
+    unused = sorted(recorded - profile.needed_signals())[:MOST_NAMES]
+    choice = f"; signals without a channel: {', '.join(unused)}" if unused else ""
+    return (
+        f"warning: no reading of {', '.join(lacking)}: check and replay refuse this log; name the "
+        f"signals in the profile (--profile {where}), or add a source that has them{choice}"
+    )
 
 
 def _missing_signals(

@@ -21,6 +21,7 @@ from edge_agent.inputs.readers import can_log, can_text, gnss, mdf, racelogic, r
 from edge_agent.inputs.readers.dbc import Database
 from edge_agent.inputs.recording import Recording, foreign_errors
 from schemas.errors import InputError
+from schemas.runtime.durable import open_durably
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
@@ -182,7 +183,8 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
     }
     table = pa.table(columns).replace_schema_metadata({PROVENANCE: json.dumps(provenance).encode()})
     try:
-        pq.write_table(table, path, compression="zstd")
+        with open_durably(path) as file:
+            pq.write_table(table, file, compression="zstd")
     except OSError as error:
         raise InputError(
             "out", f"cannot write {path} ({error})", "name a file in a writable folder"

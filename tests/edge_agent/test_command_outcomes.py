@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -20,6 +21,7 @@ from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.spool_file import SpoolFile
 from schemas import tables
+from schemas.signals import per_wheel
 from schemas.wire import Kind
 from tests.edge_agent.service import Router, Service
 from tests.ports import free_ports
@@ -74,14 +76,38 @@ def test_a_log_as_csv_comes_with_the_command_that_converts_it(
     assert {"ax", "omega_fl"} <= set(pq.read_schema(out).names)
 
 
-def test_import_without_any_signal_that_replay_needs_returns_1(
+def test_import_without_a_channel_that_replay_needs_returns_1(
     tmp_path: Path, capsys: Output
 ) -> None:
+    """A column without a reading counts as missing, and the warning lists unused signals."""
     path = tmp_path / "little.csv"
-    path.write_text("t,latitude,longitude\n0.0,57.7,11.9\n0.1,57.7,11.9\n0.2,57.7,11.9\n")
+    wheels = ",".join(per_wheel("omega"))
+    rows = "".join(f"0.{k},1,0,5,50,50,50,,0\n" for k in range(3))
+    path.write_text(f"t,ax,ay,gier,{wheels},delta_fl\n{rows}")
     assert main(["import", str(path), "--out", str(tmp_path / "little.parquet")]) == 1
-    said = capsys.readouterr().out
-    assert "no ax, ay, yaw_rate, omega_fl, omega_fr, omega_rl, omega_rr, delta_fl: replay" in said
+    said = capsys.readouterr().err
+    profile = tmp_path / "little.profile.json"
+    assert "no reading of yaw_rate, omega_rr: check and replay refuse" in said
+    assert f"--profile {profile}" in said
+    assert said.endswith("signals without a channel: gier\n")
+    assert main(["check", str(tmp_path / "little.parquet"), "--vehicle", "class:suv"]) == 2
+
+
+def test_failed_import_leaves_no_file(tmp_path: Path, capsys: Output) -> None:
+    """The wheel radius is missing, then the disk is full."""
+    path = tmp_path / "d.csv"
+    path.write_text("t,ax,WheelSpeed_FL [km/h]\n0.0,1,9\n0.1,1,9\n")
+    command = ["import", str(path), "--out", str(tmp_path / "d.parquet")]
+    assert main(command) == 2
+    assert "give the wheel's radius" in capsys.readouterr().err
+    size = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, size[1]))
+    try:
+        assert main([*command, "--vehicle", "class:suv"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, size)
+    assert "error: out: cannot write" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == ["d.csv"]
 
 
 def test_replay_names_every_format_and_refuses_a_folder_without_files(

@@ -278,7 +278,7 @@ def test_import_keeps_a_draft_that_was_edited(
 ) -> None:
     text = "t,ax,ay\n0.0,1.0,0.0\n0.1,1.0,0.0\n"
     command = ["import", str(write(tmp_path / "a.csv", text)), "--out", str(tmp_path / "o.parquet")]
-    assert [main(command), main(command)] == [0, 0]
+    assert [main(command), main(command)] == [1, 1]
     draft = tmp_path / "o.profile.json"
     edited = draft.read_text().replace('"signal": "ax"', '"signal": "ax", "unit": "g"')
     draft.write_text(edited)
@@ -302,8 +302,8 @@ def test_import_names_each_missing_wheel(
 ) -> None:
     text = "t,ax,ay,yaw_rate,delta_fr,omega_fl\n0.0,1,1,1,1,1\n0.1,1,1,1,1,1\n"
     source = write(tmp_path / "a.csv", text)
-    assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 0
-    assert "note: no omega_fr, omega_rl, omega_rr: replay" in capsys.readouterr().out
+    assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 1
+    assert "no reading of omega_fr, omega_rl, omega_rr: check" in capsys.readouterr().err
 
 
 def test_import_names_a_misspelt_signal_of_the_profile(

@@ -30,11 +30,11 @@ Output = pytest.CaptureFixture[str]
 FIRST = 1500  # [frames] six seconds
 
 
-def bring(out: Path, *sources: Path, more: tuple[str, ...] = ("--profile", "toyota")) -> pa.Table:
-    assert (
-        main(["import", *map(str, sources), *more, "--vehicle", str(VEHICLE), "--out", str(out)])
-        == 0
-    )
+def bring(
+    out: Path, *sources: Path, more: tuple[str, ...] = ("--profile", "toyota"), code: int = 0
+) -> pa.Table:
+    words = ["import", *map(str, sources), *more, "--vehicle", str(VEHICLE), "--out", str(out)]
+    assert main(words) == code
     return pq.read_table(out)
 
 
@@ -120,19 +120,8 @@ def test_profile_draft_from_names_of_a_measurement_file_and_a_bag(
     vehicle = json.loads(VEHICLE.read_text()) | {"steering_ratio": 16.0}
     (tmp_path / "car.json").write_text(json.dumps(vehicle))
     out = tmp_path / "lab.parquet"
-    assert (
-        main(
-            [
-                "import",
-                str(tmp_path / "lab.mf4"),
-                "--vehicle",
-                str(tmp_path / "car.json"),
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
+    words = ["--vehicle", str(tmp_path / "car.json"), "--out", str(out)]
+    assert main(["import", str(tmp_path / "lab.mf4"), *words]) == 1
     table = pq.read_table(out)
     means = {name: float(np.mean(column(table, name))) for name in table.column_names[1:]}
     expected = {
@@ -177,7 +166,7 @@ def test_sensor_topics_of_a_bag_keep_their_own_stamps(tmp_path: Path) -> None:
             )
             late = ns + (k % 7) * 3_000_000
             writer.write(topic, late, types.serialize_cdr(message, "sensor_msgs/msg/Imu"))
-    table = bring(tmp_path / "imu.parquet", tmp_path / "bag", more=())
+    table = bring(tmp_path / "imu.parquet", tmp_path / "bag", more=(), code=1)
     assert set(table.column_names) == {"timestamp", "ax", "ay", "yaw_rate"}
     assert np.allclose(np.diff(column(table, "yaw_rate")), 0.01, atol=1e-9)
 
@@ -345,9 +334,8 @@ def test_a_validity_bit_and_a_sign_bit_are_heeded(tmp_path: Path) -> None:
     (tmp_path / "p.json").write_text(
         json.dumps({"version": 1, "name": "p", "channels": {"yaw_rate": channel}})
     )
-    table = bring(
-        tmp_path / "o.parquet", tmp_path / "a.parquet", more=("--profile", str(tmp_path / "p.json"))
-    )
+    profile = ("--profile", str(tmp_path / "p.json"))
+    table = bring(tmp_path / "o.parquet", tmp_path / "a.parquet", more=profile, code=1)
     two = np.radians(2.0)
     assert np.allclose(
         column(table, "yaw_rate"), [two + 0.5, 0.5 - two, np.nan, np.nan, np.nan], equal_nan=True
