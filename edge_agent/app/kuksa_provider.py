@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
-from edge_agent.inputs.live.kuksa.connection import FILES, PORT, BrokerConnection
+from edge_agent.inputs.live.kuksa.connection import FILES, PORT, BrokerConnection, describe_error
 from edge_agent.publish.vss import BRANCH
 from schemas.errors import InputError
 from schemas.thresholds import NS
@@ -59,7 +59,7 @@ class KuksaProvider:
         address, _, query = text.partition("?")
         files = dict(parse_qsl(query))
         host, _, port = address.partition(":")
-        if not host or not (port or str(PORT)).isdigit() or not set(files) <= set(FILES):
+        if not host or not set(files) <= set(FILES):
             fix = f"write it like 127.0.0.1:{PORT}?ca=ca.pem&token=agent.jwt"
             raise InputError("kuksa", f"{text!r} is not the address of a databroker", fix)
         self.written = 0
@@ -101,7 +101,11 @@ class KuksaProvider:
                     self._latest = None
                 if latest is None:
                     return
-                self._write_all(publish, *latest)
+                try:
+                    self._write_all(publish, *latest)
+                # The library may raise any error, which must not end this thread.
+                except Exception as error:  # noqa: BLE001
+                    self._log_problem(str(error) or type(error).__name__)
 
     def _write_all(
         self,
@@ -142,7 +146,7 @@ class KuksaProvider:
                 self._unknown_paths.add(path)
                 log.warning("the databroker does not know %s: %s", path, error.details())
             elif not is_rejected:
-                self._log_problem(f"{code.name}: {error.details()}")
+                self._log_problem(describe_error(error))
             elif path not in self._rejecting_paths:
                 self._rejecting_paths.add(path)
                 log.warning("the databroker rejects a value of %s: %s", path, error.details())

@@ -131,14 +131,15 @@ def parse_port(text: str) -> int:
     Raises:
         argparse.ArgumentTypeError: `text` is not a port number.
     """
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value <= LAST_PORT:
+    if not is_port(text):
         problem = f"{text[:60]!r} is not a port (0 to {LAST_PORT})"
         raise argparse.ArgumentTypeError(problem)
-    return value
+    return int(text)
+
+
+def is_port(text: str) -> bool:
+    """Return True if `text` is a port number."""
+    return text.isascii() and text.isdigit() and len(text) <= 5 and int(text) <= LAST_PORT
 
 
 def wants_quiet(arguments: Sequence[str]) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from edge_agent.inputs.live.feed import Feed, HostClock, Received
-from edge_agent.inputs.live.kuksa.connection import BrokerConnection
+from edge_agent.inputs.live.kuksa.connection import BrokerConnection, describe_error
 from edge_agent.inputs.recording import Series
 from schemas.thresholds import NS
 
@@ -79,6 +79,8 @@ class DatabrokerFeed(Feed):
                     self._hear_update(update, standing=is_first)
                     if self.stopping.is_set():
                         return
+            except connection.grpc.RpcError as error:
+                raise ConnectionError(describe_error(error)) from None
             finally:
                 self._call.cancel()
 
@@ -113,7 +115,7 @@ class DatabrokerFeed(Feed):
                 known.append(path)
             except connection.grpc.RpcError as error:
                 if error.code() != connection.grpc.StatusCode.NOT_FOUND:
-                    raise ConnectionError(f"{error.code().name}: {error.details()}") from None
+                    raise ConnectionError(describe_error(error)) from None
                 self.log_problem(f"has no signal {path}")
         return known
 

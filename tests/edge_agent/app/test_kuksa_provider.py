@@ -87,6 +87,21 @@ def test_broker_that_comes_later_gets_the_latest_values(
             assert broker.value(CONDITION).value.string == "ICE"
 
 
+def test_unexpected_error_does_not_end_the_provider(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        Databroker("127.0.0.1:0", [*FRICTION, CONDITION]) as broker,
+        closing(KuksaProvider(f"127.0.0.1:{broker.port}")) as provider,
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(provider, "_write_one", lambda *_: 1 / 0)
+            provider.write(ICE, TIME)
+            until(lambda: "fails (division by zero)" in caplog.text)
+        provider.write(ICE, TIME)
+        until(lambda: provider.written == 4)
+
+
 @pytest.mark.parametrize(
     ("lower", "upper", "condition"),
     [(0.05, 0.19, "ICE"), (0.05, 0.21, "UNKNOWN"), (0.81, 1.1, "DRY"), (0.79, 1.1, "UNKNOWN")],
