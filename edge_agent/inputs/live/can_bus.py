@@ -12,6 +12,7 @@ from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.readers.can_log import Frames, Log, decode_log
 from edge_agent.inputs.readers.dbc import Database
 from edge_agent.inputs.recording import Series, import_optional
+from schemas.errors import InputError
 from schemas.thresholds import NS
 
 EXTENDED_MASK = 0x1FFFFFFF
@@ -63,7 +64,7 @@ class CanFeed(Feed):
         options: options of `can.Bus`: interface, channel and further options of the interface.
 
     Raises:
-        InputError: python-can is not installed.
+        InputError: python-can is not installed, or does not know the interface.
     """
 
     def __init__(
@@ -71,6 +72,9 @@ class CanFeed(Feed):
     ) -> None:
         super().__init__(name, clock)
         self._can_library = import_optional("can")
+        if (interface := options["interface"]) not in self._can_library.VALID_INTERFACES:
+            known = ", ".join(sorted(self._can_library.VALID_INTERFACES))
+            raise InputError("source", f"there is no interface {interface}", f"use one of {known}")
         self._decoder = decoder
         self._options = dict(options)
 

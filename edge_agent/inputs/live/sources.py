@@ -29,16 +29,20 @@ from edge_agent.inputs.live.can_bus import CanFeed, Decoder
 from edge_agent.inputs.live.databroker import DatabrokerFeed
 from edge_agent.inputs.live.feed import Feed, HostClock
 from edge_agent.inputs.live.gpsd import GpsdFeed
+from edge_agent.inputs.live.kuksa.connection import FILES
 from edge_agent.inputs.live.ros2 import Ros2Feed, RosTopics
 from edge_agent.inputs.profile import Profile, load_profile
 from edge_agent.inputs.readers.can_log import no_database
 from edge_agent.inputs.readers.dbc import Database, database_of
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
+from schemas.runtime.commandline import is_port
 
 KINDS: Final = ("can", "gpsd", "ros2", "vss")
 PORTS: Final = {"gpsd": 2947, "vss": 55555}
 VSS_PROFILE: Final = "vss"
+# options of the kinds whose options are not passed to a library
+OPTIONS: Final = {"gpsd": (), "ros2": ("domain", "frames", "messages"), "vss": FILES}
 
 
 def is_live(source: str) -> bool:
@@ -86,6 +90,10 @@ def _open_source(
         raise InputError(
             "source", f"{source!r} has invalid options ({error})", "write them like ?bus=1&fd=true"
         ) from error
+    for name in options:
+        if name not in (known := OPTIONS.get(kind, options)):
+            fix = f"use {', '.join(known)}" if known else "remove it"
+            raise InputError("source", f"{source!r}: the option {name} is unknown", fix)
     if kind == "can":
         if database is None:
             raise no_database(Path(source))
@@ -190,9 +198,8 @@ def _parse_host(source: str, address: str, port: int) -> tuple[str, int]:
     host, _, number = (
         address.rpartition(":") if ":" in address else (address or "127.0.0.1", "", str(port))
     )
-    try:
-        return host, int(number)
-    except ValueError as error:
+    if not is_port(number):
         raise InputError(
             "source", f"{source!r} has no port", f"write it like gpsd:127.0.0.1:{port}"
-        ) from error
+        )
+    return host, int(number)

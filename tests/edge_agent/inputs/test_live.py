@@ -182,6 +182,17 @@ def test_databroker_is_queried_and_old_values_are_no_readings(
     assert "has no signal Vehicle.AngularVelocity.Yaw" in caplog.text
 
 
+def test_reason_of_a_lost_databroker_is_its_code_and_details(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("edge_agent.inputs.live.databroker.BUFFER", 5000)
+    with Databroker("127.0.0.1:0", ["Vehicle.Acceleration.Lateral"]) as broker:
+        feeds, _, _ = open_sources([f"vss:127.0.0.1:{broker.port}"], None)
+        feeds[0].start()
+        until(lambda: "lost (INVALID_ARGUMENT: no path, or too long a buffer)" in caplog.text)
+        feeds[0].close()
+
+
 @pytest.mark.parametrize(
     ("source", "profile", "named"),
     [
@@ -196,6 +207,15 @@ def test_databroker_is_queried_and_old_values_are_no_readings(
         ("vss:?token=/nowhere", None, "token|nowhere"),
         ("can:virtual/a", "no such profile", "profile"),
         ("ros2:?messages=/nowhere", "vss", "topic"),
+        ("gpsd:127.0.0.1:99999", "toyota", "port"),
+        ("gpsd:?port=1", "toyota", "option port is unknown; remove it"),
+        ("ros2:?domian=1", "vss", "option domian is unknown; use domain, frames"),
+        ("vss:127.0.0.1", None, "port"),
+        ("vss:127.0.0.1:99999", None, "port"),
+        ("vss:?tokn=/nowhere", None, "option tokn is unknown; use ca, token"),
+        (f"vss:?ca={__file__}", None, "has no certificate"),
+        (f"vss:?token={__file__}", None, "is not a token"),
+        ("can:socketcam/can0", "toyota", "no interface socketcam; use one of .*socketcan"),
     ],
 )
 def test_a_source_that_makes_no_sense_is_one_clear_error(
