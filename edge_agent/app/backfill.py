@@ -24,6 +24,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimates_file import EstimatesFile
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.output_path import prepare_path
+from edge_agent.app.plausible import Plausibility
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.inputs.doctor.adopt import prepare_log
 from edge_agent.inputs.signal_log import read_log
@@ -50,12 +51,15 @@ class Task(NamedTuple):
 
 class Outcome(NamedTuple):
     """Result of the estimation of one drive: the number of estimated samples, or the reason of a
-    failure.
+    failure. `faults` are those that the signal doctor found in the log, and `implausible` is the
+    summary of implausible estimates.
     """
 
     task: Task
     samples: int
     error: InputError | None
+    faults: tuple[str, ...] = ()
+    implausible: str | None = None
 
 
 def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
@@ -255,11 +259,16 @@ def estimate_drive(task: Task, estimator: str, memberships: Memberships | None =
     """
     try:
         vehicle = load_vehicle(task.vehicle)
-        log, vehicle, *_ = prepare_log(read_log(task.log), vehicle)
+        log, vehicle, diagnosis, _ = prepare_log(read_log(task.log), vehicle)
         bank = bank_of(estimator, [vehicle], memberships)
+        plausibility = Plausibility(vehicle.wheel_radius)
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):
-                file.write(block.t, bank.advance(block.t, block.signals))
+                estimates = bank.advance(block.t, block.signals)
+                plausibility.add(block.t, block.signals, estimates)
+                file.write(block.t, estimates)
     except InputError as error:
         return Outcome(task, 0, error)
-    return Outcome(task, len(log.t), None)
+    faults = tuple(f"{one.channel} {one.kind}: {one.words}" for one in diagnosis.findings)
+    implausible = plausibility.summary_line() if plausibility.problems() else None
+    return Outcome(task, len(log.t), None, faults, implausible)

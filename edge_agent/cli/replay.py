@@ -119,6 +119,8 @@ def _replay_several(
             f"{len(args.log)} logs into a folder",
             "publish one log, to one file, at a time",
         )
+    if args.compare is not None:
+        raise InputError("compare", "needs one log", "write one report at a time")
     tasks = tasks_of(args.log, args.vehicle, args.out)  # raises if a log would be overwritten
     if args.engine == SPARK:
         outcomes = backfill_on_spark(tasks, estimator, memberships)
@@ -264,9 +266,13 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     """Print the progress of estimating `count` recorded logs on stderr. Print an error for each log
-    that could not be read. Return 2 if there was such a log, else 0.
+    that could not be read, and warnings for faulty signals and implausible estimates. Return 2 if a
+    log could not be read, else 3 if estimates are implausible, else 0.
     """
+    from edge_agent.app.plausible import IMPLAUSIBLE
+
     bad = 0
+    code = 0
     samples = 0
     began = time.monotonic()
     last = 0.0
@@ -275,6 +281,11 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
         if outcome.error is not None:
             bad += 1
             print(f"error: {outcome.task.log}: {outcome.error}", file=sys.stderr, flush=True)
+        for fault in outcome.faults:
+            print(f"warning: {outcome.task.log}: {fault}", file=sys.stderr)
+        if outcome.implausible is not None:
+            code = IMPLAUSIBLE
+            print(f"warning: {outcome.task.log}: {outcome.implausible}", file=sys.stderr)
         elapsed = time.monotonic() - began
         if elapsed - last >= PROGRESS_S or done == count:
             last = elapsed
@@ -284,7 +295,7 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
                 file=sys.stderr,
                 flush=True,
             )
-    return 2 if bad else 0
+    return 2 if bad else code
 
 
 def _write_estimates(

@@ -13,6 +13,8 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -198,11 +200,42 @@ def test_logs_of_one_name_and_estimates_over_their_log_are_refused(
         list(estimate_drives([], "ckf", 0))
 
 
-def test_several_logs_are_not_published(
+def test_faulty_signals_and_implausible_estimates_are_reported(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["replay", *map(str, logs(drives)), "--out", str(tmp_path), "--publish"]) == 2
+    """The first log has a time with one decimal, the second an acceleration in another unit."""
+    table = pq.read_table(drives / "d0.parquet")
+    coarse = tmp_path / "coarse.parquet"
+    strong = tmp_path / "strong.parquet"
+    for path, column, values in (
+        (coarse, "t", np.floor(table["t"].to_numpy() * 10.0) / 10.0),
+        (strong, "ay", table["ay"].to_numpy() + 1000.0),
+    ):
+        place = table.column_names.index(column)
+        pq.write_table(table.set_column(place, column, pa.array(values)), path)
+    words = [
+        "--vehicle",
+        str(drives / "d0.json"),
+        "--estimator",
+        "ckf",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert main(["replay", str(coarse), str(strong), *words]) == 3
+    reported = capsys.readouterr().err
+    assert f"warning: {coarse}: t repeats: most samples repeat a time" in reported
+    assert f"warning: {strong}: 100 samples" in reported
+    assert "NOT PLAUSIBLE: the upper bound lies below the grip in use" in reported
+
+
+def test_several_logs_are_not_published_or_compared(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", *map(str, logs(drives)), "--out", str(tmp_path)]
+    assert main([*words, "--publish"]) == 2
     assert "error: publish: 3 logs into a folder" in capsys.readouterr().err
+    assert main([*words, "--compare", "ckf"]) == 2
+    assert "error: compare: needs one log" in capsys.readouterr().err
 
 
 def test_an_engine_is_for_several_logs_and_wants_no_jobs(
