@@ -74,7 +74,7 @@ def read_log(path: Path) -> SignalLog:
     """Read and check a signal log.
 
     Raises:
-        InputError: the log is not valid. The error names the column (and row) and the fix. Reasons:
+        InputError: the log is not valid. The error names log, column (and row) and fix. Reasons:
             - The file is not a readable Parquet file, or has no rows.
             - A required column is missing, or has no reading.
             - A column is not numeric.
@@ -83,6 +83,13 @@ def read_log(path: Path) -> SignalLog:
     table = _read_table(path)
     if not table.num_rows:
         raise InputError("log", f"{path} has no rows", "give a log with at least one sample")
+    try:
+        return _parse_table(table)
+    except InputError as error:
+        raise InputError(error.field, f"{error.problem} ({path})", error.fix) from error
+
+
+def _parse_table(table: pa.Table) -> SignalLog:
     t, start_ns = _read_time(table)
     signals = np.full((table.num_rows, len(CHANNELS)), np.nan)
     for index, name in enumerate(CHANNELS):
@@ -105,6 +112,9 @@ def require_log(path: Path) -> None:
     """
     if not path.exists():
         raise InputError("log", f"{path} does not exist", "give the path of a signal log")
+    if path.is_dir():
+        fix = f"name the logs in it, or convert a ROS bag with {conversion_command(path)}"
+        raise InputError("log", f"{path} is a folder", fix)
     if not path.is_file():
         return
     try:
@@ -140,6 +150,8 @@ def conversion_command(path: Path) -> str:
 
 def _not_parquet(path: Path, reason: str) -> InputError:
     problem = f"{path} is not a Parquet file ({reason})"
+    if path.suffix == ".parquet":
+        return InputError("log", problem, "copy it again, or import its recording again")
     return InputError("log", problem, f"convert it with {conversion_command(path)}")
 
 

@@ -188,44 +188,53 @@ BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such file": (lambda path: None, "^log: .* does not exist; give"),
     "empty file": (
         lambda path: path.write_bytes(b""),
-        "^log: .* is not a Parquet file .*; convert it with edge-agent import",
+        "^log: .* is not a Parquet file .*; (copy|convert) it",
     ),
     "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),
     "no rows": (lambda path: pq.write_table(pa.table(a_log(0)), path), "^log: .* has no rows; "),
-    "no time": (make_log_writer(t=None), "^t: the log has neither t nor timestamp; add"),
-    "no ax": (make_log_writer(ax=None), "^ax: the log has no such column; add"),
-    "no omega_rr": (make_log_writer(omega_rr=None), "^omega_rr: the log has no such column; add"),
+    "no time": (
+        make_log_writer(t=None),
+        r"^t: the log has neither t nor timestamp \(.*log.*\); add",
+    ),
+    "no ax": (make_log_writer(ax=None), r"^ax: the log has no such column \(.*log.*\); add"),
+    "no omega_rr": (
+        make_log_writer(omega_rr=None),
+        r"^omega_rr: the log has no such column \(.*log.*\); add",
+    ),
     "no steering": (
         make_log_writer(delta_fl=None, delta_fr=None),
-        "^delta_fl: .* no such column; add it or delta_fr",
+        r"^delta_fl: .* no such column \(.*log.*\); add it or delta_fr",
     ),
     "yaw_rate all NaN": (
         make_log_writer(yaw_rate=_LOST),
-        "^yaw_rate: has no reading in any row; record",
+        r"^yaw_rate: has no reading in any row \(.*log.*\); record",
     ),
     "omega_fl all null": (
         make_log_writer(omega_fl=pa.nulls(5, pa.float64())),
-        "^omega_fl: has no reading in any row; record",
+        r"^omega_fl: has no reading in any row \(.*log.*\); record",
     ),
     "steering all NaN": (
         make_log_writer(delta_fl=_LOST, delta_fr=_LOST),
-        "^delta_fl: has no reading in any row; record",
+        r"^delta_fl: has no reading in any row \(.*log.*\); record",
     ),
     "nanoseconds as float": (
         make_log_writer(t=None, timestamp=1.7e18 + 1e7 * np.arange(5)),
-        "^timestamp: is beyond the year 2262; write ns as int64",
+        r"^timestamp: is beyond the year 2262 \(.*log.*\); write ns as int64",
     ),
     "time goes back": (
         make_log_writer(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])),
-        "^t: goes back at row 3; sort the log",
+        r"^t: goes back at row 3 \(.*log.*\); sort the log",
     ),
     "time missing": (
         make_log_writer(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])),
-        "^t: row 1 has no time; give",
+        r"^t: row 1 has no time \(.*log.*\); give",
     ),
-    "text for a number": (make_log_writer(ay=["a"] * 5), "^ay: is string, not a number; write"),
+    "text for a number": (
+        make_log_writer(ay=["a"] * 5),
+        r"^ay: is string, not a number \(.*log.*\); write",
+    ),
     "text for a time": (
         make_log_writer(t=None, timestamp=["a"] * 5),
-        "^timestamp: is string, not a time; write",
+        r"^timestamp: is string, not a time \(.*log.*\); write",
     ),
 }

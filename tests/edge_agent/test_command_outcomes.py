@@ -76,6 +76,15 @@ def test_a_log_as_csv_comes_with_the_command_that_converts_it(
     assert {"ax", "omega_fl"} <= set(pq.read_schema(out).names)
 
 
+def test_folder_and_damaged_log_get_fitting_advice(tmp_path: Path, capsys: Output) -> None:
+    assert main(["check", str(tmp_path)]) == 2
+    assert f"log: {tmp_path} is a folder; name the logs in it" in capsys.readouterr().err
+    path = tmp_path / "cut.parquet"
+    path.write_bytes(b"PAR1\n")
+    assert main(["check", str(path)]) == 2
+    assert capsys.readouterr().err.endswith("; copy it again, or import its recording again\n")
+
+
 def test_import_without_a_channel_that_replay_needs_returns_1(
     tmp_path: Path, capsys: Output
 ) -> None:
