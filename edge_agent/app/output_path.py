@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 
 from schemas.errors import InputError
+from schemas.vehicle_classes import PREFIX
 
 
 def prepare_path(field: str, path: Path, kept: Iterable[Path] = ()) -> Path:
@@ -14,8 +15,11 @@ def prepare_path(field: str, path: Path, kept: Iterable[Path] = ()) -> Path:
     `kept` are files that must not be overwritten.
 
     Raises:
-        InputError: the path is a folder or one of `kept`, or its folder cannot be written.
+        InputError: the path is a folder, a vehicle class or one of `kept`, or its folder cannot be
+            written.
     """
+    if str(path).startswith(PREFIX):
+        raise InputError(field, f"{path} is a class of vehicles, not a file", "name a file")
     if path.resolve() in {one.resolve() for one in kept}:
         raise InputError(field, f"{path} is another file of this command", "name another file")
     try:

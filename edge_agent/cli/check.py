@@ -84,29 +84,29 @@ def _write_corrections(
     args: argparse.Namespace, diagnosis: Diagnosis, vehicle: Vehicle, vehicle_file: Path
 ) -> None:
     """Write the corrected profile and, if it changes, the vehicle file. Report the faults that
-    cannot be corrected in either of them.
+    cannot be corrected in either of them. If no fault can be corrected, write nothing.
     """
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.fix import apply_findings, list_corrections
 
     corrections = list_corrections(diagnosis)
-    if not corrections:
-        _print_stderr(f"{args.fix}: not written: there is nothing to correct")
-        return
     profile, corrected, left = apply_findings(corrections, profile_of(args.log), vehicle)
-    prepare_path("fix", args.fix, (args.log, vehicle_file)).write_text(
-        profile.to_json(), encoding="utf-8"
-    )
-    if corrected != vehicle:
-        prepare_path("vehicle", vehicle_file).write_text(
-            corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
-        )
     for finding in left:
         _print_stderr(
             f"not corrected: {finding.channel} {finding.kind}: its recording must be decoded in "
             "another way"
         )
+    if len(left) == len(corrections):
+        _print_stderr(f"{args.fix}: not written: there is nothing to correct")
+        return
+    prepare_path("fix", args.fix, (args.log, vehicle_file))
+    if corrected != vehicle:
+        prepare_path("vehicle", vehicle_file).write_text(
+            corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
+        )
+        _print_stderr(f"{vehicle_file}: wheel_radius is now {corrected.wheel_radius:.4g} m")
+    args.fix.write_text(profile.to_json(), encoding="utf-8")
     _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
 
 

@@ -250,6 +250,32 @@ def test_a_fix_makes_the_drive_pass(
     assert main(["check", good, *log[1:]]) == 0
 
 
+def test_radius_of_a_vehicle_class_cannot_be_corrected(
+    rough: Recorded, tmp_path: Path, capsys: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    signals = rough.signals.copy()
+    signals[:, S.OMEGA : S.OMEGA + 4] *= 1.2
+    (log, *_) = write(tmp_path / "bad.parquet", rough._replace(signals=signals))
+    before = set(tmp_path.iterdir())
+    assert main(["check", log, "--vehicle", "class:suv", "--fix", "fixed.json"]) == 2
+    assert "vehicle: class:suv is a class of vehicles, not a file" in capsys.readouterr().err
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_fix_of_a_fault_that_no_profile_corrects_writes_nothing(
+    rough: Recorded, tmp_path: Path, capsys: Output
+) -> None:
+    coarse = rough._replace(t=np.floor(rough.t))
+    log = write(tmp_path / "bad.parquet", coarse)
+    profile = tmp_path / "fixed.json"
+    assert main(["check", *log, "--fix", str(profile)]) == 1
+    said = capsys.readouterr().err
+    assert "not corrected: t repeats" in said
+    assert f"{profile}: not written" in said
+    assert not profile.exists()
+
+
 def test_a_scale_of_speeds_at_the_rim_is_corrected_in_the_profile(rough: Recorded) -> None:
     rule = Channel(signal="speed", unit="km/h")
     profile = Profile(name="own", wheel_radius=0.3, channels={"omega_fl": rule})
