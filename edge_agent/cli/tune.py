@@ -20,6 +20,7 @@ from typing import Final
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.backfill import vehicle_file_of
+from edge_agent.app.output_path import prepare_path
 from edge_agent.app.tuned_memberships import (
     WAYS,
     Budget,
@@ -42,7 +43,7 @@ from edge_agent.lab.tuning.objectives import (
     record_all,
     scores_of,
 )
-from edge_agent.lab.tuning.own_logs import own_drives
+from edge_agent.lab.tuning.own_logs import own_drives, sample_step
 from edge_agent.lab.tuning.search import Iteration, Objective, Problem, Progress, Result
 from edge_agent.lab.tuning.study import run_search
 from schemas.errors import InputError
@@ -135,6 +136,7 @@ def _run_comparison(args: argparse.Namespace, ants: int, iterations: int) -> int
     """
     duration = QUICK_DURATION_S if args.quick else DURATION_S
     chosen = args.objective or ("predictive" if args.log else "interval")
+    prepare_path("out", args.out, [*args.log, *map(_vehicle_file(args), args.log)])
     train, held_out = _tuning_drives(args, chosen, duration)
     print_flushed(
         f"{len(train.vehicles)} drives for the search, {len(held_out.vehicles)} held out, "
@@ -213,12 +215,20 @@ def _tuning_drives(
         )
     logs = []
     for path in args.log:
-        vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
+        vehicle = load_vehicle(_vehicle_file(args)(path))
         log = read_log(path)
+        if not sample_step(log) > 0.0:
+            fix = "correct its time (edge-agent check)"
+            raise InputError("log", f"{path}: most samples have the same time", fix)
         logs.append((log, vehicle))
         for note in warn_about_faults(diagnose(log.t, log.signals, vehicle, log.ground)):
             print(note, file=sys.stderr)
     return own_drives(logs, duration_s)
+
+
+def _vehicle_file(args: argparse.Namespace) -> Callable[[Path], Path]:
+    """Return the function that gives the path of a log's vehicle file."""
+    return vehicle_file_of if args.vehicle is None else lambda _: Path(args.vehicle)
 
 
 def _search_worth(score: Score, objective: str) -> float:

@@ -34,7 +34,7 @@ def own_drives(
     Raises:
         InputError: the recordings are too short.
     """
-    samples = min(round(duration_s / float(np.median(np.diff(log.t)))) for log, _ in logs)
+    samples = min(round(duration_s / sample_step(log)) for log, _ in logs)
     parts = [
         (log, vehicle, first)
         for log, vehicle in logs
@@ -51,6 +51,11 @@ def own_drives(
     ]
     train = len(chosen) - max(1, len(chosen) // HELD_OUT)
     return _side_by_side(chosen[:train], samples), _side_by_side(chosen[train:], samples)
+
+
+def sample_step(log: SignalLog) -> float:
+    """Return the median time between two samples of a log [s]; 0 if it has only one sample."""
+    return float(np.median(np.diff(log.t))) if len(log.t) > 1 else 0.0
 
 
 def _side_by_side(parts: Sequence[tuple[SignalLog, Vehicle, int]], samples: int) -> TuningSet:

@@ -7,6 +7,8 @@ from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
@@ -213,6 +215,25 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         "colony": 1,
     }
     assert provenance.budget.evaluations == {"random": 6, "colony": 6}
+
+
+def test_unusable_output_and_time_are_refused_before_the_search(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "d.parquet"
+    files = ["--out", str(log), "--vehicle-out", str(log.with_suffix(".json"))]
+    assert main(["simulate", "slalom", "--duration", "1", *files]) == 0
+    before = log.read_bytes()
+    capsys.readouterr()
+    words = ["tune", str(log), "--quick", "--out"]
+    for out in (log, log.with_suffix(".json"), tmp_path):
+        assert main([*words, str(out)]) == 2
+        assert capsys.readouterr().err.startswith("error: out: ")
+    assert log.read_bytes() == before
+    table = pq.read_table(log)
+    pq.write_table(table.set_column(0, "t", pa.array([0.0] * table.num_rows)), log)
+    assert main([*words, str(tmp_path / "tuned.json")]) == 2
+    assert f"error: log: {log}: most samples have the same time" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
