@@ -79,6 +79,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
     if args.paper and args.only:
         raise InputError("paper", f"not with --only {args.only}", "leave one of them out")
+    if (args.logs is not None) != (args.only == "real"):
+        fix = "give --logs DIR, a folder of logs, each next to its vehicle file"
+        raise InputError("logs", "is needed by --only real, and only by it", fix)
     draws = args.only in (None, "detection") and not args.no_plots
     if draws and importlib.util.find_spec("matplotlib") is None:
         raise InputError(
@@ -173,12 +176,6 @@ def _evaluate_real_logs(args: argparse.Namespace) -> int:
     from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
     from schemas.runtime.figures import markdown, write
 
-    if args.logs is None:
-        raise InputError(
-            "logs",
-            "is missing",
-            "name the folder of logs, each next to its vehicle file: --logs DIR",
-        )
     found = judge_folder(args.logs, _print_progress)
     figures = summarise(found)
     write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)

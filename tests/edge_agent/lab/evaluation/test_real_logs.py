@@ -108,4 +108,7 @@ def test_logs_of_a_folder_are_judged_and_reported(tmp_path: Path) -> None:
 def test_a_folder_without_logs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="vehicle file"):
         judge_folder(tmp_path)
-    assert main(["evaluate", "--only", "real", "--out", str(tmp_path / "out")]) == 2
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["evaluate", "--only", "real", *out]) == 2
+    assert main(["evaluate", "--logs", str(tmp_path), *out]) == 2
+    assert not (tmp_path / "out").exists()
