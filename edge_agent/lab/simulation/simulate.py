@@ -78,6 +78,8 @@ TRUTH: Final = (
 )
 STEERING_LAG_S: Final = 0.1  # [s] from the driver's demand to the road wheel
 PEDAL_LAG_S: Final = 0.15
+FASTEST_M_S: Final = 120.0  # [m/s] maximum speed at the start; no road car is faster
+MOST_SAMPLES: Final = 5_000_000  # 1.6 GB of true values
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,12 @@ def simulate_manoeuvre(
     seed = checked_seed(seed)
     _check_positive(speed=speed, rate_hz=setup.rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
+    if speed > FASTEST_M_S:
+        raise InputError("speed", f"{speed:g} m/s is no car's", f"give at most {FASTEST_M_S:g}")
     duration = manoeuvre.duration if duration_s is None else duration_s
+    if duration * setup.rate_hz > MOST_SAMPLES:
+        problem = f"{duration:g} s at {setup.rate_hz:g} Hz are more than {MOST_SAMPLES} samples"
+        raise InputError("duration_s", problem, "give a lower rate or duration")
     road = road_named(setup.road, seed, setup.slope)
     world = ProvingGround(
         _friction_field(manoeuvre.friction if mu is None else mu), road.table, road.surface_table

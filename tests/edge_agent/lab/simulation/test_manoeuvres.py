@@ -103,6 +103,8 @@ def test_the_same_seed_drives_the_same_and_another_does_not() -> None:
     ("field", "arguments"),
     [
         ("manoeuvre", {"name": "wheelie"}),
+        ("speed", {"name": "slalom", "speed": 1e9}),
+        ("duration_s", {"name": "slalom", "setup": DriveSetup(rate_hz=1e9)}),
         ("mu", {"name": "sine", "mu": -0.1}),
         ("speed", {"name": "sine", "speed": 0.0}),
         ("rate_hz", {"name": "sine", "setup": DriveSetup(rate_hz=float("nan"))}),
