@@ -36,17 +36,20 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
     Raises:
         InputError: the signal doctor found a fault, or could not decide.
     """
-    from edge_agent.inputs.doctor.report import publishing_advice, report_lines
+    from edge_agent.inputs.doctor.report import report_lines
 
     if not diagnosis.is_passed:
         print(
             "\n".join(line for line in report_lines(diagnosis) if not line.startswith("sound")),
             file=sys.stderr,
         )
+        fix = (
+            "correct its profile (edge-agent check --fix)"
+            if diagnosis.findings
+            else "drive half a minute with turns and some braking"
+        )
         raise InputError(
-            "log",
-            "did not pass the signal doctor",
-            f"{publishing_advice(diagnosis)}; --trust publishes it unchanged",
+            "log", "did not pass the signal doctor", f"{fix}, or publish it unchanged with --trust"
         )
 
 

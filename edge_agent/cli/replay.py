@@ -160,6 +160,8 @@ def _replay_one(
         )
     bank_of(estimator, [vehicle], memberships)  # raises for a wrong name before the log is read
     log = read_log(path)
+    if args.publish:
+        _require_position(path, log)
     start_ns = _start_time(args.start, log)
     log, vehicle, diagnosis, notes = prepare_log(log, vehicle)
     plausibility = Plausibility(vehicle.wheel_radius)
@@ -188,6 +190,16 @@ def _replay_one(
     if code == 0 and plausibility.problems():
         return IMPLAUSIBLE
     return code
+
+
+def _require_position(path: Path, log: SignalLog) -> None:
+    """Raise an InputError if a log has no position, because then no record could be published."""
+    from schemas.signals import S
+
+    place = abs(log.signals[:, [S.LATITUDE, S.LONGITUDE]])
+    if not (place <= (90.0, 180.0)).all(axis=1).any():
+        problem = f"{path} has no position, so there is nothing to publish"
+        raise InputError("latitude", problem, "import it together with a GNSS log")
 
 
 def _check_output(args: argparse.Namespace, vehicle_file: Path) -> None:

@@ -5,6 +5,7 @@ written, and the exit code when something is left to do.
 from __future__ import annotations
 
 import json
+import math
 import re
 import resource
 import sqlite3
@@ -134,6 +135,22 @@ def test_replay_names_every_format_and_refuses_a_folder_without_files(
             f"error: out: cannot write /proc/{name} (No such file or directory); name a file in a "
             "writable folder\n"
         )
+
+
+@pytest.mark.parametrize("latitude", [math.nan, 127.0])
+def test_log_without_a_position_is_not_published(
+    tmp_path: Path, capsys: Output, latitude: float
+) -> None:
+    path = tmp_path / "d.parquet"
+    replay = write_drive(path)
+    table = pq.read_table(path)
+    place = table.column_names.index("latitude")
+    values = pa.array([latitude] * table.num_rows)
+    pq.write_table(table.set_column(place, "latitude", values), path)
+    out = tmp_path / "e.parquet"
+    assert main([*replay, "--out", str(out), "--publish", "--trust", "--name", "car-one"]) == 2
+    assert f"latitude: {path} has no position, so there is nothing" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_connect_replaces_the_router_and_unsent_records_are_reported(
