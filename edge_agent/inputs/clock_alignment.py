@@ -91,8 +91,8 @@ def _find_zone(recording: Recording, main: Recording, lead: float, shift: float)
             return zone
     raise InputError(
         recording.name,
-        f"its clock is {lead:.0f} s from that of {main.name}",
-        f"give --clock {recording.name}=SECONDS, what to add to it",
+        f"its clock is {lead + shift:.0f} s later than that of {main.name}",
+        f"give --clock {recording.name}={-lead:.0f}, or another number of seconds to add to it",
     )
 
 

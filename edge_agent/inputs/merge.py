@@ -182,6 +182,8 @@ def _build_rows(
     if is_one_table and profile.rate_hz is None:
         t = next(iter(series.values())).t
         return _Rows(t, {name: one.values for name, one in series.items()})
+    if series.keys() <= set(SPARSE):
+        raise InputError("source", "has only positions", "add a recording of the car's signals")
     dense = {name: one for name, one in series.items() if name not in SPARSE and len(one.t) > 1}
     if not dense:
         raise InputError(

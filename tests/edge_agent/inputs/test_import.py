@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -237,11 +238,17 @@ def test_clocks_that_do_not_meet_are_an_error_with_its_remedy(
         str(VEHICLE),
     ]
     assert main([*arguments, "--out", str(tmp_path / "o.parquet")]) == 2
-    assert "--clock late.nmea=" in capsys.readouterr().err
-    assert (
-        main([*arguments, "--out", str(tmp_path / "o.parquet"), "--clock", "late.nmea=-2764800"])
-        == 0
-    )
+    out = ["--out", str(tmp_path / "o.parquet"), "--clock"]
+    shift = re.search("--clock (late.nmea=-27648..), or", capsys.readouterr().err)
+    assert shift is not None
+    assert main([*arguments, *out, "late.nmea=-2000000"]) == 2
+    assert "its clock is 7648" in capsys.readouterr().err
+    assert main([*arguments, *out, shift[1]]) == 0
+
+
+def test_positions_alone_are_no_drive(tmp_path: Path, capsys: Output) -> None:
+    assert main(["import", str(NMEA), "--out", str(tmp_path / "o.parquet")]) == 2
+    assert "error: source: has only positions; add a recording" in capsys.readouterr().err
 
 
 def test_a_rim_speed_without_a_radius_is_an_error(
