@@ -140,7 +140,10 @@ def _decode_frames(
     rules = list(profile.channels.values()) if profile else []
     buses = {rule.message: rule.bus for rule in rules if rule.message and rule.bus is not None}
     with foreign_errors(path, "CAN log"):
-        return can_log.decode_log(frames, path.name, database, requested_signals, buses)
+        recording = can_log.decode_log(frames, path.name, database, requested_signals, buses)
+    if path.suffix.lower() == ".blf":
+        recording.notes += can_log.notes_if_cut(path)
+    return recording
 
 
 def profile_of(log: Path) -> Profile:

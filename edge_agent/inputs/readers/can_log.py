@@ -26,6 +26,7 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".blf", ".asc", ".log", ".trc")
 MICRO: Final = 1_000_000
+BLF_SIZE: Final = slice(16, 24)  # bytes of a BLF file that state its size, 0 if it was not finished
 # The year 2000 [s UTC]. A smaller time counts from the start of the log.
 DATED_S: Final = 946_684_800.0
 Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
@@ -151,6 +152,15 @@ def log_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
                     time, message.data
                 )
     return require_steady_clock(path, log), float(first) if np.isfinite(first) else 0.0
+
+
+def notes_if_cut(path: Path) -> list[str]:
+    """Return a note if a BLF file is shorter than its header states, because it was truncated."""
+    with path.open("rb") as file:
+        header = file.read(BLF_SIZE.stop)
+    size = path.stat().st_size
+    whole = int.from_bytes(header[BLF_SIZE], "little") if header.startswith(b"LOGG") else 0
+    return [f"{path.name}: cut off, {size} of {whole} bytes are left"] if size < whole else []
 
 
 def bus_of(channel: Any) -> int:  # noqa: ANN401 a number, a name or None

@@ -246,6 +246,16 @@ def test_clocks_that_do_not_meet_are_an_error_with_its_remedy(
     assert main([*arguments, *out, shift[1]]) == 0
 
 
+def test_note_tells_that_a_log_was_cut_off(tmp_path: Path, capsys: Output) -> None:
+    whole = BLF.read_bytes()
+    for name, size in (("whole", len(whole)), ("cut", len(whole) // 2)):
+        path = tmp_path / f"{name}.blf"
+        path.write_bytes(whole[:size])
+        bring(tmp_path / f"{name}.parquet", path)
+        note = f"note: {name}.blf: cut off, {size} of {len(whole)} bytes are left"
+        assert (note in capsys.readouterr().out) == (name == "cut")
+
+
 def test_positions_alone_are_no_drive(tmp_path: Path, capsys: Output) -> None:
     assert main(["import", str(NMEA), "--out", str(tmp_path / "o.parquet")]) == 2
     assert "error: source: has only positions; add a recording" in capsys.readouterr().err
