@@ -108,7 +108,7 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
         if title in numbers:
             recording.signals[name] = Series(t, numbers[title], _unit_in(title))
         elif not pa.types.is_null(table[title].type):
-            left.append(name)
+            left.append(f"{name} ({_first_text(table[title])!r})")
     if left:
         notes.append(f"{path.name}: left out, not only numbers: {', '.join(left[:MOST_NAMES])}")
     return recording
@@ -237,6 +237,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def _first_text(column: Any) -> object:  # noqa: ANN401 Arrow columns are not generic
+    """Return the first value of a column that is not a number; None if there is no such value."""
+    values = (value.as_py() for value in column)
+    return next((one for one in values if one is not None and not _is_number(str(one))), None)
+
+
 def _time_column(path: Path, titles: dict[str, str], requested: str | None) -> str:
     if requested is not None:
         whole = next((name for name, full in titles.items() if requested in (name, full)), None)
@@ -307,7 +313,8 @@ def _parse_seconds(
             raise InputError(name, "is missing in a row", "give every sample its time")
         return (values - values[0]) / NS, int(values[0])
     if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
-        raise InputError(name, f"is {column.type}, not a time", "write seconds, or a time stamp")
+        problem = f"has the value {_first_text(column)!r}, which is not a time"
+        raise InputError(name, problem, "write seconds or time stamps, and no row of units")
     raw = np.asarray(column.to_numpy(zero_copy_only=False))
     if not np.isfinite(raw[0]):
         raise InputError(name, "is missing at row 0", "give every sample its time")

@@ -97,6 +97,12 @@ def test_can_frames_in_text_are_decoded(tmp_path: Path, name: str, text: str) ->
     assert np.allclose(speed.t, [0.0, 0.01])
 
 
+def test_row_of_units_below_the_names_is_named(tmp_path: Path) -> None:
+    source = write(tmp_path / "a.csv", "Time,ax\ns,m/s²\n0.0,1.0\n0.1,2.0\n")
+    with pytest.raises(InputError, match="Time: has the value 's', .*; write .* no row of units"):
+        read_source(source, None, None)
+
+
 def test_can_frames_in_text_need_a_database(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="dbc"):
         read_source(write(tmp_path / "a.csv", GVRET), None, None)
@@ -247,7 +253,7 @@ def test_column_that_is_not_only_numbers_is_noted(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", "t,ax,ay\n0.0,1.0,-\n0.1,1.0,0.5\n")
     recording = read_source(path, None, None)
     assert recording.signals.keys() == {"ax"}
-    assert recording.notes == ["a.csv: left out, not only numbers: ay"]
+    assert recording.notes == ["a.csv: left out, not only numbers: ay ('-')"]
 
 
 @pytest.mark.parametrize("time", ["0.0", "2026-11-29T10:00:00.0Z"])
