@@ -21,7 +21,7 @@ import pyarrow as pa
 from edge_agent.inputs.signal_log import SignalLog
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.runtime.durable import open_durably
+from schemas.runtime.durable import open_durably, write_durably
 from schemas.runtime.installing import install_command
 from schemas.runtime.palette import GRIP_RANGE, line_of, shade
 from schemas.signals import Health, S
@@ -88,10 +88,10 @@ def write_report(drive: RecordedDrive, path: Path) -> None:
         InputError: the suffix is unknown, or a required package is missing.
     """
     if path.suffix == PAGE:
-        with open_durably(path) as file:
-            file.write(page_of(drive).encode())
+        write_durably(path, page_of(drive))
     elif path.suffix in IMAGES:
-        figure_of(drive).savefig(path, dpi=120)
+        with open_durably(path) as file:
+            figure_of(drive).savefig(file, format=path.suffix[1:], dpi=120)
     else:
         raise InputError(
             "out", f"{path.name} has no known ending", f"use one of {', '.join(ENDINGS)}"

@@ -30,7 +30,7 @@ from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.driving_direction import DrivingDirection, sign_wheels
 from edge_agent.inputs.profile import Profile
 from schemas.numeric import FloatArray
-from schemas.runtime.durable import open_durably
+from schemas.runtime.durable import write_durably
 from schemas.vehicle import Vehicle
 
 PART_S: Final = 600.0  # [s] length of a section, 9 MB of signals
@@ -232,8 +232,7 @@ def _read_state(path: Path, identity: str) -> Known:
 def _write_state(path: Path, known: Known) -> None:
     """Write the stored knowledge about a car to its file, atomically."""
     try:
-        with open_durably(path) as file:
-            file.write(known.model_dump_json(indent=1).encode() + b"\n")
+        write_durably(path, known.model_dump_json(indent=1) + "\n")
     except OSError as error:
         log.warning(
             "%s cannot be written (%s): what was learned from this part of the trip is lost",

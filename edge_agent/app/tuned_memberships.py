@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from edge_agent.adaptation.memberships import RETIRED, Memberships
 from schemas.config import explain
 from schemas.errors import InputError
+from schemas.runtime.durable import write_durably
 
 FOLDER: Final = Path(__file__).parent / "tuned"
 # Untuned memberships, random search as the control, and the ant colony.
@@ -190,7 +191,7 @@ def save_tuned(path: Path, document: Document) -> None:
     parse_tuned(text, f"tuned file {path}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write_durably(path, text)
     except OSError as error:
         raise InputError(
             "out", f"cannot write {path} ({error.strerror})", "name a file in a writable folder"

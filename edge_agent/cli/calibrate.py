@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.output_path import prepare_path
     from edge_agent.calibration.held_out import learn_validated
     from schemas.errors import InputError
+    from schemas.runtime.durable import write_durably
     from schemas.vehicle import load_vehicle
 
     vehicle = load_vehicle(args.vehicle).model_copy(update={"calibration": None})
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     text = vehicle.model_copy(update={"calibration": found.calibration}).model_dump_json(
         indent=1, exclude_none=True
     )
-    out.write_text(text + "\n", encoding="utf-8")
+    write_durably(out, text + "\n")
     print("\n".join(report_lines(found)))
     print(f"{out}: learned from {len(drives)} {'drive' if len(drives) == 1 else 'drives'}")
     return 0

@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.report import report_page
     from edge_agent.inputs.signal_log import read_log, require_log
+    from schemas.runtime.durable import write_durably
     from schemas.vehicle import load_vehicle
 
     require_log(args.log)
@@ -55,9 +56,8 @@ def run(args: argparse.Namespace) -> int:
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     _print_report(args, diagnosis, _doubted_flags(log))
     if args.out is not None:
-        prepare_path("out", args.out, (args.log, vehicle_file)).write_text(
-            report_page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8"
-        )
+        out = prepare_path("out", args.out, (args.log, vehicle_file))
+        write_durably(out, report_page(diagnosis, f"{args.log.name}, {vehicle.name}"))
     if args.fix is not None:
         _write_corrections(args, diagnosis, vehicle, vehicle_file)
     return 0 if diagnosis.is_passed else NOT_PASSED
@@ -89,6 +89,7 @@ def _write_corrections(
     from edge_agent.app.output_path import prepare_path
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.fix import apply_findings, list_corrections
+    from schemas.runtime.durable import write_durably
 
     corrections = list_corrections(diagnosis)
     profile, corrected, left = apply_findings(corrections, profile_of(args.log), vehicle)
@@ -102,11 +103,10 @@ def _write_corrections(
         return
     prepare_path("fix", args.fix, (args.log, vehicle_file))
     if corrected != vehicle:
-        prepare_path("vehicle", vehicle_file).write_text(
-            corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
-        )
+        text = corrected.model_dump_json(indent=1, exclude_none=True) + "\n"
+        write_durably(prepare_path("vehicle", vehicle_file), text)
         _print_stderr(f"{vehicle_file}: wheel_radius is now {corrected.wheel_radius:.4g} m")
-    args.fix.write_text(profile.to_json(), encoding="utf-8")
+    write_durably(args.fix, profile.to_json())
     _print_stderr(f"{args.fix}: the corrected profile; import the recording again with it")
 
 

@@ -68,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.profile import load_profile, shipped_profiles
     from edge_agent.inputs.readers.dbc import database_of
     from edge_agent.inputs.signal_log import require_no_estimates
+    from schemas.runtime.durable import write_durably
     from schemas.vehicle import load_vehicle
 
     if args.list:
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         merged, profile = _merge(recordings, profile, vehicle, shifts)
     write_log(out, merged, profile, [source.name for source in args.source])
     if draft is not None:
-        draft_path.write_text(draft.to_json(), encoding="utf-8")
+        write_durably(draft_path, draft.to_json())
         drafted = f"drafted from names, {len(draft.channels)} channels; check it before use"
         print(f"{draft_path}: {drafted}")
     lacking = _lacking_channels(merged.columns)

@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.signal_log import conversion_command
     from edge_agent.lab.simulation import MANOEUVRES, DriveSetup, Fault, simulate_manoeuvre
     from schemas.errors import InputError
+    from schemas.runtime.durable import write_durably
 
     if args.list:
         print_list(
@@ -96,9 +97,8 @@ def run(args: argparse.Namespace) -> int:
     )
     write_table("out", args.out, log)
     if args.vehicle_out is not None:
-        prepare_path("vehicle-out", args.vehicle_out, [args.out]).write_text(
-            vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
-        )
+        text = vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
+        write_durably(prepare_path("vehicle-out", args.vehicle_out, [args.out]), text)
     print(f"{args.out}: {log.num_rows} samples of {args.manoeuvre}")
     if args.out.suffix == ".csv":
         print(

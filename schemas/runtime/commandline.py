@@ -8,6 +8,7 @@ implausible signals (edge-agent), 130 ended by Ctrl-C.
 from __future__ import annotations
 
 import argparse
+import errno
 import math
 import re
 import sys
@@ -24,6 +25,8 @@ FAILED: Final = 1
 BAD_INPUT: Final = 2
 INTERRUPTED: Final = 130  # exit code 128 + SIGINT, as shells use it
 SHELLS: Final = ("bash", "zsh", "tcsh")
+# error numbers of a disk that has no more space for a file
+FULL_DISK: Final = (errno.EDQUOT, errno.EFBIG, errno.ENOSPC)
 # Optional extra of this project that installs a package.
 EXTRA_OF: Final = {"scipy": "analytics", "matplotlib": "analytics"}
 LAST_PORT: Final = 65_535
@@ -176,8 +179,8 @@ def version() -> str:
 
 
 def run_guarded(run: Callable[[], int]) -> int:
-    """Run the function of a command. If it ends by misuse, Ctrl-C or a closed output pipe, print at
-    most one line and no traceback.
+    """Run the function of a command. If it ends by misuse, Ctrl-C, a closed output pipe or a full
+    disk, print at most one line and no traceback.
 
     Returns:
         the exit code.
@@ -201,6 +204,11 @@ def run_guarded(run: Callable[[], int]) -> int:
         # The reader of standard output has ended (`| head`), so nobody reads an error message.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        if error.errno not in FULL_DISK:
+            raise
+        print(f"error: disk: {error.strerror}; free some space, or use another", file=sys.stderr)
+        return FAILED
 
 
 def out_folder(field: str, path: Path) -> Path:

@@ -59,6 +59,12 @@ def open_durably(
         sync_directory(path.parent)
 
 
+def write_durably(path: Path, text: str) -> None:
+    """Write a text file, complete and durable; if that fails, an existing file stays unchanged."""
+    with open_durably(path) as file:
+        file.write(text.encode())
+
+
 @contextmanager
 def own_drafts(folder: Path) -> Iterator[Path]:
     """Provide a temporary folder within `folder` for drafts (unfinished files) that the caller

@@ -86,6 +86,27 @@ def test_folder_and_damaged_log_get_fitting_advice(tmp_path: Path, capsys: Outpu
     assert capsys.readouterr().err.endswith("; copy it again, or import its recording again\n")
 
 
+def test_full_disk_is_one_line_and_leaves_no_file(tmp_path: Path, capsys: Output) -> None:
+    replay = write_drive(tmp_path / "d.parquet")
+    car = ["--vehicle", str(tmp_path / "car.json")]
+    before = set(tmp_path.iterdir())
+    commands = [
+        *([*replay, "--out", str(tmp_path / f"x.{ending}")] for ending in ("csv", "html", "svg")),
+        ["check", str(tmp_path / "d.parquet"), *car, "--out", str(tmp_path / "page.html")],
+        [*DRIVE, "--out", str(tmp_path / "other.parquet")],
+    ]
+    capsys.readouterr()
+    size = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, size[1]))
+    try:
+        for command in commands:
+            assert main(command) == 1
+            assert "error: disk: File too large; free some space" in capsys.readouterr().err
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, size)
+    assert set(tmp_path.iterdir()) == before
+
+
 def test_import_without_a_channel_that_replay_needs_returns_1(
     tmp_path: Path, capsys: Output
 ) -> None:
