@@ -14,7 +14,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +32,7 @@ from edge_agent.app.tuned_memberships import (
 )
 from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.driving_direction import sign_wheels
 from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.tuning.objectives import (
     OBJECTIVES,
@@ -220,7 +221,8 @@ def _tuning_drives(
         if not sample_step(log) > 0.0:
             fix = "correct its time (edge-agent check)"
             raise InputError("log", f"{path}: most samples have the same time", fix)
-        logs.append((log, vehicle))
+        signed = replace(log, signals=sign_wheels(log.t, log.signals, vehicle))
+        logs.append((signed, vehicle))
         for note in warn_about_faults(diagnose(log.t, log.signals, vehicle, log.ground)):
             print(note, file=sys.stderr)
     return own_drives(logs, duration_s)

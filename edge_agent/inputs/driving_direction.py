@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.estimators.common.readings import GAP_S
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import Records, records
@@ -37,6 +36,7 @@ PROBABLY_M_S: Final = (
 ALIKE: Final = (0.5, 3.0)
 UNDECIDED_M_S: Final = 2.0  # [m/s] a car that reaches this speed undecided drives forwards
 FASTEST_REVERSE_M_S: Final = 10.0  # [m/s] reverse gears of cars end at about 30 km/h
+GAP_S: Final = 0.5  # [s] a_x is not integrated over a longer gap between two samples
 NEGATIVE_RAD_S: Final = -0.2  # [rad/s] a wheel speed below this shows a sensor with sign
 
 

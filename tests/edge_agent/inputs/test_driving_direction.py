@@ -33,7 +33,7 @@ def park(now: Moment) -> tuple[float, float]:
 
 
 @pytest.fixture
-def parked(
+def parking(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> tuple[FloatArray, Vehicle]:
     """Return the signals (T, 18) and the vehicle of three laps of `park` on a dry road."""
@@ -69,9 +69,9 @@ def upper_ends(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     return bank.advance(times_of(signals)[:, None], signals[:, None]).mu_upper[:, 0]
 
 
-@pytest.mark.parametrize("parked", ["small", "sedan", "van"], indirect=True)
-def test_a_car_in_reverse_on_a_dry_road_is_not_on_ice(parked: tuple[FloatArray, Vehicle]) -> None:
-    signals, vehicle = parked
+@pytest.mark.parametrize("parking", ["small", "sedan", "van"], indirect=True)
+def test_a_car_in_reverse_on_a_dry_road_is_not_on_ice(parking: tuple[FloatArray, Vehicle]) -> None:
+    signals, vehicle = parking
     backwards = with_second_lap_backwards(signals)
     measured = without_signs(backwards)
     signed = sign_wheels(times_of(measured), measured, vehicle)
@@ -81,9 +81,9 @@ def test_a_car_in_reverse_on_a_dry_road_is_not_on_ice(parked: tuple[FloatArray, 
     assert np.array_equal(np.sign(signed[fast, S.OMEGA]), np.sign(backwards[fast, S.OMEGA]))
 
 
-@pytest.mark.parametrize("parked", ["sedan"], indirect=True)
-def test_a_car_that_drives_forwards_is_left_alone(parked: tuple[FloatArray, Vehicle]) -> None:
-    signals, vehicle = parked
+@pytest.mark.parametrize("parking", ["sedan"], indirect=True)
+def test_a_car_that_drives_forwards_is_left_alone(parking: tuple[FloatArray, Vehicle]) -> None:
+    signals, vehicle = parking
     t = times_of(signals)
     assert sign_wheels(t, signals, vehicle) is signals
     coarse = signals.copy()
@@ -93,18 +93,18 @@ def test_a_car_that_drives_forwards_is_left_alone(parked: tuple[FloatArray, Vehi
     assert sign_wheels(t[500:1500], rolling, vehicle) is rolling
 
 
-@pytest.mark.parametrize("parked", ["sedan"], indirect=True)
-def test_speeds_with_sign_are_left_alone(parked: tuple[FloatArray, Vehicle]) -> None:
-    signals, vehicle = parked
+@pytest.mark.parametrize("parking", ["sedan"], indirect=True)
+def test_speeds_with_sign_are_left_alone(parking: tuple[FloatArray, Vehicle]) -> None:
+    signals, vehicle = parking
     backwards = with_second_lap_backwards(signals)
     assert np.nanmin(sign_wheels(times_of(signals), backwards, vehicle)[:, S.OMEGA]) == np.nanmin(
         backwards[:, S.OMEGA]
     )
 
 
-@pytest.mark.parametrize("parked", ["sedan"], indirect=True)
-def test_blocks_of_any_length_give_the_same_signs(parked: tuple[FloatArray, Vehicle]) -> None:
-    signals, vehicle = parked
+@pytest.mark.parametrize("parking", ["sedan"], indirect=True)
+def test_blocks_of_any_length_give_the_same_signs(parking: tuple[FloatArray, Vehicle]) -> None:
+    signals, vehicle = parking
     measured = without_signs(with_second_lap_backwards(signals))
     t = times_of(measured)
     whole = sign_wheels(t, measured, vehicle)
