@@ -31,7 +31,8 @@ def use_agent_library() -> bool:
 
 def build_agent_library(path: Path) -> None:
     """Build the agent's shared library `path`. The library contains the kernels that a pipeline
-    with one vehicle calls to process a sample and to return its friction beliefs.
+    with one vehicle calls to process a sample and to return its friction beliefs, and those that
+    correct a sample.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no linker, or the linker fails.
@@ -44,18 +45,21 @@ def build_agent_library(path: Path) -> None:
 
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.inputs.block import Block
+    from edge_agent.inputs.driving_direction import sign_wheels
     from edge_agent.observe.pipeline import Pipeline
     from schemas.config import AgentConfig
     from schemas.signals import CHANNELS, CONTEXT
     from schemas.vehicle import load_vehicle
 
     config = AgentConfig()
-    pipeline = Pipeline(bank_of(config.estimator, [load_vehicle("class:compact")]), 1, config)
+    vehicle = load_vehicle("class:compact")
+    pipeline = Pipeline(bank_of(config.estimator, [vehicle]), 1, config)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
     context = np.full((1, 1, len(CONTEXT)), np.nan)
     with np.errstate(all="ignore"):  # outputs are undefined, because kernels are only recorded
         pipeline.step(Block(np.zeros((1, 1)), np.zeros((1, 1), np.int64), signals, context))
         pipeline.beliefs()
+        sign_wheels(np.zeros(1), signals[:, 0], vehicle)
     build_library(recorder, path)
 
 

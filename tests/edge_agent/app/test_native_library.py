@@ -26,6 +26,7 @@ import numpy as np
 {{before}}
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block
+from edge_agent.inputs.driving_direction import sign_wheels
 from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
 from schemas.signals import CONTEXT
@@ -35,9 +36,11 @@ drive = np.load(sys.argv[1])
 t = drive["t"]
 signals = drive["signals"]
 context = np.random.default_rng(0).integers(0, 2, (*t.shape, len(CONTEXT))).astype(float)
-bank = bank_of("aco-fckf", [load_vehicle("class:compact")] * {VEHICLES})
+vehicle = load_vehicle("class:compact")
+bank = bank_of("aco-fckf", [vehicle] * {VEHICLES})
 pipeline = Pipeline(bank, {VEHICLES}, AgentConfig())
 digest = hashlib.sha256()
+digest.update(sign_wheels(t[:, 0].copy(), signals[:, 0].copy(), vehicle).tobytes())
 records = 0
 for first in range(0, len(t), 10):
     part = slice(first, first + 10)
