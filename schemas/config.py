@@ -280,6 +280,8 @@ class ServiceConfig(MonitoringSettings):
     @field_validator("archive", mode="before")
     @classmethod
     def _check_folder(cls, given: object) -> object:
+        if given == "":
+            raise ValueError("should be a folder, or left out")
         return {"path": given} if isinstance(given, str | Path) else given
 
 

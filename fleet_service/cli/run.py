@@ -10,7 +10,8 @@ import os
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,11 +101,23 @@ def _read_config(arguments: argparse.Namespace) -> ServiceConfig:
     from schemas.config import ServiceConfig, load
 
     config = load(arguments.config, ServiceConfig)
+    _check_regions(config.regions)
     if arguments.standby:
         config = config.model_copy(update={"standby": True})
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     return config
+
+
+def _check_regions(expressions: Sequence[str]) -> None:
+    """Raise InputError if two region expressions overlap: each message from their common regions
+    would arrive twice.
+    """
+    from schemas import regions
+
+    for one, other in combinations(expressions, 2):
+        if regions.overlap(one, other):
+            raise InputError("regions", f"{one} and {other} overlap", "leave one of them out")
 
 
 def _start_service(

@@ -136,6 +136,17 @@ def test_parameters_parted_by_an_ampersand_are_named(capsys: pytest.CaptureFixtu
     assert "separate the parameters by ';'" in capsys.readouterr().err
 
 
+def test_overlapping_regions_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "service.json"
+    config.write_text(json.dumps({"regions": ["1200/320/*", "1201/*/*", "1200/320/230"]}))
+    assert main(["run", "--config", str(config), "--archive", str(tmp_path / "archive")]) == 2
+    said = capsys.readouterr().err
+    assert "error: regions: 1200/320/* and 1200/320/230 overlap; " in said
+    assert not (tmp_path / "archive").exists()
+
+
 def test_a_taken_archive_is_said(
     tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]
 ) -> None:

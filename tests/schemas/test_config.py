@@ -46,6 +46,13 @@ def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path)
         load(tmp_path / "nosuch.json", Enrolment, "fleet")
 
 
+def test_an_archive_without_name_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "service.json"
+    path.write_text(json.dumps({"archive": ""}))
+    with pytest.raises(InputError, match=r'^archive: should be a folder, or left out \(got ""\);'):
+        load(path, ServiceConfig)
+
+
 def test_raw_days_too_few_to_recognise_repeats_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "service.json"
     for days in (0, LEAST_RAW_DAYS):
