@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from graphlib import TopologicalSorter
 from typing import Final
 
-_IMPORT: Final = re.compile(r'^import \{\s+([^}]+?),?\s+\} from "\./(\w+)\.js";$', re.MULTILINE)
+_IMPORT: Final = re.compile(r'^import \{([^{}]+)\} from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT: Final = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
 _OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
@@ -56,7 +56,7 @@ def _wrap_module(name: str, body: str, exported: list[str]) -> str:
 
 def _split_names(names: str) -> list[str]:
     """Return the names of an import, which may be on several lines; "a as b" is one of them."""
-    return re.split(r",\s+", names)
+    return [one.strip() for one in names.split(",") if one.strip()]
 
 
 def _strip_imports(text: str) -> str:
