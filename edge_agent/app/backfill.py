@@ -269,6 +269,6 @@ def estimate_drive(task: Task, estimator: str, memberships: Memberships | None =
                 file.write(block.t, estimates)
     except InputError as error:
         return Outcome(task, 0, error)
-    faults = tuple(f"{one.channel} {one.kind}: {one.words}" for one in diagnosis.findings)
+    faults = tuple(map(str, diagnosis.findings))
     implausible = plausibility.summary_line() if plausibility.problems() else None
     return Outcome(task, len(log.t), None, faults, implausible)

@@ -59,7 +59,7 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
     """
     found = diagnosis.findings
     for fault in found:
-        print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
+        print(f"warning: {fault}", file=sys.stderr)
     if found:
         print(
             "warning: the estimates below are invalid until this is corrected; run edge-agent "

@@ -30,7 +30,7 @@ from fleet_service.lab.bars import ATTACKS
 from fleet_service.lab.drive import CELL, watch_drive
 from fleet_service.lab.messages import SentMessage, clock_of, forge_messages, make_messages
 from fleet_service.lab.score import excited_vehicles
-from fleet_service.lab.town import CELLS, LENGTH, Town, Visits
+from fleet_service.lab.town import CELLS, LENGTH, Town, Visits, with_claims
 from schemas.config import ServiceConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
@@ -108,22 +108,7 @@ def claim_random(rng: Generator, drive: AttackedDrive) -> Visits:
     """
     visits = drive.visits
     claim = rng.uniform(0.05, 1.2, len(visits))
-    return _with_claims(visits, _attacking_rows(visits, ATTACKERS), claim)
-
-
-def _with_claims(visits: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
-    reports = SimulatedReports(
-        visits.reports.reading,
-        visits.reports.std,
-        np.where(lying, claim, visits.reports.used),
-        visits.reports.manoeuvre,
-        np.where(
-            lying[:, None], agent.overconfident_likelihood(claim), visits.reports.log_likelihood
-        ),
-    )
-    return Visits(
-        visits.seconds, visits.vehicle, visits.place, visits.mu, visits.excited & ~lying, reports
-    )
+    return with_claims(visits, _attacking_rows(visits, ATTACKERS), claim)
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:

@@ -9,7 +9,7 @@ noisy, so a visit is sometimes reported for the previous or the next cell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -201,16 +201,25 @@ def claim_falsely(visits: Visits, liars: BoolArray, claim: float) -> Visits:
     the friction `claim` with high confidence, instead of their own values.
     """
     lying = liars[visits.vehicle]
-    readings = np.where(lying, claim, visits.reports.reading)
-    reports = SimulatedReports(
-        readings,
-        np.where(lying, agent.OVERCONFIDENT_STD, visits.reports.std),
-        np.where(lying, claim, visits.reports.used),
-        visits.reports.manoeuvre,
-        np.where(
-            lying[:, None], agent.overconfident_likelihood(claim), visits.reports.log_likelihood
-        ),
+    claimed = with_claims(visits, lying, claim)
+    reports = replace(
+        claimed.reports,
+        reading=np.where(lying, claim, visits.reports.reading),
+        std=np.where(lying, agent.OVERCONFIDENT_STD, visits.reports.std),
     )
-    return Visits(
-        visits.seconds, visits.vehicle, visits.place, visits.mu, visits.excited & ~lying, reports
+    return replace(claimed, reports=reports)
+
+
+def with_claims(visits: Visits, lying: BoolArray, claim: FloatArray | float) -> Visits:
+    """Return the visits with the likelihood and the grip used of a claimed friction `claim` (n,) in
+    the visits that the mask `lying` (n,) selects. These visits do not count as excited. Readings
+    and their standard deviations stay.
+    """
+    reports = visits.reports
+    likelihood = agent.overconfident_likelihood(claim)
+    claims = replace(
+        reports,
+        used=np.where(lying, claim, reports.used),
+        log_likelihood=np.where(lying[:, None], likelihood, reports.log_likelihood),
     )
+    return replace(visits, excited=visits.excited & ~lying, reports=claims)

@@ -33,6 +33,9 @@ class Finding:
     delay_s: float = 0.0
     confidence: float = SETTLED
 
+    def __str__(self) -> str:
+        return f"{self.channel} {self.kind}: {self.words}"
+
 
 @dataclass
 class Diagnosis:

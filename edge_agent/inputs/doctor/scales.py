@@ -32,6 +32,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.doctor.identities import Fit
+from edge_agent.inputs.driving_direction import FASTEST_REVERSE_M_S
 from edge_agent.inputs.units import ANGLE, DEG, SPEED
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import GRAVITY
@@ -99,7 +100,6 @@ FLIPPED: Final = Mistake("sign", -1.0)
 # Most wheel-speed sensors do not report the direction. In a car that drives backwards, such a speed
 # has the wrong sign in all identities, as if several other signals had one.
 REVERSING: Final = Mistake("unsigned in reverse", -1.0)
-FASTEST_REVERSE: Final = 10.0  # [m/s] reverse gears of cars end at about 30 km/h
 QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
 # Clocks that an identity compares: identity -> (device on the left, device on the right).
 CLOCKS: Final = {
@@ -144,7 +144,7 @@ def faults_of(vehicle: Vehicle, ground: Fit, fast: float) -> dict[str, list[Mist
     rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
     if ground.is_known and 0.4 < ground.gain < 2.5 and abs(ground.gain - 1.0) > 0.03:
         rims.append(Mistake("radius", 1.0 / ground.gain))
-    if fast < FASTEST_REVERSE:
+    if fast < FASTEST_REVERSE_M_S:
         rims.append(REVERSING)
     angles = [
         Mistake("deg", 1.0 / ANGLE["deg"]),

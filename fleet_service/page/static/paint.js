@@ -13,7 +13,7 @@ import {
 import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
 import { Pixels } from "./pixels.js";
 import { ribbons, ribbonWidth, streets, track } from "./ribbons.js";
-import { write } from "./vector.js";
+import { writeBeside } from "./vector.js";
 
 const CORNER_PX = [60, 140]; // size of the buttons in the upper right corner
 const NEAR_PX = 14;
@@ -304,23 +304,8 @@ function names(pen, view, roads, placed) {
       line.length * view.scale < line.name.length * 7
     )
       continue;
-    const turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
-    const flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn;
     const off = ribbonWidth(view) * 1.6 + 9;
-    if (
-      write(
-        pen,
-        ink,
-        line.name,
-        a[0] + Math.sin(flat) * off,
-        a[1] - Math.cos(flat) * off,
-        flat,
-        12.5,
-        placed,
-        view,
-      )
-    )
-      said.add(line.name);
+    if (writeBeside(pen, ink, line.name, a, a, b, off, 12.5, placed, view)) said.add(line.name);
   }
 }
 

@@ -340,27 +340,21 @@ function street(pen, ink, { name, along }, left, top, px, placed, view, said) {
       const [a, b, middle] = [at(far - half), at(far + half), at(far)];
       const chord = Math.hypot(b[0] - a[0], b[1] - a[1]);
       if (chord < 1.93 * half || !inside(middle)) continue;
-      const turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
-      const flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn;
       const off = side * Math.max(13, (6.5 * view.scale) / metresPerWorld(view.y));
-      if (
-        write(
-          pen,
-          ink,
-          name,
-          middle[0] + Math.sin(flat) * off,
-          middle[1] - Math.cos(flat) * off,
-          flat,
-          12,
-          placed,
-          view,
-        )
-      )
-        said.set(name, 1);
+      if (writeBeside(pen, ink, name, middle, a, b, off, 12, placed, view)) said.set(name, 1);
     }
 }
 
-export function write(pen, ink, name, x, y, turn, size, placed, view, quiet = false) {
+// Write a name `off` pixels beside the point `at`, along the line from `a` to `b`, and upright.
+export function writeBeside(pen, ink, name, at, a, b, off, size, placed, view) {
+  const turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
+  const flat = Math.abs(turn) > Math.PI / 2 ? turn + Math.PI : turn;
+  const x = at[0] + Math.sin(flat) * off;
+  const y = at[1] - Math.cos(flat) * off;
+  return write(pen, ink, name, x, y, flat, size, placed, view);
+}
+
+function write(pen, ink, name, x, y, turn, size, placed, view, quiet = false) {
   pen.font = `${quiet ? "italic 400" : size > 13 ? "700" : "600"} ${size}px system-ui, sans-serif`;
   const wide = pen.measureText(name).width / 2 + 4;
   const high = size * 0.7;
