@@ -308,7 +308,11 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     speed = max(features.speed, SLOWEST_SLIP_M_S)
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
-        noise = max(constants.physical.omega_noise, ROUNDING * memory.last.omega_step[wheel])
+        noise = max(
+            constants.physical.omega_noise,
+            ROUNDING * memory.last.omega_step[wheel],
+            memory.vibration,
+        )
         linear = row[Parameter.SLOPE_X] / speed
         slip_variance = (linear * noise * row[Parameter.RADIUS]) ** 2
         features.abrupt_noise[wheel] = (
@@ -430,12 +434,8 @@ def unexplained_slip_difference(
         slip = (faster - turning) / speed
         unknown = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j], 0.0))
         samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
-        noise = (
-            constants.physical.omega_noise
-            * row[Parameter.RADIUS]
-            / speed
-            * math.sqrt(2.0 / samples)
-        )
+        noise = max(constants.physical.omega_noise / math.sqrt(samples), memory.vibration)
+        noise *= math.sqrt(2.0) * row[Parameter.RADIUS] / speed
         difference = abs(
             row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left]
         )

@@ -25,18 +25,22 @@ from schemas.thresholds import UTILISED_WINDOW_S
 APART_SLIDES = 0.08  # [1] difference of two wheel speeds over the speed
 SPIN_SLIDES = 12.0  # [m/s^2] difference of a wheel's acceleration from the car's
 SEEN = 0.3  # [1] increase of the membership from which a new slide counts as begun
+# [1] mean square of the second smallest of four second differences of independent normal values,
+# over the variance of these values
+SECOND_SMALLEST = 2.45
 
 
 @compiled
 def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
-    """Update the evidence that wheels slide, memory.slip, with the wheel speeds of the block (the
-    samples within 0.05 s).
+    """Update the evidence that wheels slide, memory.slip, and the vibration of wheels with the
+    wheel speeds of the block (the samples within 0.05 s).
     """
     slip = memory.slip
     seen = slip_membership(memory, features)
     slip.begins = max(seen - slip.held, 0.0)
     slip.held = max(seen, slip.held * math.exp(-features.duration / UTILISED_WINDOW_S))
     slip.ended = slip.held - seen
+    learn_vibration(memory, constants, features)
     if slip.begins > SEEN and front_slides_more(memory, features):
         wheelbase = memory.row[Parameter.TO_FRONT] + memory.row[Parameter.TO_REAR]
         # The rear tyres need `abrupt_time` to build up their force at the place of the front axle.
@@ -51,6 +55,34 @@ def update_slip(memory: MixtureMemory, constants: Constants, features: BlockFeat
 def sliding_degree(memory: MixtureMemory) -> float:
     """Return the fuzzy truth value, 0 to 1, of "a wheel slides" in the current block."""
     return float(memory.slip.held - memory.slip.ended)
+
+
+@compiled
+def learn_vibration(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
+    """Update memory.vibration, the standard deviation [rad/s] of the wheel speeds of a block that
+    an uneven road causes, while no wheel slides.
+
+    It follows from the second differences of the wheel speeds over three blocks. Only the wheel
+    with the second smallest difference counts, because the wheels of one axle may begin to slide.
+    For the same reason a large difference counts as `huber` standard deviations.
+    """
+    earlier = memory.earlier_omega
+    smallest = second = math.inf
+    for wheel in range(4):
+        omega = features.rolling[wheel] / memory.row[Parameter.RADIUS]
+        bend = abs(omega - 2.0 * earlier[0, wheel] + earlier[1, wheel])
+        earlier[1, wheel], earlier[0, wheel] = earlier[0, wheel], omega
+        if bend < smallest:
+            smallest, second = bend, smallest
+        elif bend < second:
+            second = bend
+    if second < math.inf and features.speed > SLOW_M_S:
+        share = 1.0 - math.exp(-features.duration / constants.chosen.window)
+        share *= 1.0 - sliding_degree(memory)
+        square = memory.vibration**2
+        usual = max(memory.vibration, constants.physical.omega_noise)
+        found = min(second**2 / SECOND_SMALLEST, (constants.guards.huber * usual) ** 2)
+        memory.vibration = math.sqrt(square + share * (found - square))
 
 
 @compiled

@@ -184,6 +184,9 @@ class MixtureMemory:
     factor: Annotated[FloatArray, 2]  # [1] adapted over nominal R: wheels, axles
     last_side: Annotated[FloatArray, 2]  # [1] axles' lateral force over load in the previous block
     usual_rolling: Annotated[FloatArray, 4]  # [m/s] smoothed forward speed according to each wheel
+    # [rad/s] mean wheel speeds of the last block and of the one before it
+    earlier_omega: Annotated[FloatArray, 2, 4]
+    vibration: float  # [rad/s] standard deviation of a block's mean wheel speed by uneven road
     # [1] slips of the wheels, along and across, that belong to the tyres' force (`relaxation.py`)
     built_along: Annotated[FloatArray, 4]
     built_across: Annotated[FloatArray, 4]
@@ -221,4 +224,5 @@ def new_filters(
     prior["mean"], prior["std"], prior["time"] = means, spreads, nominal.time
     filters["row"], filters["factor"] = rows, 1.0
     filters["last_side"] = filters["usual_rolling"] = np.nan
+    filters["earlier_omega"] = np.nan
     return filters
