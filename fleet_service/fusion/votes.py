@@ -222,7 +222,7 @@ class CellPlace(NamedTuple):
 
 
 @refcount_free_inlined
-def update(
+def update_cell(
     rows: Rows,
     place: CellPlace,
     entries: RecordArray,
@@ -234,67 +234,83 @@ def update(
     the caller has written to `scratch` (work memory).
     """
     row, sources = place
-    belief = rows.belief
     cells = rows.cells
     time = entries[entry].time
-    kind = int(entries[entry].kind)
-    key = cells[row].key
+    is_value = entries[entry].kind == ReportKind.VALUE
+    is_new = cells[row].time == 0
     p = scratch[ScratchRow.BELIEF]
-    seconds = 0.0
-    passed = 0.0
-    unpack_belief(belief, row, p)
-    new = cells[row].time == 0
-    if new:
-        cells[row].first = time
-        _, _, prior = road_time(weather, key, time, time)
-        if prior:
-            mix_prior(p, 1.0, weather.prior[prior])
-    else:
-        passed = (time - cells[row].time) * 1e-9
-        seconds = max(passed, 0.0) + cells[row].aged / AGED
-        fade_weights(cells, row, cells[row].time, time)
-    change = 0.0
-    prior = 0
-    cells[row].aged = _remembered_parts(seconds)
-    if seconds >= c.FORGET_S:
-        drift, change, prior = road_time(weather, key, time - int(seconds * NS), time)
-        forget(p, drift, change, weather.prior[prior], scratch[ScratchRow.PADDED])
-        cells[row].aged = np.uint16(0)
-    weight = float(entries[entry].weight)
-    if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0:
-        weight = _untrusted_weight(cells, row, kind, float(entries[entry].power), weight)
+    unpack_belief(rows.belief, row, p)
+    change, prior = _age_belief(cells, row, time, weather, scratch)
+    weight = _reduce_untrusted(cells, row, entries, entry)
     strength = weight * entries[entry].power * entries[entry].share
-    if kind == ReportKind.VALUE and not new:
-        ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
-    if kind == ReportKind.VALUE:
-        apply_vote(
-            p,
-            scratch[ScratchRow.LIKELIHOOD],
-            min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST),
-        )
+    if is_value:
+        if not is_new:
+            ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
+        certainty = min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST)
+        apply_vote(p, scratch[ScratchRow.LIKELIHOOD], certainty)
     else:
-        apply_vote(
-            p, scratch[ScratchRow.LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
-        )
+        certainty = (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
+        apply_vote(p, scratch[ScratchRow.LIKELIHOOD], certainty)
         if entries[entry].limited <= 0:
-            visits = float(cells[row].visits) + 1.0  # this one included
-            noticed = float(cells[row].values) / visits
+            values = float(cells[row].values)
+            noticed = values / (float(cells[row].visits) + 1.0)  # this visit included
             note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
             if entries[entry].limited == UNLIMITED:
-                doubted = (1.0 - c.BOUND_CONTAMINATION) * min(float(cells[row].values), 1.0)
+                doubted = (1.0 - c.BOUND_CONTAMINATION) * min(values, 1.0)
                 note_silent_use(p, int(entries[entry].used), doubted * min(strength, 1.0))
-    pack_belief(p, belief, row)
+    pack_belief(p, rows.belief, row)
     cells[row].time = time
     _count_visit(cells, row, entries, entry)
-    if kind == ReportKind.VALUE:
+    if is_value:
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if is_ice_source(entries, entry):
-            note_source(rows.reporters, sources, Side.ICE, entries[entry].vehicle, time)
-        elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
-            note_source(rows.reporters, sources, Side.GRIP, entries[entry].vehicle, time)
+        _note_source(rows, sources, entries, entry)
+
+
+@refcount_free_inlined
+def _age_belief(
+    cells: RecordArray, row: int, time: int, weather: Weather, scratch: Bins
+) -> tuple[float, int]:
+    """Age the belief in `scratch` about the cell in row `row` from its last visit to `time` [ns]. A
+    cell without visits gets the weather's prior instead.
+
+    Return the road time [s] of sudden changes that the ageing covers (0 if none), and the row of
+    `weather.prior` that it mixes in (0: uniform). Ageing for less than FORGET_S is postponed to a
+    later visit.
+    """
+    p = scratch[ScratchRow.BELIEF]
+    seconds = 0.0
+    if cells[row].time == 0:
+        cells[row].first = time
+        _, _, initial = road_time(weather, cells[row].key, time, time)
+        if initial:
+            mix_prior(p, 1.0, weather.prior[initial])
+    else:
+        passed = (time - cells[row].time) * 1e-9
+        seconds = max(passed, 0.0) + cells[row].aged / AGED
+        fade_weights(cells, row, cells[row].time, time)
+    if seconds < c.FORGET_S:
+        cells[row].aged = _remembered_parts(seconds)
+        return 0.0, 0
+    drift, change, prior = road_time(weather, cells[row].key, time - int(seconds * NS), time)
+    forget(p, drift, change, weather.prior[prior], scratch[ScratchRow.PADDED])
+    cells[row].aged = np.uint16(0)
+    return change, prior
+
+
+@refcount_free_inlined
+def _note_source(rows: Rows, sources: int, entries: RecordArray, entry: int) -> None:
+    """Record the vehicle of an observation (row `entry`) in the cell's list of vehicles that
+    reported ice or grip (row `sources`), if the observation shows either clearly.
+    """
+    vehicle = entries[entry].vehicle
+    time = entries[entry].time
+    if is_ice_source(entries, entry):
+        note_source(rows.reporters, sources, Side.ICE, vehicle, time)
+    elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
+        note_source(rows.reporters, sources, Side.GRIP, vehicle, time)
 
 
 @refcount_free_inlined
@@ -441,19 +457,19 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
 
 
 @refcount_free_inlined
-def _untrusted_weight(
-    cells: RecordArray, row: int, kind: int, power: float, weight: float
-) -> float:
-    """Return the weight of an untrusted vehicle's vote (effect of its observation on a cell),
-    reduced by earlier votes of other untrusted vehicles in the cell. The k-th new vehicle counts
-    1/k², so all together count at most 1.6 votes.
+def _reduce_untrusted(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> float:
+    """Return the weight in [0, 1] of the vehicle that made an observation (row `entry`) in a cell,
+    and count its vote if the vehicle is untrusted. The k-th untrusted vehicle of a cell counts
+    1/k², so all together count at most 1.6 votes. The weight of a trusted vehicle is unchanged.
 
     Therefore an attacker gains nothing from many new names. Repeated votes of one vehicle are
-    already discounted by `power` (share of new information). The weight of a trusted vehicle is
-    returned unchanged.
+    already discounted by `power` (share of new information).
     """
+    weight = float(entries[entry].weight)
     if not 0.0 < weight < c.SOURCE_TRUST:
         return weight
+    kind = int(entries[entry].kind)
+    power = float(entries[entry].power)
     others = np.float32(cells[row].untrusted[kind] / UNTRUSTED)
     cells[row].untrusted[kind] = np.uint16(min(float(others + power) * UNTRUSTED + 0.5, 65535.0))
     return weight / float((np.float32(1.0) + others) ** 2)

@@ -40,7 +40,7 @@ from fleet_service.fusion.votes import (
     discount_vote,
     load_likelihood,
     needs_reporters,
-    update,
+    update_cell,
 )
 from fleet_service.fusion.weather import Weather
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
@@ -169,7 +169,7 @@ def _absorb_votes(
             continue
         discount_vote(entries, pairs, entry)
         place = CellPlace(slot, cells[slot].reporters)
-        update(state.live, place, entries, entry, weather, scratch)
+        update_cell(state.live, place, entries, entry, weather, scratch)
     return waiting
 
 
@@ -294,7 +294,7 @@ def _recompute_beliefs(state: State, weather: Weather, stale: Int32Array, scratc
             discount_vote(entries, state.pairs, entry)
             load_likelihood(entries, entry, scratch)
             place = CellPlace(slot, reporters)
-            update(live, place, entries, entry, weather, scratch)
+            update_cell(live, place, entries, entry, weather, scratch)
             entry = entries[entry].following
         windows[window].stale = 0
 
@@ -397,7 +397,7 @@ def _commit_windows(
             if not whole:
                 load_likelihood(entries, entry, scratch)
                 place = CellPlace(window, window)
-                update(state.base, place, entries, entry, weather, scratch)
+                update_cell(state.base, place, entries, entry, weather, scratch)
             if entries[entry].limited > 0:
                 judge_flag(live.reporters, live.cells[slot].reporters, peers, entries, entry)
             if entries[entry].kind == ReportKind.VALUE:
