@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.store.records import NONE
 from fleet_service.fusion.store.table import find_row
 from schemas import grid
@@ -24,7 +24,7 @@ _SIDEWAYS: Final = (1, 3)
 # Number of cells in which the other direction of the road may lie: the same cell, left and right.
 ACROSS_CELLS: Final = 1 + len(_SIDEWAYS)
 # [ns] time for which a visit shows that a road leads through a cell
-_ROAD_NS: Final = int(c.FORGOTTEN_S) * NS
+_ROAD_NS: Final = int(constants.FORGOTTEN_S) * NS
 
 
 @refcount_free_inlined

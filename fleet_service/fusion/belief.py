@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
@@ -47,7 +47,7 @@ class ReportKind(IntEnum):
 
 _BINS: Final = mugrid.BINS
 # [bins²/s] Diffusion coefficient of the slow change of μ: half the variance gained per second.
-_DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0
+_DIFFUSION: Final = 0.5 * (constants.DRIFT_PER_ROOT_HOUR / constants.BIN_WIDTH) ** 2 / 3600.0
 # Largest share of a bin that moves to each neighbouring bin in one diffusion step. A larger share
 # makes the scheme unstable or adds ripples.
 _STEP: Final = 0.25
@@ -58,7 +58,7 @@ _STEPS: Final = math.ceil(_DIFFUSION * 24 * 3600 / _STEP)
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
-_EDGE: Final = (SLIPPERY_MU - mugrid.LOWER) / c.BIN_WIDTH
+_EDGE: Final = (SLIPPERY_MU - mugrid.LOWER) / constants.BIN_WIDTH
 # share of each bin that lies below SLIPPERY_MU
 SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
@@ -75,7 +75,7 @@ def bias_kernel() -> FloatArray:
     the standard deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut off REACH bins from its
     centre.
     """
-    spread = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
+    spread = np.hypot(constants.BIAS_RELATIVE * _CENTRES, constants.BIAS_ABSOLUTE)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / spread))
     kernel[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS))) > REACH] = 0.0
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
@@ -124,7 +124,7 @@ def _write_quantiles(belief: FloatArray, levels: FloatArray, out: FloatArray) ->
                 place += 1
             mass = belief[k, place]
             share = (target - below) / mass if mass > 0.0 else 0.0
-            out[j, k] = mugrid.LOWER + c.BIN_WIDTH * (place + min(max(share, 0.0), 1.0))
+            out[j, k] = mugrid.LOWER + constants.BIN_WIDTH * (place + min(max(share, 0.0), 1.0))
 
 
 @refcount_free_inlined
@@ -231,7 +231,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
             for i in range(_BINS):
                 p[i] += share * ((padded[i] - padded[i + 1]) + (padded[i + 2] - padded[i + 1]))
     if change_s > 0.0:
-        mix_prior(p, -math.expm1(-change_s / c.CHANGE_S), prior)
+        mix_prior(p, -math.expm1(-change_s / constants.CHANGE_S), prior)
 
 
 @refcount_free_inlined
@@ -244,7 +244,7 @@ def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -
     would resist a real change. `power` is the share of the coming vote (effect of one visit) that
     is new information.
     """
-    lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
+    lacking = constants.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / constants.CHANGE_S)
     if lacking > 0.0:
         mix_prior(p, lacking, prior)
 
@@ -259,7 +259,7 @@ def kind_of(evidence: ByteArray) -> ReportKind:
     least = np.uint8(255)
     for i in range(_BINS):
         least = min(least, evidence[i])
-    is_value = evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS
+    is_value = evidence[_BINS - 1] >= int(least) + constants.VALUE_DROP_STEPS
     return ReportKind.VALUE if is_value else ReportKind.BOUND
 
 
@@ -294,7 +294,7 @@ def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> No
         for j in range(_BINS):
             steps = min(steps, evidence[j])
             out[j] = _LIKELIHOOD[steps]
-        if evidence[_BINS - 1] - int(steps) > c.NOISE_DROP_STEPS:
+        if evidence[_BINS - 1] - int(steps) > constants.NOISE_DROP_STEPS:
             for j in range(_BINS - 1, -1, -1):
                 if evidence[j] == steps:
                     break

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
 from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
@@ -77,7 +77,7 @@ class BeliefMap:
         copy of the state instead of the live one.
         """
         rows = self.store.state.live if rows is None else rows
-        rule = _rule_of(self._shape.reader, c.SILENCE, narrow=True)
+        rule = _rule_of(self._shape.reader, constants.SILENCE, narrow=True)
         at = np.full(len(slots), now)
         return road_beliefs(rows, self.store.table, self._weather, rule, slots, at)
 
@@ -156,7 +156,7 @@ class BeliefMap:
         reporters = self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NONE, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
-        trusted = self.vote_weights[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
+        trusted = self.vote_weights[-1].weights(np.maximum(who, 0)) >= constants.SOURCE_TRUST
         counted = (who != NONE) & trusted & (when > np.reshape(since, (-1, 1)))
         return who, np.where(counted, when, 0)
 

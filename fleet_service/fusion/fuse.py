@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief_map import BeliefMap
 from fleet_service.fusion.late import LATE_MOST_NS, delay_observations, fused_at
 from fleet_service.fusion.observations import Observations
@@ -88,7 +88,7 @@ class Fusion(BeliefMap):
         self.enrolled = enrolled
         self._lateness_ns = int(lateness_s * NS)
         # number of epochs whose vote weights an observation in time may still need
-        self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2
+        self._kept_epochs = self._lateness_ns // constants.EPOCH_NS + 2
         self._epoch: int | None = None
         self.reports: Reports = no_reports()
         super().__init__(
@@ -128,14 +128,14 @@ class Fusion(BeliefMap):
         observation from before the checkpoint arrives later, it is processed as if it had been made
         at the checkpoint. The result is None before the first observation.
         """
-        return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
+        return None if self._epoch is None else self._epoch * constants.EPOCH_NS - self._lateness_ns
 
     @property
     def next_epoch(self) -> int:
         """Return the start [ns] of the first epoch (minute) that has not been fused yet; 0 before
         the first observation.
         """
-        return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
+        return 0 if self._epoch is None else (self._epoch + 1) * constants.EPOCH_NS
 
     def update(self, observations: Observations, before: RecordedResult | None = None) -> Updated:
         """Fuse observations in any order and return the outcome for each.
@@ -150,7 +150,7 @@ class Fusion(BeliefMap):
         """
         if before is None:
             late, late_by = _find_late(observations.time, self.checkpoint)
-            most_waiting = c.WAITING_MOST
+            most_waiting = constants.WAITING_MOST
         else:
             late = before.late
             late_by = before.late_by
@@ -160,7 +160,7 @@ class Fusion(BeliefMap):
             observations = delay_observations(observations, late_by, self._weather)
         left_out = late & ~delayed
         vehicle = self.store.vehicles_of(observations.vehicle)
-        epoch = observations.time // c.EPOCH_NS
+        epoch = observations.time // constants.EPOCH_NS
         # The loop writes weight and flags of one epoch after the other into these arrays.
         arrivals = _make_arrivals(observations, vehicle, delayed)
         touched = [np.zeros(0, np.int64)]
@@ -238,7 +238,7 @@ class Fusion(BeliefMap):
             self._epoch = epoch
         while self._epoch < epoch:
             self._epoch = self._epoch + 1 if self.waiting else epoch
-            before = self._epoch * c.EPOCH_NS - self._lateness_ns
+            before = self._epoch * constants.EPOCH_NS - self._lateness_ns
             store = self.store
             for due in store.due_windows(before):
                 vehicles = VehicleRecords(store.peers, store.names)

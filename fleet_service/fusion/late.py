@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import PADDED, PRIOR, Bins, forget, largest_bin
 from fleet_service.fusion.observations import Observations
 from fleet_service.fusion.weather import Weather, road_time
@@ -33,7 +33,7 @@ from schemas.thresholds import NS, US_STEP
 
 # [ns] A late visit is fused only if it is at most this much older than the checkpoint. After this
 # time, the road has probably changed.
-LATE_MOST_NS: Final = int(c.CHANGE_S) * NS
+LATE_MOST_NS: Final = int(constants.CHANGE_S) * NS
 # [ns] Interval directly after the checkpoint in which late visits get their times.
 _PLACES_NS: Final = NS
 _FLOOR: Final = mugrid.FLOOR_STEPS

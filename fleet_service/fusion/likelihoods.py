@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.reported import Evidence, as_reported
 from schemas import mugrid
@@ -27,10 +27,10 @@ from schemas.runtime.jit import refcount_free_locked
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
 # Half a standard deviation of the grip used. A bound is flat from the grip used minus this.
-_LESS: Final = 0.5 * c.UTILISED_STD
+_LESS: Final = 0.5 * constants.UTILISED_STD
 # Step of the grip used in the table of bounds; the grip used is rounded down. A tenth of its
 # standard deviation.
-_USED_STEP: Final = c.UTILISED_STD / 10.0
+_USED_STEP: Final = constants.UTILISED_STD / 10.0
 
 
 def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
@@ -92,7 +92,7 @@ def _levelled_bounds() -> ByteArray:
     32), in steps of 1/16 nat. Row k is for the grip used k·_USED_STEP, up to UTILISED_MOST. The
     part above the grip used is already flat (`level_above_used`).
     """
-    used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
+    used = np.arange(0.0, constants.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
     return level_above_used(mugrid.encode_log_likelihood(at_least(used)), used)
 
 
@@ -127,7 +127,7 @@ def level_above_used(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 @refcount_free_locked
 def _level_rows(steps: ByteArray, used: FloatArray) -> None:
     for n in range(len(steps)):
-        if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= c.VALUE_DROP_STEPS:
+        if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= constants.VALUE_DROP_STEPS:
             continue
         place = min(max(np.searchsorted(mugrid.EDGES, used[n] - _LESS) - 1, 0), mugrid.BINS - 1)
         floor = np.uint8(255)
@@ -136,7 +136,7 @@ def _level_rows(steps: ByteArray, used: FloatArray) -> None:
         least = np.uint8(255)
         for i in range(place, mugrid.BINS):
             least = min(least, steps[n, i])
-        falling = steps[n, mugrid.BINS - 1] - int(least) > c.NOISE_DROP_STEPS
+        falling = steps[n, mugrid.BINS - 1] - int(least) > constants.NOISE_DROP_STEPS
         for i in range(mugrid.BINS - 1, place - 1, -1):
             falling = falling and steps[n, i] > least
             steps[n, i] = steps[n, i] - least if falling else 0
@@ -155,16 +155,18 @@ def states_more_grip(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) ->
     """
     sent = columns["log_likelihood"]
     place = np.minimum(np.searchsorted(mugrid.CENTRES, used), mugrid.BINS - 1)
-    bound = columns["with_likelihood"] & (sent[:, -1] < c.VALUE_DROP_STEPS)
-    return np.asarray(bound & (sent[np.arange(len(sent)), place] >= 0.75 * c.VALUE_DROP_STEPS))
+    bound = columns["with_likelihood"] & (sent[:, -1] < constants.VALUE_DROP_STEPS)
+    return np.asarray(
+        bound & (sent[np.arange(len(sent)), place] >= 0.75 * constants.VALUE_DROP_STEPS)
+    )
 
 
 def at_least(used: FloatArray) -> FloatArray:
     """Return the log-likelihoods (n, 32) of lower bounds of friction: ln Φ((μ - u) / σ_u), where u
     is the grip used and σ_u its standard deviation. They are flat if u is NaN.
     """
-    known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
-    std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
+    known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), constants.UTILISED_MOST)[:, None]
+    std = np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
     return log_distribution((mugrid.CENTRES - known_use) / std)
 
 
@@ -180,6 +182,6 @@ def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) ->
 
 
 def _side_std(to_bound: FloatArray) -> FloatArray:
-    std = np.nan_to_num(to_bound / Z_95, nan=c.POSTERIOR_STD)
+    std = np.nan_to_num(to_bound / Z_95, nan=constants.POSTERIOR_STD)
     # The grid cannot represent less than half a bin.
-    return np.maximum(std, 0.5 * c.BIN_WIDTH)
+    return np.maximum(std, 0.5 * constants.BIN_WIDTH)

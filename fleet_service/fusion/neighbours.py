@@ -66,7 +66,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.adjacent import (
     ACROSS,
     ACROSS_CELLS,
@@ -89,7 +89,7 @@ from schemas.thresholds import NS
 
 _BINS: Final = mugrid.BINS
 # P(same surface) by distance in cells
-_KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
+_KEPT: Final[FloatArray] = np.power(constants.SAME_SURFACE, np.arange(constants.NEIGHBOURS + 1))
 # number of cells in a tile, and largest number of aged beliefs that one reading keeps
 _TILE_CELLS: Final = 4 ** (grid.CELL_ZOOM - grid.TILE_ZOOM)
 
@@ -218,7 +218,7 @@ def _read_beliefs(
             buffers.own[i] = buffers.scratch[ScratchRow.BELIEF, i]
         target = Readout(slots[k], now[k], prior)
         slippery = read_slippery(rule.slippery, live.cells, slots[k], buffers.own)
-        if c.DECIDED <= slippery <= 1.0 - c.DECIDED:
+        if constants.DECIDED <= slippery <= 1.0 - constants.DECIDED:
             _multiply_messages(parts, target, buffers, out[k])
         else:
             read_road(rule.kernels, live.cells, slots[k], buffers.own, out[k])
@@ -237,7 +237,7 @@ def _is_measured(parts: MapParts, target: Readout, row: int, belief: Bins) -> bo
     firmest = 0.0
     for i in range(_BINS):
         firmest = max(firmest, belief[i] / prior[i])
-    return firmest >= c.HEARD_MOST
+    return firmest >= constants.HEARD_MOST
 
 
 @refcount_free_inlined
@@ -272,7 +272,7 @@ def _multiply_side(parts: MapParts, target: Readout, side: int, buffers: Buffers
     across = side == ACROSS
     has_messages = False
     neighbour = search.key // grid.SECTORS
-    for step in range(1, (ACROSS_CELLS if across else c.HEARD_CELLS) + 1):
+    for step in range(1, (ACROSS_CELLS if across else constants.HEARD_CELLS) + 1):
         neighbour, row = find_neighbour(parts.table, cells, search, neighbour, step)
         measured = row != NONE and _can_combine(parts, target, row, buffers)
         if measured:
@@ -304,7 +304,7 @@ def _multiply_limited(product: Bins, road: Bins, prior: Bins, kept: float) -> No
     """
     for i in range(_BINS):
         factor = 1.0 + kept * (road[i] / prior[i] - 1.0)
-        product[i] *= min(max(factor, 1.0 / c.HEARD_MOST), c.HEARD_MOST)
+        product[i] *= min(max(factor, 1.0 / constants.HEARD_MOST), constants.HEARD_MOST)
 
 
 @refcount_free_inlined
@@ -368,11 +368,11 @@ def _choose_message(
     best = NONE
     search = SearchSide(cells[target.slot].key, side, target.now)
     neighbour = search.key // grid.SECTORS
-    for step in range(1, (ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS) + 1):
+    for step in range(1, (ACROSS_CELLS if side == ACROSS else constants.NEIGHBOURS) + 1):
         neighbour, row = find_neighbour(parts.table, cells, search, neighbour, step)
         if row == NONE:
             continue
-        ended = _stored_slippery(live, row) < c.NEIGHBOUR_GRIP
+        ended = _stored_slippery(live, row) < constants.NEIGHBOUR_GRIP
         if ended or is_border(live, target.slot, row, target.now):
             if side == ACROSS:
                 continue
@@ -402,7 +402,7 @@ def stretches(live: Rows, table: IntArray, slots: IntArray) -> IntArray:
 
     A stretch ends at a cell whose own reports make slippery road unlikely.
     """
-    out = np.full((len(slots), 1 + 2 * c.NEIGHBOURS + ACROSS_CELLS), NONE)
+    out = np.full((len(slots), 1 + 2 * constants.NEIGHBOURS + ACROSS_CELLS), NONE)
     _find_stretches(live, table, slots, out)
     return out
 
@@ -415,12 +415,12 @@ def _find_stretches(live: Rows, table: IntArray, slots: IntArray, out: IntArray)
         for side in (BEFORE, BEHIND, ACROSS):
             search = SearchSide(own.key, side, own.time)
             neighbour = search.key // grid.SECTORS
-            for step in range(ACROSS_CELLS if side == ACROSS else c.NEIGHBOURS):
+            for step in range(ACROSS_CELLS if side == ACROSS else constants.NEIGHBOURS):
                 neighbour, row = find_neighbour(table, live.cells, search, neighbour, step + 1)
                 if row == NONE:
                     continue
-                if _stored_slippery(live, row) >= c.NEIGHBOUR_GRIP:
-                    out[k, 1 + side * c.NEIGHBOURS + step] = row
+                if _stored_slippery(live, row) >= constants.NEIGHBOUR_GRIP:
+                    out[k, 1 + side * constants.NEIGHBOURS + step] = row
                 elif side != ACROSS:
                     break
 
@@ -435,9 +435,9 @@ def _lower_to_unsure(road: FloatArray, quiet: FloatArray) -> None:
     """
     current = _slippery_probability(road)
     least = _slippery_probability(quiet)
-    if current <= c.UNSURE or least >= current:
+    if current <= constants.UNSURE or least >= current:
         return
-    kept = max((c.UNSURE - least) / (current - least), 0.0)
+    kept = max((constants.UNSURE - least) / (current - least), 0.0)
     for i in range(_BINS):
         road[i] = kept * road[i] + (1.0 - kept) * quiet[i]
 

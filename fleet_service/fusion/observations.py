@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.likelihoods import make_evidence, states_more_grip
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
@@ -125,5 +125,5 @@ def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> Boo
     for name in FLAGS:
         if name in columns:
             active |= columns[name] == 1
-    most = used + np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * used)
+    most = used + np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
     return np.asarray(active & (most < SLIPPERY_MU))

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
@@ -61,7 +61,7 @@ def _describe_rows(steps: ByteArray, reported: Float32Array, likelihood: FloatAr
         for j in range(mugrid.BINS):
             steps[n, j] -= least
             likelihood[j] = _LIKELIHOOD[steps[n, j]]
-        if steps[n, mugrid.BINS - 1] < c.VALUE_DROP_STEPS:
+        if steps[n, mugrid.BINS - 1] < constants.VALUE_DROP_STEPS:
             continue
         whole = 0.0
         first = 0.0
@@ -76,6 +76,6 @@ def _describe_rows(steps: ByteArray, reported: Float32Array, likelihood: FloatAr
             second += likelihood[i] * (mugrid.CENTRES[i] - mean) ** 2
         reported[n, 0] = mean
         reported[n, 1] = math.sqrt(
-            second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2
+            second / whole + (constants.BIAS_RELATIVE * mean) ** 2 + constants.BIAS_ABSOLUTE**2
         )
         reported[n, 2] = slippery / whole

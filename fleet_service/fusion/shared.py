@@ -41,7 +41,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.store.records import (
     MANOEUVRES,
     NONE,
@@ -64,7 +64,7 @@ STATED: Final = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2)
 _BORDERS: Final = tuple(0.5 * (a + b) for a, b in pairwise(STATED))
 KINDS: Final = (1.0, 1.5, 2.2, 3.0)
 TENTH_NS: Final = 360 * NS  # [ns] the weights of a cell fade in steps of this length
-_FADES: Final = np.exp(-np.arange(64) * TENTH_NS / NS / c.VOTE_RENEWAL_S).astype(np.float32)
+_FADES: Final = np.exp(-np.arange(64) * TENTH_NS / NS / constants.VOTE_RENEWAL_S).astype(np.float32)
 _MOST: Final = np.iinfo(np.uint8).max
 
 
@@ -103,8 +103,10 @@ def _write_shared_parts(reported: Float32Array, out: ByteArray) -> None:
         if math.isnan(mean):
             mean = np.float32(1.0)
         relative = std / max(mean, np.float32(mugrid.LOWER))
-        stated = relative * relative - np.float32(c.BIAS_RELATIVE**2)
-        hidden = np.float32(c.SHARED_PART) * min(max(stated, np.float32(0.0)), np.float32(0.25))
+        stated = relative * relative - np.float32(constants.BIAS_RELATIVE**2)
+        hidden = np.float32(constants.SHARED_PART) * min(
+            max(stated, np.float32(0.0)), np.float32(0.25)
+        )
         share = min(np.float32(math.sqrt(hidden)), np.float32(STATED[-1]))
         out[row] = np.uint8(share * np.float32(SHARED))
 
@@ -123,7 +125,7 @@ class Shape(NamedTuple):
         """Return the slope (error of a friction value per unit of unused grip) by which intervals
         are widened for readers of the map.
         """
-        return self.slope + c.SHAPE_DOUBT
+        return self.slope + constants.SHAPE_DOUBT
 
     @property
     def alarm(self) -> float:
@@ -140,7 +142,7 @@ class Shape(NamedTuple):
 
 # Slopes (error of a value per unit of unused grip) with a table of kernels; the nearest is used.
 SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)
-UNKNOWN_SHAPE: Final = Shape(c.SHAPE_PRIOR, c.SHAPE_PRIOR)
+UNKNOWN_SHAPE: Final = Shape(constants.SHAPE_PRIOR, constants.SHAPE_PRIOR)
 
 
 def shared_kernel(
@@ -162,12 +164,14 @@ def shared_kernel(
         slope: error of a value per unit of unused grip.
     """
     centres = mugrid.CENTRES
-    common = c.COMMON_ALWAYS**2 + (c.COMMON_MANOEUVRE**2 + np.square(stated)) / kinds
-    unused = c.SHARED_SHARE - np.asarray(used)[..., None] / centres
-    shape = np.clip(slope * unused, 0.0, c.SHARED_MOST)
+    common = (
+        constants.COMMON_ALWAYS**2 + (constants.COMMON_MANOEUVRE**2 + np.square(stated)) / kinds
+    )
+    unused = constants.SHARED_SHARE - np.asarray(used)[..., None] / centres
+    shape = np.clip(slope * unused, 0.0, constants.SHARED_MOST)
     relative = np.sqrt(np.asarray(common))[..., None] * centres
-    low = np.hypot(np.hypot(relative, c.COMMON_ABSOLUTE), shape * centres)
-    return _two_sided(low, np.hypot(relative, c.COMMON_HIGH))
+    low = np.hypot(np.hypot(relative, constants.COMMON_ABSOLUTE), shape * centres)
+    return _two_sided(low, np.hypot(relative, constants.COMMON_HIGH))
 
 
 def base_kernel() -> FloatArray:
@@ -175,8 +179,10 @@ def base_kernel() -> FloatArray:
     friction and no values. K maps a belief about the friction that the fleet measures to a belief
     about the road.
     """
-    relative = c.COMMON_RELATIVE * mugrid.CENTRES
-    return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
+    relative = constants.COMMON_RELATIVE * mugrid.CENTRES
+    return _two_sided(
+        np.hypot(relative, constants.COMMON_ABSOLUTE), np.hypot(relative, constants.COMMON_HIGH)
+    )
 
 
 def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
@@ -299,11 +305,11 @@ def note_value(
     """
     used = entries[entry].used / USED
     shared = entries[entry].shared / SHARED
-    gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
+    gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * constants.SHARED_SHARE)
     weight = (
         strength
-        * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2
-        / (1.0 + (shared / c.SHARED_WIDE) ** 2)
+        * min(max(gentle, constants.SHARED_LEAST), 1.0) ** 2
+        / (1.0 + (shared / constants.SHARED_WIDE) ** 2)
     )
     before = 0.0
     largest = 0

@@ -4,7 +4,7 @@ they show where a slippery stretch of road ends. Compiled.
 
 from __future__ import annotations
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.store.records import NONE, SOURCES, Rows, Side
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
@@ -44,7 +44,7 @@ def _grip_beside_ice(rows: Rows, grip: int, ice: int, now: int) -> bool:
     ice_row = rows.cells[ice].reporters
     if grip_row == NONE or ice_row == NONE:
         return False
-    since = (now - c.SOURCE_NS) // NS
+    since = (now - constants.SOURCE_NS) // NS
     first = now // NS
     second = first
     for k in range(SOURCES):

@@ -19,15 +19,19 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.normal import normal_cdf
 from schemas import grid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 from schemas.thresholds import EARTH_RADIUS_M
 
 _EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # [m] circumference at the equator
-_STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
-_BORDERS: Final = np.arange(-c.SPREAD_CELLS - 1, c.SPREAD_CELLS + 2)  # k ± 1 of all steps k
+_STEPS: Final = np.array(
+    [k for k in range(-constants.SPREAD_CELLS, constants.SPREAD_CELLS + 1) if k]
+)
+_BORDERS: Final = np.arange(
+    -constants.SPREAD_CELLS - 1, constants.SPREAD_CELLS + 2
+)  # k ± 1 of all steps k
 
 
 def other_cells(
@@ -52,7 +56,7 @@ def other_cells(
     columns = (x[:, None] + ahead[0].astype(np.int64)) % n
     rows = y[:, None] + ahead[1].astype(np.int64)
     other = grid.interleave(columns, np.clip(rows, 0, n - 1))
-    good = (share >= c.SPREAD_LEAST) & np.isfinite(yaw)[:, None] & (rows >= 0) & (rows < n)
+    good = (share >= constants.SPREAD_LEAST) & np.isfinite(yaw)[:, None] & (rows >= 0) & (rows < n)
     good &= grid.region_of(other) == grid.region_of(cell)[:, None]
     return np.where(good, other, -1), np.where(good, share, 0.0).astype(np.float32)
 

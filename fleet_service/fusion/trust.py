@@ -41,7 +41,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.shared import Shape
 from fleet_service.fusion.store.records import NONE, USED
 from fleet_service.fusion.vote_weights import VoteWeights
@@ -53,14 +53,14 @@ from schemas.thresholds import NS, SLIPPERY_MU
 
 # Assumed share of agreement of an enrolled vehicle that has not been compared with others: the
 # operator vouches for it, so it starts like a vehicle that agreed with all others.
-_ENROLLED_AGREEMENT: Final = 1.0 - c.CONTAMINATION_LEAST
-_AGREEMENT: Final = 1.0 - c.CONTAMINATION
+_ENROLLED_AGREEMENT: Final = 1.0 - constants.CONTAMINATION_LEAST
+_AGREEMENT: Final = 1.0 - constants.CONTAMINATION
 # Relative; no vehicle measures μ more exactly than the rounding to bins allows, 1 % on dry road.
-_LEAST_VARIANCE: Final = c.BIAS_ABSOLUTE**2
+_LEAST_VARIANCE: Final = constants.BIAS_ABSOLUTE**2
 # Places of a vehicle's record among which another vehicle may have its place. Twice the number that
 # makes a vehicle known, so the first meetings of a vehicle displace each other only if more than
 # this many fall into one group.
-_GROUP: Final = 2 * int(c.ESTABLISHED_PEERS)
+_GROUP: Final = 2 * int(constants.ESTABLISHED_PEERS)
 
 
 @refcount_free
@@ -87,7 +87,7 @@ def compare_reports(
         entry: row of the new value in `entries`.
     """
     here = reporters[row]
-    if entries[entry].share < c.HERE_SHARE or entries[entry].late:
+    if entries[entry].share < constants.HERE_SHARE or entries[entry].late:
         return
     vehicle = int(entries[entry].vehicle)
     now = entries[entry].time // NS
@@ -97,31 +97,36 @@ def compare_reports(
     reported = here.time
     used = entries[entry].used / USED
     place = 0
-    for k in range(c.REPORTERS):
+    for k in range(constants.REPORTERS):
         if reporter[k] == vehicle:
             place = k
-            if c.REVISIT_S <= now - reported[k] <= c.PEER_S:
+            if constants.REVISIT_S <= now - reported[k] <= constants.PEER_S:
                 both = 0.5 * (mean + here.mean[k])
                 difference = (mean - here.mean[k]) / both
                 variance = _own_variance(mean, std) + _own_variance(
                     float(here.mean[k]), float(here.std[k])
                 )
                 # only if both values belong to the same road
-                if difference * difference < c.PEERS_DISAGREE**2 * variance:
+                if difference * difference < constants.PEERS_DISAGREE**2 * variance:
                     _note_shape(peers, vehicle, (used - here.used[k]) / both, difference, variance)
             break
         if reported[k] < reported[place]:
             place = k
-    for k in range(c.REPORTERS):
+    for k in range(constants.REPORTERS):
         other = int(reporter[k])
-        # Numba does not compile `other in (...)`
-        if other == NONE or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109
+        if other == NONE or now - reported[k] > constants.PEER_S:
             continue
-        spread = math.hypot(max(std, c.NOVELTY_STD), max(float(here.std[k]), c.NOVELTY_STD))
-        if spread > c.PEER_STD:
+        if other == vehicle:
+            continue
+        spread = math.hypot(
+            max(std, constants.NOVELTY_STD), max(float(here.std[k]), constants.NOVELTY_STD)
+        )
+        if spread > constants.PEER_STD:
             continue
         deviations = abs(mean - here.mean[k]) / spread
-        agreement = (c.PEERS_DISAGREE - deviations) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
+        agreement = (constants.PEERS_DISAGREE - deviations) / (
+            constants.PEERS_DISAGREE - constants.PEERS_AGREE
+        )
         agreement = min(max(agreement, 0.0), 1.0)
         _record_meeting(
             peers, vehicle, other, _pair_rank(names[vehicle].key, names[other].key), agreement
@@ -147,28 +152,28 @@ def judge_flag(
     from SLIPPERY. The vehicle's own value of the same visit is not a confirmation, because the flag
     and the value come from the same slip.
     """
-    if entries[entry].share < c.HERE_SHARE or entries[entry].late:
+    if entries[entry].share < constants.HERE_SHARE or entries[entry].late:
         return
     here = reporters[row]
     vehicle = int(entries[entry].vehicle)
     now = entries[entry].time // NS
     newest = 0
     deviation = 0.0
-    for k in range(c.REPORTERS):
+    for k in range(constants.REPORTERS):
         other = int(here.reporter[k])
         time = int(here.time[k])
         if other == NONE or other == vehicle:  # noqa: SIM109 as above
             continue
-        if now - time > c.PEER_S or time <= newest:
+        if now - time > constants.PEER_S or time <= newest:
             continue
         newest = time
-        deviation = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), c.NOVELTY_STD)
+        deviation = (SLIPPERY_MU - here.mean[k]) / max(float(here.std[k]), constants.NOVELTY_STD)
     this = peers[vehicle]
     if deviation >= 1.0:
         this.flags_confirmed += np.float32(1.0)
     elif deviation <= -1.0:
         this.flags_contradicted += np.float32(1.0)
-    if this.flags_confirmed + this.flags_contradicted > c.PEERS:
+    if this.flags_confirmed + this.flags_contradicted > constants.PEERS:
         this.flags_confirmed *= np.float32(0.5)
         this.flags_contradicted *= np.float32(0.5)
 
@@ -193,7 +198,7 @@ def _note_shape(
     this = peers[vehicle]
     this.used_squares += np.float32(used * used / variance)
     this.used_products += np.float32(used * difference / variance)
-    if this.used_squares > c.SHAPE_MEMORY:
+    if this.used_squares > constants.SHAPE_MEMORY:
         this.used_squares *= np.float32(0.5)
         this.used_products *= np.float32(0.5)
 
@@ -203,7 +208,7 @@ def _own_variance(mean: float, std: float) -> float:
     """Return the relative variance of a reported friction value, without the part that the
     vehicle's constant bias contributes.
     """
-    return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
+    return max((std / max(mean, mugrid.LOWER)) ** 2 - constants.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
 @refcount_free
@@ -228,7 +233,7 @@ def _record_meeting(
     peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float
 ) -> None:
     this = peers[vehicle]
-    first = rank % c.PEERS // _GROUP * _GROUP
+    first = rank % constants.PEERS // _GROUP * _GROUP
     place = first
     for k in range(first, first + _GROUP):
         if this.other[k] == other:
@@ -246,7 +251,7 @@ def _record_meeting(
         this.met[place] = 0.0
     this.agreed[place] += agreement
     this.met[place] += 1.0
-    if this.met[place] > c.PEER_MEMORY:
+    if this.met[place] > constants.PEER_MEMORY:
         this.agreed[place] *= 0.5
         this.met[place] *= 0.5
 
@@ -292,23 +297,25 @@ def _update_weights(
         this = peers[v]
         weight_sum = 0.0
         agreed = 0.0
-        for k in range(c.PEERS):
+        for k in range(constants.PEERS):
             if this.other[k] != NONE:
                 theirs = float(before[this.other[k]])
                 met = float(this.met[k])
-                weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
+                weight = max(min(theirs, 1.0), constants.TRUST_HEARD_LEAST) * min(met, 1.0)
                 weight_sum += weight
                 agreed += weight * float(this.agreed[k]) / max(met, 1.0)
-        mean = (prior * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + weight_sum)
-        known[v], trust = weight_sum >= c.ESTABLISHED_PEERS, _scale_trust(mean)
+        mean = (prior * constants.TRUST_PRIOR_PEERS + agreed) / (
+            constants.TRUST_PRIOR_PEERS + weight_sum
+        )
+        known[v], trust = weight_sum >= constants.ESTABLISHED_PEERS, _scale_trust(mean)
         if known[v]:
-            trusted += trust >= c.SOURCE_TRUST
+            trusted += trust >= constants.SOURCE_TRUST
         out[v] = _known_weight(mean) if known[v] or enrolled else trust
-    if enrolled or trusted < c.ESTABLISHED_VEHICLES:
+    if enrolled or trusted < constants.ESTABLISHED_VEHICLES:
         return 0
     for v in range(len(out)):
         if not known[v]:
-            out[v] = min(float(out[v]), c.NEWCOMER)
+            out[v] = min(float(out[v]), constants.NEWCOMER)
     return 1
 
 
@@ -322,9 +329,9 @@ def heeded_flags(peers: RecordArray) -> BoolArray:
     example, the flags of a vehicle that always reports an intervention support no alert after two
     dry cells.
     """
-    right = _AGREEMENT * c.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
-    whole = c.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
-    return np.asarray(right >= c.TRUST_NONE * whole)
+    right = _AGREEMENT * constants.TRUST_PRIOR_PEERS + peers["flags_confirmed"]
+    whole = constants.TRUST_PRIOR_PEERS + peers["flags_confirmed"] + peers["flags_contradicted"]
+    return np.asarray(right >= constants.TRUST_NONE * whole)
 
 
 def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
@@ -337,10 +344,10 @@ def shape_of(peers: RecordArray, weight: Float32Array) -> Shape:
     """
     vehicles = len(weight)
     trust = np.minimum(weight.astype(np.float64), 1.0)
-    prior = 1.0 / c.SHAPE_PRIOR**2
+    prior = 1.0 / constants.SHAPE_PRIOR**2
     squares = float((trust * peers["used_squares"][:vehicles]).sum())
     products = float((trust * peers["used_products"][:vehicles]).sum())
-    slope = (products + c.SHAPE_PRIOR * prior) / (squares + prior)
+    slope = (products + constants.SHAPE_PRIOR * prior) / (squares + prior)
     return Shape(float(np.clip(slope, 0.0, 1.0)), (squares + prior) ** -0.5)
 
 
@@ -354,7 +361,7 @@ def initial_trust(*, established: bool = False, enrolled: bool = False) -> float
     if enrolled:
         return float(_known_weight(_ENROLLED_AGREEMENT))
     weight = _scale_trust(_AGREEMENT)
-    return min(weight, c.NEWCOMER) if established else weight
+    return min(weight, constants.NEWCOMER) if established else weight
 
 
 @refcount_free_locked
@@ -362,10 +369,12 @@ def _known_weight(agreement: float) -> float:
     """Return the vote weight r of a known or enrolled vehicle from its share of agreement g. It is
     above 1 if the vehicle disagreed with others in less than the share CONTAMINATION.
     """
-    right = min(agreement, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION)
+    right = min(agreement, 1.0 - constants.CONTAMINATION_LEAST) / (1.0 - constants.CONTAMINATION)
     return _scale_trust(agreement) * max(right, 1.0)
 
 
 @refcount_free_locked
 def _scale_trust(mean: float) -> float:
-    return min(max((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0), 1.0)
+    return min(
+        max((mean - constants.TRUST_NONE) / (constants.TRUST_FULL - constants.TRUST_NONE), 0.0), 1.0
+    )

@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from schemas.numeric import BoolArray, Float32Array, IntArray
 
 # Archive columns for corrections of a vehicle's values, with the values of "no correction". This
 # fusion corrects no value.
-UNCORRECTED: Final = {"bias": 0.0, "bias_std": c.BIAS_RELATIVE, "spread": 1.0, "slope": 0.0}
+UNCORRECTED: Final = {"bias": 0.0, "bias_std": constants.BIAS_RELATIVE, "spread": 1.0, "slope": 0.0}
 
 
 class VoteWeights(NamedTuple):

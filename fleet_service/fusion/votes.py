@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import (
     PADDED,
     REACH,
@@ -96,7 +96,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
         return
     mean = mean_of(likelihood)
     entries[entry].mean = mean
-    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else c.UNSURE
+    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else constants.UNSURE
     if kind == ReportKind.VALUE:
         std, slippery = describe_likelihood(likelihood, mean)
         entries[entry].std = std
@@ -162,15 +162,15 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         std = _from_parts(pairs[pair].std)
         spent = _from_parts(pairs[pair].spent[kind])
     new_mean = entries[entry].mean
-    new_std = max(entries[entry].std, np.float32(c.NOVELTY_STD))
+    new_std = max(entries[entry].std, np.float32(constants.NOVELTY_STD))
     power = np.float32(1.0)
     if time > 0 and time >= least:
-        renewed = -math.expm1(-max(now - time, 0) / c.VOTE_RENEWAL_S)
+        renewed = -math.expm1(-max(now - time, 0) / constants.VOTE_RENEWAL_S)
         spent *= np.float32(1.0 - renewed)
         novelty = 0.0
-        if now - time >= c.REVISIT_S:
+        if now - time >= constants.REVISIT_S:
             novelty = _novel_share(kind, float(mean), float(std), float(new_mean), float(new_std))
-        power = np.float32(max(renewed, min(novelty, c.VOTES - float(spent))))
+        power = np.float32(max(renewed, min(novelty, constants.VOTES - float(spent))))
         new_mean = mean + power * (new_mean - mean)
         new_std = std + power * (new_std - std)
     else:
@@ -205,10 +205,12 @@ def _novel_share(kind: int, mean: float, std: float, new_mean: float, new_std: f
     # If the bound u rises, the mean of "at least u" under the uniform prior rises by half as much.
     if kind == ReportKind.BOUND:
         # It is new in full from two standard deviations of the grip used on.
-        share = (new_mean - mean) / c.UTILISED_STD
+        share = (new_mean - mean) / constants.UTILISED_STD
     else:
         deviations = abs(new_mean - mean) / math.hypot(std, new_std)
-        share = (deviations - c.PEERS_AGREE) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
+        share = (deviations - constants.PEERS_AGREE) / (
+            constants.PEERS_DISAGREE - constants.PEERS_AGREE
+        )
     return min(max(share, 0.0), 1.0)
 
 
@@ -246,17 +248,19 @@ def update_cell(
     if is_value:
         if not is_new:
             ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
-        certainty = min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST)
+        certainty = min(
+            (1.0 - constants.CONTAMINATION) * strength, 1.0 - constants.CONTAMINATION_LEAST
+        )
         apply_vote(p, scratch[ScratchRow.LIKELIHOOD], certainty)
     else:
-        certainty = (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0)
+        certainty = (1.0 - constants.BOUND_CONTAMINATION) * min(strength, 1.0)
         apply_vote(p, scratch[ScratchRow.LIKELIHOOD], certainty)
         if entries[entry].limited <= 0:
             values = float(cells[row].values)
             noticed = values / (float(cells[row].visits) + 1.0)  # this visit included
-            note_silence(p, c.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
+            note_silence(p, constants.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
             if entries[entry].limited == UNLIMITED:
-                doubted = (1.0 - c.BOUND_CONTAMINATION) * min(values, 1.0)
+                doubted = (1.0 - constants.BOUND_CONTAMINATION) * min(values, 1.0)
                 note_silent_use(p, int(entries[entry].used), doubted * min(strength, 1.0))
     pack_belief(p, rows.belief, row)
     cells[row].time = time
@@ -265,7 +269,7 @@ def update_cell(
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
-    if weight * entries[entry].share >= c.SOURCE_TRUST:
+    if weight * entries[entry].share >= constants.SOURCE_TRUST:
         _note_source(rows, sources, entries, entry)
 
 
@@ -291,7 +295,7 @@ def _age_belief(
         passed = (time - cells[row].time) * 1e-9
         seconds = max(passed, 0.0) + cells[row].aged / AGED
         fade_weights(cells, row, cells[row].time, time)
-    if seconds < c.FORGET_S:
+    if seconds < constants.FORGET_S:
         cells[row].aged = _remembered_parts(seconds)
         return 0.0, 0
     drift, change, prior = road_time(weather, cells[row].key, time - int(seconds * NS), time)
@@ -309,7 +313,7 @@ def _note_source(rows: Rows, sources: int, entries: RecordArray, entry: int) -> 
     time = entries[entry].time
     if is_ice_source(entries, entry):
         note_source(rows.reporters, sources, Side.ICE, vehicle, time)
-    elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
+    elif entries[entry].slippery <= 1.0 - constants.SOURCE_SHARE:
         note_source(rows.reporters, sources, Side.GRIP, vehicle, time)
 
 
@@ -331,7 +335,7 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
         whole += p[i]
         slippery += SLIPPERY_SHARE[i] * p[i]
         least += SLIPPERY_SHARE[i] * prior[i]
-    least = max(least, c.UNSURE)
+    least = max(least, constants.UNSURE)
     share = slippery / whole
     if share <= least:
         return
@@ -375,7 +379,7 @@ def _remembered_parts(seconds: float) -> np.uint16:
     """Convert a duration [s], limited to FORGET_S, to the integer that cell records store, in units
     of 1/AGED s.
     """
-    return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
+    return np.uint16(min(seconds, constants.FORGET_S) * AGED + 0.5)
 
 
 @refcount_free_inlined
@@ -389,9 +393,12 @@ def is_ice_source(entries: RecordArray, entry: int) -> bool:
     the same sliding wheel, so this evidence would count twice.
     """
     slippery = entries[entry].slippery
-    if slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.EVIDENCE_NATS:
+    if (
+        slippery >= constants.SOURCE_SHARE
+        and ice_evidence(entries, entry) >= constants.EVIDENCE_NATS
+    ):
         return True
-    return bool(entries[entry].limited == HEEDED and slippery > 1.0 - c.SOURCE_SHARE)
+    return bool(entries[entry].limited == HEEDED and slippery > 1.0 - constants.SOURCE_SHARE)
 
 
 @refcount_free_inlined
@@ -419,7 +426,13 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
     least = math.inf
     for i in range(_GRIP_BIN, mugrid.BINS):
         road = mugrid.CENTRES[i]
-        doubt = min(max(_WITNESS_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.SHARED_MOST) * road
+        doubt = (
+            min(
+                max(_WITNESS_SLOPE * (constants.SHARED_SHARE - used / road), 0.0),
+                constants.SHARED_MOST,
+            )
+            * road
+        )
         for j in range(i, -1, -1):
             excess = road - mugrid.CENTRES[j]
             if excess > 3.0 * doubt:
@@ -440,7 +453,7 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
     return bool(
         entries[entry].kind == ReportKind.VALUE
         or entries[entry].limited > 0
-        or entries[entry].slippery <= 1.0 - c.SOURCE_SHARE
+        or entries[entry].slippery <= 1.0 - constants.SOURCE_SHARE
     )
 
 
@@ -449,7 +462,7 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
     """Count one visit of a vehicle to a cell, and the vehicle if it is new there. A visit that was
     probably in another cell is not counted.
     """
-    if entries[entry].share < c.HERE_SHARE:
+    if entries[entry].share < constants.HERE_SHARE:
         return
     cells[row].visits += np.uint32(1)
     if entries[entry].fresh and not cells[row].returned & returning_bit(entries[entry].number):
@@ -466,7 +479,7 @@ def _reduce_untrusted(cells: RecordArray, row: int, entries: RecordArray, entry:
     already discounted by `power` (share of new information).
     """
     weight = float(entries[entry].weight)
-    if not 0.0 < weight < c.SOURCE_TRUST:
+    if not 0.0 < weight < constants.SOURCE_TRUST:
         return weight
     kind = int(entries[entry].kind)
     power = float(entries[entry].power)

@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import NONE, SOURCES, Side
 from fleet_service.fusion.witnesses import stretch_slots, stretch_sources, witnesses_of
@@ -144,7 +143,7 @@ class Alerts:
         live = self._fusion.live
         if self._idle_roads is None or live.vehicles[slot] >= OTHERS_NEEDED:
             return True
-        witnesses = witnesses_of(self._fusion, slot, time - c.SOURCE_NS)
+        witnesses = witnesses_of(self._fusion, slot, time - constants.SOURCE_NS)
         return self._idle_roads.admit(
             int(live.key[slot]) // grid.SECTORS, witnesses, time, LEAST_SOURCES
         )
@@ -174,7 +173,9 @@ class Alerts:
         opposed = against[:, 0] > own[:, 1] - FRESH_NS
         needed = np.where(opposed, MOST_SOURCES, LEAST_SOURCES)
         enough = (own > 0).sum(axis=1) >= needed
-        along = stretch_sources(fusion, candidates, fusion.live.time[candidates] - c.SOURCE_NS)
+        along = stretch_sources(
+            fusion, candidates, fusion.live.time[candidates] - constants.SOURCE_NS
+        )
         enough |= (along.second > 0) & (against[:, 0] <= along.second - FRESH_NS)
         accused = (own[:, 0] > 0) & (fusion.slippery(candidates) > LIKELY)
         return np.asarray(candidates[enough & (accused | along.around)])
@@ -184,7 +185,9 @@ class Alerts:
         each slot, (k, SOURCES); 0 means no vehicle. Only reports within the hour before the slot's
         last report count.
         """
-        return self._fusion.sources(slots, side, self._fusion.live.time[slots] - c.SOURCE_NS)
+        return self._fusion.sources(
+            slots, side, self._fusion.live.time[slots] - constants.SOURCE_NS
+        )
 
     def _can_clear(self, slots: IntArray) -> BoolArray:
         """Return a mask of slots, (k,): True if the alert may be cleared. Within the hour before

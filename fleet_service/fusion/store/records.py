@@ -27,7 +27,7 @@ from typing import Annotated, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import PackedArray
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
@@ -281,11 +281,11 @@ class ReportersRecord:
     (`source`) and time [s].
     """
 
-    reporter: Annotated[Int32Array, c.REPORTERS]
-    time: Annotated[UIntArray, c.REPORTERS]
-    mean: Annotated[Float32Array, c.REPORTERS]
-    std: Annotated[Float32Array, c.REPORTERS]
-    used: Annotated[Float32Array, c.REPORTERS]
+    reporter: Annotated[Int32Array, constants.REPORTERS]
+    time: Annotated[UIntArray, constants.REPORTERS]
+    mean: Annotated[Float32Array, constants.REPORTERS]
+    std: Annotated[Float32Array, constants.REPORTERS]
+    used: Annotated[Float32Array, constants.REPORTERS]
     source: Annotated[Int32Array, 2, SOURCES]
     source_time: Annotated[UIntArray, 2, SOURCES]
 
@@ -308,10 +308,10 @@ class PeersRecord:
             contradicted the vehicle's slip controllers.
     """
 
-    other: Annotated[Int32Array, c.PEERS]
-    rank: Annotated[Int32Array, c.PEERS]
-    agreed: Annotated[Float32Array, c.PEERS]
-    met: Annotated[Float32Array, c.PEERS]
+    other: Annotated[Int32Array, constants.PEERS]
+    rank: Annotated[Int32Array, constants.PEERS]
+    agreed: Annotated[Float32Array, constants.PEERS]
+    met: Annotated[Float32Array, constants.PEERS]
     used_squares: np.float32
     used_products: np.float32
     flags_confirmed: np.float32

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.belief import ReportKind
 from fleet_service.fusion.store.records import (
     NONE,
@@ -30,8 +30,8 @@ from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
 from schemas.runtime.prefetch import prefetch
 from schemas.runtime.records import RecordArray
 
-_VALUES_S: Final = int(c.FORGOTTEN_S)
-_BOUNDS_S: Final = int(c.VOTE_RENEWAL_S)
+_VALUES_S: Final = int(constants.FORGOTTEN_S)
+_BOUNDS_S: Final = int(constants.VOTE_RENEWAL_S)
 # 2⁶⁴ divided by the golden ratio: the multiples of this number are far apart (Fibonacci hashing).
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)
 # flag of a key: the pair is active again, so the report is not valid
@@ -44,7 +44,9 @@ def oldest_remembered(now: int, kind: int) -> int:
     at `now` [s]. Older reports have no effect, whether or not their record is already deleted.
     """
     return int(
-        now - now % c.FORGOTTEN_EVERY_S - (_VALUES_S if kind == ReportKind.VALUE else _BOUNDS_S)
+        now
+        - now % constants.FORGOTTEN_EVERY_S
+        - (_VALUES_S if kind == ReportKind.VALUE else _BOUNDS_S)
     )
 
 

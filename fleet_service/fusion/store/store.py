@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import constants
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
 from fleet_service.fusion.store.growth import (
     grow_entries,
@@ -54,7 +54,7 @@ from schemas.thresholds import NS
 _NOTHING = np.zeros(0, np.int32)
 # [s] Time by which the checkpoint may be ahead of the clock: with little lateness, the rest of an
 # epoch. One more epoch is allowed for the clock's error.
-_AHEAD: Final = 2 * c.EPOCH_NS // NS
+_AHEAD: Final = 2 * constants.EPOCH_NS // NS
 
 
 class Store:
@@ -231,7 +231,7 @@ class Store:
         observations are final are moved then (`settle_pairs`), and also whenever many such records
         exist.
         """
-        now = checkpoint_s - checkpoint_s % c.FORGOTTEN_EVERY_S
+        now = checkpoint_s - checkpoint_s % constants.FORGOTTEN_EVERY_S
         state = self.state
         resting = int(state.used[PAIRS]) - self.waiting
         # A resting pair takes five times the memory of a settled one, but settling reads all
@@ -241,7 +241,9 @@ class Store:
             self.state = settle_pairs(state, self.names[: self.vehicles], self.size, now)
         if now != self.forgotten_at:
             self.forgotten_at = now
-            self.state = rebuild_reporters(self.state, self.size, now - c.SOURCE_NS // NS - _AHEAD)
+            self.state = rebuild_reporters(
+                self.state, self.size, now - constants.SOURCE_NS // NS - _AHEAD
+            )
 
     def untouched(self, before: int) -> BoolArray:
         """Return a mask of slots, (size,): True if the last visit of a vehicle was before `before`

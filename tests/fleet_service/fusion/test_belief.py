@@ -10,21 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_service.fusion import belief as b
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import belief, constants
 from schemas import mugrid
 
 
 def forget(p: np.ndarray, seconds: float) -> None:
-    b.forget(p, seconds, seconds, b.PRIOR, np.empty(b.PADDED))
+    belief.forget(p, seconds, seconds, belief.PRIOR, np.empty(belief.PADDED))
 
 
 def convolve_bias(evidence: np.ndarray, kind: int, vote: np.ndarray) -> None:
-    b.convolve_bias(evidence, kind, np.zeros(b.PADDED), vote)
+    belief.convolve_bias(evidence, kind, np.zeros(belief.PADDED), vote)
 
 
 def vote_for(p: np.ndarray, vote: np.ndarray, strength: float) -> None:
-    b.apply_vote(p, vote, strength)
+    belief.apply_vote(p, vote, strength)
     p /= p.sum()
 
 
@@ -40,9 +39,9 @@ _steps = st.lists(st.integers(0, 255), min_size=32, max_size=32).map(
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=64, max_size=64), st.floats(0.0, 1.0))
 def test_quantiles_are_those_of_the_contract_bit_for_bit(bins: list[float], level: float) -> None:
-    belief = np.array(bins).reshape(2, 32)
-    expected = [mugrid.quantiles(belief, q) for q in (level, 0.5)]
-    np.testing.assert_array_equal(b.quantiles(belief, (level, 0.5)), expected)
+    beliefs = np.array(bins).reshape(2, 32)
+    expected = [mugrid.quantiles(beliefs, q) for q in (level, 0.5)]
+    np.testing.assert_array_equal(belief.quantiles(beliefs, (level, 0.5)), expected)
 
 
 @given(_steps, st.floats(0.0, 1e6), st.floats(0.15, 1.0), st.floats(0.0, 1.0))
@@ -53,7 +52,7 @@ def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
     vote = np.empty(32)
     for _ in range(3):
         forget(p, seconds)
-        convolve_bias(evidence, b.kind_of(evidence), vote)
+        convolve_bias(evidence, belief.kind_of(evidence), vote)
         vote_for(p, vote, (1.0 - contamination) * power)
     assert p.min() >= 0.0
     assert p.sum() == pytest.approx(1.0, abs=1e-6)
@@ -79,10 +78,10 @@ def test_no_number_of_bounds_that_fall_by_half_a_nat_lowers_the_upper_end(
 ) -> None:
     p = mugrid.PRIOR.copy()
     vote = np.empty(32)
-    assert b.kind_of(evidence) == b.ReportKind.BOUND
-    convolve_bias(evidence, b.ReportKind.BOUND, vote)
+    assert belief.kind_of(evidence) == belief.ReportKind.BOUND
+    convolve_bias(evidence, belief.ReportKind.BOUND, vote)
     for _ in range(votes):
-        vote_for(p, vote, 1.0 - c.CONTAMINATION)
+        vote_for(p, vote, 1.0 - constants.CONTAMINATION)
         forget(p, 60.0)
     assert mugrid.quantiles(p, 0.95) >= mugrid.quantiles(mugrid.PRIOR, 0.95) - 1e-9
 
@@ -92,21 +91,21 @@ def test_drift_keeps_the_mean_and_adds_its_variance(seconds: float) -> None:
     p = np.zeros(32)
     p[16] = 1.0
     forget(p, seconds)
-    change = -np.expm1(-seconds / c.CHANGE_S)
+    change = -np.expm1(-seconds / constants.CHANGE_S)
     drifted = (p - change / 32) / (1.0 - change)
     mean = drifted @ mugrid.CENTRES
     variance = drifted @ (mugrid.CENTRES - mean) ** 2
     assert mean == pytest.approx(mugrid.CENTRES[16], abs=1e-6)
-    assert variance == pytest.approx(c.DRIFT_PER_ROOT_HOUR**2 * seconds / 3600.0, rel=1e-5)
+    assert variance == pytest.approx(constants.DRIFT_PER_ROOT_HOUR**2 * seconds / 3600.0, rel=1e-5)
 
 
 def test_the_bias_kernel_is_a_probability_for_every_road() -> None:
-    kernel = b.bias_kernel()
+    kernel = belief.bias_kernel()
     np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
     middle = kernel[20] @ mugrid.CENTRES
     spread = np.sqrt(kernel[20] @ (mugrid.CENTRES - middle) ** 2)
     assert spread == pytest.approx(
-        np.hypot(c.BIAS_RELATIVE * mugrid.CENTRES[20], c.BIAS_ABSOLUTE), rel=0.02
+        np.hypot(constants.BIAS_RELATIVE * mugrid.CENTRES[20], constants.BIAS_ABSOLUTE), rel=0.02
     )
 
 
@@ -115,16 +114,16 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
     evidence[4] = 0
     vote = np.empty(32)
     p = mugrid.PRIOR.copy()
-    convolve_bias(evidence, b.ReportKind.VALUE, vote)
-    vote_for(p, vote, 1.0 - c.CONTAMINATION)
-    assert p.max() / p.min() < 32 / c.CONTAMINATION
+    convolve_bias(evidence, belief.ReportKind.VALUE, vote)
+    vote_for(p, vote, 1.0 - constants.CONTAMINATION)
+    assert p.max() / p.min() < 32 / constants.CONTAMINATION
 
 
 def test_a_vote_of_no_weight_or_no_power_changes_nothing() -> None:
     evidence = np.arange(32, dtype=np.uint8) * 8
     vote = np.empty(32)
-    convolve_bias(evidence, b.ReportKind.VALUE, vote)
-    for contamination, power in ((1.0, 1.0), (c.CONTAMINATION, 0.0)):
+    convolve_bias(evidence, belief.ReportKind.VALUE, vote)
+    for contamination, power in ((1.0, 1.0), (constants.CONTAMINATION, 0.0)):
         p = np.linspace(1.0, 2.0, 32)
         p /= p.sum()
         before = p.copy()

@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.likelihoods import bound_by_used, level_above_used
 from fleet_service.lab import situations
 from schemas import mugrid
@@ -28,7 +27,7 @@ PATHS = ("protobuf posterior", "json posterior", "protobuf likelihood", "json li
 # From .54 the posterior of .9 counts as a measured value, not as a bound.
 @given(st.floats(0.0, 0.53))
 def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: float) -> None:
-    assert situations.bound_excess(used, path) <= c.UTILISED_STD
+    assert situations.bound_excess(used, path) <= constants.UTILISED_STD
 
 
 @settings(max_examples=15)
@@ -42,7 +41,7 @@ def test_any_number_of_bounds_leaves_belief_flat_above_the_grip_used(
     )
     fusion.update(replace(o, evidence=level_above_used(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
-    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
+    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + constants.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
 
 
@@ -56,7 +55,7 @@ def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
     fusion = Fusion(120.0)
     fusion.update(replace(o, evidence=bound_by_used(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
-    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
+    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + constants.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
     if vehicles >= 10:
         assert lower >= used - 0.15

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fleet_service.fusion import Fusion, Updated
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, Updated, constants
 from fleet_service.fusion.fuse import RecordedResult
 from tests.fleet_service.examples import CELL, START, belief, observations, slippery, value
 from tests.fleet_service.fusion.test_order import difference, drive
@@ -48,7 +47,7 @@ def test_late_visit_to_an_unvisited_cell_counts_as_if_in_time() -> None:
 
 def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> None:
     fusion = Fusion(120.0)
-    fusion.update(observations([c.CHANGE_S + 1000.0], [50], value([0.8]), cell=CELL + 9))
+    fusion.update(observations([constants.CHANGE_S + 1000.0], [50], value([0.8]), cell=CELL + 9))
     updated = fusion.update(observations([100.0], [1], value([0.2])))
     assert updated.late.all()
     assert not updated.late_by.any()

@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.likelihoods import make_evidence
 from fleet_service.fusion.reported import as_reported
 from schemas import mugrid
@@ -34,7 +33,7 @@ def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
     assert steps[1].min() == 0
     assert reported[:2, 0] == pytest.approx([0.85, 0.3], abs=0.01)
     assert reported[0, 1] == pytest.approx(
-        np.hypot(0.05, np.hypot(c.BIAS_RELATIVE * 0.85, c.BIAS_ABSOLUTE)), rel=0.02
+        np.hypot(0.05, np.hypot(constants.BIAS_RELATIVE * 0.85, constants.BIAS_ABSOLUTE)), rel=0.02
     )
     assert reported[:2, 2] == pytest.approx([0.0, 0.97], abs=0.03)
     assert np.isnan(reported[2]).all()

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_service.fusion import Fusion, shared
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants, shared
 from fleet_service.fusion.store.records import NONE, ManoeuvreKind
 from schemas import mugrid
 from tests.fleet_service.examples import belief, interval, observations, value
@@ -59,7 +58,7 @@ def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
 def test_certainty_grows_with_manoeuvres_not_with_equal_vehicles() -> None:
     same = np.full(30, ManoeuvreKind.BRAKING)
     mixed = np.arange(30) % 4
-    spread = np.hypot(c.COMMON_ALWAYS, c.COMMON_MANOEUVRE) * 0.6
+    spread = np.hypot(constants.COMMON_ALWAYS, constants.COMMON_MANOEUVRE) * 0.6
     assert width(0.6, same) > 3.0 * spread
     assert width(0.6, mixed) < 0.95 * width(0.6, same)
     assert width(0.2, same) > 1.2 * width(0.6, same)

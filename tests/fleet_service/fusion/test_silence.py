@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.likelihoods import at_least as normal_bound
 from fleet_service.fusion.likelihoods import states_more_grip
@@ -44,7 +43,7 @@ def test_many_quiet_visits_after_ice_leave_it_undecided() -> None:
     before = Fusion(120.0)
     before.update(observations(60.0 * np.arange(8), np.arange(8), value(np.full(8, 0.15), 0.03)))
     assert slippery(belief(before)) > 0.95
-    assert c.UNSURE < slippery(belief(visited(np.full(8, 0.15)))) < 0.65
+    assert constants.UNSURE < slippery(belief(visited(np.full(8, 0.15)))) < 0.65
 
 
 def test_quiet_visits_raise_no_lower_bound_above_their_use() -> None:
@@ -66,7 +65,7 @@ def test_a_working_controller_is_no_silence() -> None:
 
 @pytest.mark.parametrize("noticed", [np.zeros(0), np.full(8, 0.8)], ids=["nobody", "grip"])
 def test_road_without_ice_is_not_called_slippery_by_silence(noticed: FloatArray) -> None:
-    assert slippery(belief(visited(noticed))) <= UNKNOWN + 1e-6 < c.UNSURE
+    assert slippery(belief(visited(noticed))) <= UNKNOWN + 1e-6 < constants.UNSURE
 
 
 def disputed_cell(values: int, silent: int, *, used: float = 0.5, states: bool = True) -> Fusion:

@@ -7,8 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.trust import initial_trust
 from fleet_service.serve.alerts import Alerts
 from tests.fleet_service.examples import belief, observations, slippery, value
@@ -48,7 +47,7 @@ def test_group_that_agrees_only_with_itself_loses_its_vote(
 def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
     assert initial_trust() == pytest.approx(0.75)
     assert Fusion(120.0).trust(7) == pytest.approx(initial_trust())
-    assert drive_liars().trust(999) == pytest.approx(c.NEWCOMER)
+    assert drive_liars().trust(999) == pytest.approx(constants.NEWCOMER)
 
 
 def test_two_enrolled_vehicles_that_nobody_met_raise_an_alert() -> None:
@@ -65,7 +64,7 @@ def test_two_enrolled_vehicles_that_nobody_met_raise_an_alert() -> None:
 
 
 def test_an_enrolled_vehicle_starts_like_one_that_agreed_with_all_others() -> None:
-    most = (1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION)
+    most = (1.0 - constants.CONTAMINATION_LEAST) / (1.0 - constants.CONTAMINATION)
     assert Fusion(120.0, enrolled=True).trust(7) == pytest.approx(most)
     assert drive_liars(enrolled=True).trust(999) == pytest.approx(most)
 
@@ -94,7 +93,7 @@ def test_whoever_agreed_with_enough_known_vehicles_is_no_newcomer() -> None:
     for minute in range(10):
         seconds = 60.0 * minute + np.arange(len(HONEST))
         fusion.update(observations(seconds, HONEST, value(np.full(len(HONEST), 0.8))))
-    met = int(c.ESTABLISHED_PEERS)
+    met = int(constants.ESTABLISHED_PEERS)
     new = np.arange(1000, 1100)
     who = np.concatenate([np.tile(HONEST[:met], (len(new), 1)), new[:, None]], axis=1).ravel()
     cells = np.repeat(50 + np.arange(len(new)), met + 1)
@@ -104,8 +103,8 @@ def test_whoever_agreed_with_enough_known_vehicles_is_no_newcomer() -> None:
                 begin + 0.1 * np.arange(len(who)), who, value(np.full(len(who), 0.8)), cell=cells
             )
         )
-    assert fusion.trust(999) == pytest.approx(c.NEWCOMER)
-    assert min(fusion.trust(int(v)) for v in new) >= c.SOURCE_TRUST
+    assert fusion.trust(999) == pytest.approx(constants.NEWCOMER)
+    assert min(fusion.trust(int(v)) for v in new) >= constants.SOURCE_TRUST
 
 
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
@@ -124,4 +123,4 @@ def test_a_vehicle_that_keeps_changing_its_mind_has_two_votes() -> None:
     n = 60
     flips = np.where(np.arange(n) % 2 == 0, 0.1, 1.1)
     fusion.update(observations(100.0 + np.arange(n), np.full(n, 50), value(flips)))
-    assert fusion.live.values[0] < 6 * 0.75 + 0.75 * (c.VOTES + 0.2)
+    assert fusion.live.values[0] < 6 * 0.75 + 0.75 * (constants.VOTES + 0.2)

@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion, shared
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants, shared
 from fleet_service.fusion.store.records import Side
 from fleet_service.fusion.trust import shape_of
 from schemas import mugrid
@@ -60,7 +59,7 @@ def test_shape_is_found_from_a_vehicle_that_differs_from_itself(slope: float) ->
 
 
 def test_shape_of_nobody_is_the_prior() -> None:
-    assert learned_slope(Fusion(120.0)) == pytest.approx(c.SHAPE_PRIOR)
+    assert learned_slope(Fusion(120.0)) == pytest.approx(constants.SHAPE_PRIOR)
 
 
 @pytest.mark.parametrize("gain_std", [0.05, 0.1])

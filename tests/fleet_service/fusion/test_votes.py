@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import constants as c
+from fleet_service.fusion import Fusion, constants
 from fleet_service.fusion.fuse import RecordedResult
 from fleet_service.fusion.likelihoods import level_above_used, make_evidence
 from schemas import mugrid
@@ -152,7 +151,7 @@ def test_a_sender_that_says_nothing_changes_nothing() -> None:
 def test_bound_excludes_no_friction_just_above_the_grip_used(steps: list[int], used: float) -> None:
     sent = np.array([steps], np.uint8) - np.uint8(min(steps))
     found = level_above_used(sent, np.array([used], np.float32))
-    if sent[0, -1] >= c.VALUE_DROP_STEPS:
+    if sent[0, -1] >= constants.VALUE_DROP_STEPS:
         np.testing.assert_array_equal(found, sent)
     else:
         above = found[0, np.float32(used) <= mugrid.CENTRES]
@@ -182,9 +181,9 @@ def test_flood_of_one_vehicle_is_bounded_and_reported_as_not_fused() -> None:
     rng = np.random.default_rng(2)
     o = observations(60.0 * rng.random(n), np.full(n, 7), value(rng.uniform(0.1, 1.1, n)))
     updated = [fusion.update(o.take(part)) for part in np.array_split(np.arange(n), 10)]
-    assert fusion.waiting == c.WAITING_MOST == n - sum(int(f.late.sum()) for f in updated)
+    assert fusion.waiting == constants.WAITING_MOST == n - sum(int(f.late.sum()) for f in updated)
     fusion.update(observations([70.0], [8], value([0.5])))
-    assert fusion.waiting == c.WAITING_MOST + 1
+    assert fusion.waiting == constants.WAITING_MOST + 1
     again = Fusion(120.0)
     told = (
         np.concatenate(of)
