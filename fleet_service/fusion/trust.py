@@ -86,59 +86,95 @@ def compare_reports(
         entries: observations (`EntryRecord`).
         entry: row of the new value in `entries`.
     """
-    here = reporters[row]
     if entries[entry].share < constants.HERE_SHARE or entries[entry].late:
         return
+    here = reporters[row]
     vehicle = int(entries[entry].vehicle)
     now = entries[entry].time // NS
     mean = float(entries[entry].mean)
     std = float(entries[entry].std)
-    reporter = here.reporter
-    reported = here.time
-    used = entries[entry].used / USED
-    place = 0
+    place = _find_place(reporters, row, vehicle)
+    if here.reporter[place] == vehicle:
+        _compare_visits(reporters, row, place, peers, entries, entry)
     for k in range(constants.REPORTERS):
-        if reporter[k] == vehicle:
-            place = k
-            if constants.REVISIT_S <= now - reported[k] <= constants.PEER_S:
-                both = 0.5 * (mean + here.mean[k])
-                difference = (mean - here.mean[k]) / both
-                variance = _own_variance(mean, std) + _own_variance(
-                    float(here.mean[k]), float(here.std[k])
-                )
-                # only if both values belong to the same road
-                if difference * difference < constants.PEERS_DISAGREE**2 * variance:
-                    _note_shape(peers, vehicle, (used - here.used[k]) / both, difference, variance)
-            break
-        if reported[k] < reported[place]:
-            place = k
-    for k in range(constants.REPORTERS):
-        other = int(reporter[k])
-        if other == NONE or now - reported[k] > constants.PEER_S:
+        other = int(here.reporter[k])
+        if other == NONE or other == vehicle:  # noqa: SIM109 Numba does not compile `in (...)`
             continue
-        if other == vehicle:
+        if now - here.time[k] > constants.PEER_S:
             continue
         spread = math.hypot(
             max(std, constants.NOVELTY_STD), max(float(here.std[k]), constants.NOVELTY_STD)
         )
         if spread > constants.PEER_STD:
             continue
-        deviations = abs(mean - here.mean[k]) / spread
-        agreement = (constants.PEERS_DISAGREE - deviations) / (
-            constants.PEERS_DISAGREE - constants.PEERS_AGREE
-        )
-        agreement = min(max(agreement, 0.0), 1.0)
+        agreement = _rate_agreement(abs(mean - here.mean[k]) / spread)
         _record_meeting(
             peers, vehicle, other, _pair_rank(names[vehicle].key, names[other].key), agreement
         )
         _record_meeting(
             peers, other, vehicle, _pair_rank(names[other].key, names[vehicle].key), agreement
         )
-    reporter[place] = vehicle
-    reported[place] = now
+    here.reporter[place] = vehicle
+    here.time[place] = now
     here.mean[place] = mean
     here.std[place] = std
-    here.used[place] = used
+    here.used[place] = entries[entry].used / USED
+
+
+@refcount_free
+def _find_place(reporters: RecordArray, row: int, vehicle: int) -> int:
+    """Return the place of a vehicle's friction value among the recent values of the cell in row
+    `row`, or else the place of the oldest value.
+    """
+    here = reporters[row]
+    place = 0
+    for k in range(constants.REPORTERS):
+        if here.reporter[k] == vehicle:
+            return k
+        if here.time[k] < here.time[place]:
+            place = k
+    return place
+
+
+@refcount_free
+def _compare_visits(
+    reporters: RecordArray,
+    row: int,
+    place: int,
+    peers: RecordArray,
+    entries: RecordArray,
+    entry: int,
+) -> None:
+    """Compare a vehicle's new friction value (row `entry`) with its earlier value in the same cell
+    (place `place`), and add the result to the sums of `shape_of`. Do nothing if the visits are too
+    near or too far apart in time, or if the road has probably changed in between.
+    """
+    here = reporters[row]
+    age = entries[entry].time // NS - here.time[place]
+    if age < constants.REVISIT_S or age > constants.PEER_S:
+        return
+    mean = float(entries[entry].mean)
+    before = float(here.mean[place])
+    both = 0.5 * (mean + before)
+    difference = (mean - before) / both
+    variance = _own_variance(mean, float(entries[entry].std)) + _own_variance(
+        before, float(here.std[place])
+    )
+    # only if both values belong to the same road
+    if difference * difference < constants.PEERS_DISAGREE**2 * variance:
+        used = (entries[entry].used / USED - here.used[place]) / both
+        _note_shape(peers, int(entries[entry].vehicle), used, difference, variance)
+
+
+@refcount_free
+def _rate_agreement(deviations: float) -> float:
+    """Return the agreement q in [0, 1] of two friction values that differ by `deviations` standard
+    deviations of their difference.
+    """
+    agreement = (constants.PEERS_DISAGREE - deviations) / (
+        constants.PEERS_DISAGREE - constants.PEERS_AGREE
+    )
+    return min(max(agreement, 0.0), 1.0)
 
 
 @refcount_free
@@ -162,7 +198,7 @@ def judge_flag(
     for k in range(constants.REPORTERS):
         other = int(here.reporter[k])
         time = int(here.time[k])
-        if other == NONE or other == vehicle:  # noqa: SIM109 as above
+        if other == NONE or other == vehicle:  # noqa: SIM109 Numba does not compile `in (...)`
             continue
         if now - time > constants.PEER_S or time <= newest:
             continue
@@ -307,7 +343,8 @@ def _update_weights(
         mean = (prior * constants.TRUST_PRIOR_PEERS + agreed) / (
             constants.TRUST_PRIOR_PEERS + weight_sum
         )
-        known[v], trust = weight_sum >= constants.ESTABLISHED_PEERS, _scale_trust(mean)
+        trust = _scale_trust(mean)
+        known[v] = weight_sum >= constants.ESTABLISHED_PEERS
         if known[v]:
             trusted += trust >= constants.SOURCE_TRUST
         out[v] = _known_weight(mean) if known[v] or enrolled else trust
