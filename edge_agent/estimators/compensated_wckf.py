@@ -62,6 +62,7 @@ from schemas.vehicle import Vehicle
 A_STATES = 19
 A_ROWS = 9
 B_STATES = 3
+B_POINTS = 2 * B_STATES
 A_XI = cubature_rule(A_STATES).xi
 A_WEIGHT = cubature_rule(A_STATES).w_cov
 B_XI = cubature_rule(B_STATES).xi
@@ -75,6 +76,10 @@ LARGEST = 20.0
 # Process standard deviations per s^.5, in the order of the states: v_x and v_y (offsets of the
 # accelerometers), yaw rate (model error), torque, wheel speed, force and its derivative
 A_PROCESS = np.array([0.05, 0.05, 0.2, *[20.0] * 4, *[0.5] * 4, *[100.0] * 4, *[2e4] * 4])
+# Standard deviations of the states at the first sample, in the same order and in SI units
+A_FIRST_STD = np.array(
+    [FIRST_V_STD, FIRST_V_STD, 0.1, *[20.0] * 4, *[0.3] * 4, *[200.0] * 4, *[1000.0] * 4]
+)
 A_NOISE = np.array([1e-4, *[25.0] * 4, *[1e-3] * 4])  # variances of measured r, tau and omega
 B_PROCESS = np.array([0.1, 0.1, 0.1])  # process of v_x, v_y and r per s^.5
 B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of measured r, a_x and a_y, with model errors
@@ -142,32 +147,35 @@ def _begin_filter(memory: CompensatedMemory, context: FrictionSet) -> None:  # n
     mean = memory.mean
     root = memory.root
     use = memory.track.inputs
-    X = DriveWheelState
+    index = DriveWheelState
     speed = rolling_speed(row, memory.track.now)
     known = not math.isnan(speed)
     mean[:] = 0.0
-    root[:, :] = 0.0
-    mean[X.VX], mean[X.YAW_RATE] = speed if known else 0.0, use[S.YAW_RATE]
+    mean[index.VX] = speed if known else 0.0
+    mean[index.YAW_RATE] = use[S.YAW_RATE]
     for wheel in range(4):
         omega = use[S.OMEGA + wheel]
-        mean[X.TORQUE + wheel] = use[S.TORQUE + wheel]
-        mean[X.OMEGA + wheel] = mean[X.VX] / row[Parameter.RADIUS] if math.isnan(omega) else omega
-        mean[X.FORCE + wheel] = use[S.TORQUE + wheel] / row[Parameter.RADIUS]
-        root[X.TORQUE + wheel, X.TORQUE + wheel], root[X.OMEGA + wheel, X.OMEGA + wheel] = 20.0, 0.3
-        root[X.FORCE + wheel, X.FORCE + wheel], root[X.SLOPE + wheel, X.SLOPE + wheel] = (
-            200.0,
-            1000.0,
-        )
-    root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
-    root[X.YAW_RATE, X.YAW_RATE] = 0.1
-    memory.fused[:], memory.fused_root[:] = mean[:B_STATES], root[:B_STATES, :B_STATES]
-    memory.window[:], memory.fused_window[:] = math.nan, math.nan
+        rolling = mean[index.VX] / row[Parameter.RADIUS]
+        mean[index.TORQUE + wheel] = use[S.TORQUE + wheel]
+        mean[index.OMEGA + wheel] = rolling if math.isnan(omega) else omega
+        mean[index.FORCE + wheel] = use[S.TORQUE + wheel] / row[Parameter.RADIUS]
+    root[:, :] = 0.0
+    for i in range(A_STATES):
+        root[i, i] = A_FIRST_STD[i]
+    if not known:
+        root[index.VX, index.VX] = UNKNOWN_V_STD
+    memory.fused[:] = mean[:B_STATES]
+    memory.fused_root[:] = root[:B_STATES, :B_STATES]
+    memory.window[:] = math.nan
+    memory.fused_window[:] = math.nan
 
 
 @compiled
 def _step_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
-    _step_wheel_filter(memory, context, dt)
-    _step_motion_filter(memory, context, dt)
+    _predict_wheels(memory, context, dt)
+    _update_wheels(memory, context)
+    _predict_motion(memory, context, dt)
+    _update_motion(memory, context)
     rate = DriveWheelState.YAW_RATE
     return not (
         has_diverged(memory.fused, memory.fused_root, rate)
@@ -178,169 +186,215 @@ def _step_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
 @compiled
 def _compensated_forces(
     row: FloatArray,
-    x: FloatArray,
+    velocity: FloatArray,
     use: FloatArray,
-    mu: FloatArray,
+    friction: FloatArray,
     observed: FloatArray,
     forces: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Compute the compensated longitudinal forces (4,) [N] of the wheels at the motion x (3,), by
-    equation (33) of paper 002.
+    """Compute the compensated longitudinal forces (4,) [N] of the wheels at the motion `velocity`
+    (v_x, v_y, yaw rate), by equation (33) of paper 002.
 
     For each wheel, the result is the weighted mean of the tyre model's force and of the force
     `observed`, which the wheel filter WCKF-A estimates. The weight of the tyre model is
     `slip_share`. The result is written into the first array of `forces`. The second array receives
     the lateral forces of the tyre model.
     """
-    X = DriveWheelState
-    motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
+    index = DriveWheelState
+    vx = velocity[index.VX]
+    vy = velocity[index.VY]
+    rate = velocity[index.YAW_RATE]
+    motion = np.array([vx, vy, rate, use[S.AX], use[S.AY]])
     delta = use[S.DELTA : S.DELTA + 4]
     omega = use[S.OMEGA : S.OMEGA + 4]
     share = np.empty(4)
-    tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, forces)
+    tyre_forces(row, motion, wheel_inputs(delta, omega), friction, SHAPE, forces)
     for wheel in range(4):
-        along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
+        along, _ = wheel_velocity(row, wheel, vx, vy, rate, delta[wheel])
         # A wheel without a speed reading has no known slip. Its force is then the observed one.
-        share[wheel] = (
-            0.0
-            if math.isnan(omega[wheel])
-            else slip_share(row[Parameter.RADIUS], omega[wheel], along)
-        )
+        if math.isnan(omega[wheel]):
+            share[wheel] = 0.0
+        else:
+            share[wheel] = slip_share(row[Parameter.RADIUS], omega[wheel], along)
     blend_forces(share, forces[0], observed, forces[0])
 
 
 @compiled
-def _step_wheel_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of `dt` [s] of WCKF-A, the filter of the wheels. Its lateral forces come from the
-    tyre model at the last motion that WCKF-B, the filter of the vehicle, has estimated.
+def _predict_wheels(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
+    """Predict the state of WCKF-A, the filter of the wheels, over `dt` [s]. The lateral forces come
+    from the tyre model at the last motion that WCKF-B, the filter of the vehicle, has estimated.
     """
     row = memory.row
     mean = memory.mean
-    root = memory.root
     points = context.points
-    work = context.work
     use = memory.track.inputs_before
-    now = memory.track.now
-    X = DriveWheelState
+    index = DriveWheelState
     force_x = np.empty(4)
     force_y = np.empty(4)
     noise = np.zeros((A_STATES, A_STATES))
-    _compensated_forces(
-        row,
-        memory.fused,
-        use,
-        context.friction,
-        mean[X.FORCE : X.FORCE + 4],
-        (force_x, force_y),
-    )
+    observed = mean[index.FORCE : index.FORCE + 4]
+    _compensated_forces(row, memory.fused, use, context.friction, observed, (force_x, force_y))
     delta = use[S.DELTA : S.DELTA + 4]
-    sigma_points(mean, root, A_XI, points)
+    sigma_points(mean, memory.root, A_XI, points)
     for p in range(points.shape[0]):
-        x = points[p]
-        _, _, turn = planar_accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
-        vx = x[X.VX]
-        vy = x[X.VY]
-        rate = x[X.YAW_RATE]
-        x[X.VX], x[X.VY] = vx + dt * (use[S.AX] + rate * vy), vy + dt * (use[S.AY] - rate * vx)
-        x[X.YAW_RATE] = rate + dt * turn
-        for w in range(4):
-            state = WheelState(x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w])
-            state = drive_wheel(
-                state, use[S.TORQUE + w], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS], dt
+        state = points[p]
+        forces = state[index.FORCE : index.FORCE + 4]
+        _, _, turn = planar_accelerations(row, forces, force_y, delta)
+        _advance_motion(state, use[S.AX], use[S.AY], turn, dt)
+        for k in range(4):
+            wheel = drive_wheel(
+                WheelState(
+                    state[index.TORQUE + k],
+                    state[index.OMEGA + k],
+                    state[index.FORCE + k],
+                    state[index.SLOPE + k],
+                ),
+                use[S.TORQUE + k],
+                row[Parameter.WHEEL_INERTIA],
+                row[Parameter.RADIUS],
+                dt,
             )
-            x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = state
+            state[index.TORQUE + k] = wheel.torque
+            state[index.OMEGA + k] = wheel.omega
+            state[index.FORCE + k] = wheel.force
+            state[index.SLOPE + k] = wheel.slope
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(dt)
-    predict(points, (A_WEIGHT, A_WEIGHT), noise, mean, root, work)
-    innovation = np.empty(A_ROWS)
-    std = np.empty(A_ROWS)
-    rows = np.empty((A_ROWS, A_STATES))
-    for r in range(A_ROWS):
-        place = X.YAW_RATE + r
-        reading = (
-            now[S.YAW_RATE] if r == 0 else now[S.TORQUE + r - 1] if r < 5 else now[S.OMEGA + r - 5]
-        )
-        rows[r] = root[place]
-        innovation[r] = reading - mean[place]
-        if not math.isnan(innovation[r]):
-            push_innovation(memory.window[r], innovation[r])
-        std[r] = math.sqrt(
-            weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST)
-        )
-    update(mean, root, root.copy(), Measurement(rows, innovation, std), work)
+    predict(points, (A_WEIGHT, A_WEIGHT), noise, mean, memory.root, context.work)
 
 
 @compiled
-def _step_motion_filter(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
-    """Run a step of `dt` [s] of the filter WCKF-B, which estimates the vehicle's motion from the
-    compensated tyre forces.
+def _advance_motion(state: FloatArray, ax: float, ay: float, turn: float, dt: float) -> None:
+    """Advance v_x, v_y and yaw rate of a state vector in place over `dt` [s], with the
+    accelerations `ax` and `ay` [m/s^2] and the yaw acceleration `turn` [rad/s^2].
+    """
+    index = DriveWheelState
+    vx = state[index.VX]
+    vy = state[index.VY]
+    rate = state[index.YAW_RATE]
+    state[index.VX] = vx + dt * (ax + rate * vy)
+    state[index.VY] = vy + dt * (ay - rate * vx)
+    state[index.YAW_RATE] = rate + dt * turn
+
+
+@compiled
+def _update_wheels(memory: CompensatedMemory, context: FrictionSet) -> None:
+    """Update WCKF-A, the filter of the wheels, with the measured yaw rate, torques and wheel
+    speeds. Each of them is a state, so the measurement is linear.
+    """
+    mean = memory.mean
+    root = memory.root
+    now = memory.track.now
+    readings = np.empty(A_ROWS)
+    readings[0] = now[S.YAW_RATE]
+    readings[1:5] = now[S.TORQUE : S.TORQUE + 4]
+    readings[5:9] = now[S.OMEGA : S.OMEGA + 4]
+    deviations = np.empty((A_ROWS, A_STATES))
+    innovation = np.empty(A_ROWS)
+    std = np.empty(A_ROWS)
+    for i in range(A_ROWS):
+        state = DriveWheelState.YAW_RATE + i
+        deviations[i] = root[state]
+        innovation[i] = readings[i] - mean[state]
+        if not math.isnan(innovation[i]):
+            push_innovation(memory.window[i], innovation[i])
+        std[i] = math.sqrt(
+            weighted_noise(memory.window[i], variance(root, state), A_NOISE[i], LEAST, LARGEST)
+        )
+    update(mean, root, root.copy(), Measurement(deviations, innovation, std), context.work)
+
+
+@compiled
+def _predict_motion(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
+    """Predict the vehicle's motion, the state of WCKF-B, over `dt` [s] from the compensated tyre
+    forces.
     """
     row = memory.row
-    track = memory.track
-    mean = memory.fused
-    root = memory.fused_root
-    use = track.inputs
-    now = track.now
-    X = DriveWheelState
-    observed = memory.mean[X.FORCE : X.FORCE + 4]
-    count = 2 * B_STATES
-    points = np.empty((count, B_STATES))
-    outcomes = np.empty((count, B_STATES))
-    predicted = np.empty(B_STATES)
-    state = np.empty((B_STATES, count))
-    measured = np.empty((B_STATES, count))
-    innovation = np.empty(B_STATES)
-    std = np.empty(B_STATES)
+    use = memory.track.inputs_before
+    index = DriveWheelState
+    observed = memory.mean[index.FORCE : index.FORCE + 4]
+    points = np.empty((B_POINTS, B_STATES))
     noise = np.zeros((B_STATES, B_STATES))
     force_x = np.empty(4)
     force_y = np.empty(4)
+    # The steering angles are those of the new sample.
+    delta = memory.track.inputs[S.DELTA : S.DELTA + 4]
+    sigma_points(memory.fused, memory.fused_root, B_XI, points)
+    for p in range(B_POINTS):
+        state = points[p]
+        _compensated_forces(row, state, use, context.friction, observed, (force_x, force_y))
+        ax, ay, turn = planar_accelerations(row, force_x, force_y, delta)
+        _advance_motion(state, ax, ay, turn, dt)
+    for i in range(B_STATES):
+        noise[i, i] = B_PROCESS[i] * math.sqrt(dt)
+    weights = (B_WEIGHT, B_WEIGHT)
+    predict(points, weights, noise, memory.fused, memory.fused_root, context.work)
+
+
+@compiled
+def _update_motion(memory: CompensatedMemory, context: FrictionSet) -> None:
+    """Update WCKF-B, the filter of the vehicle's motion, with the measured yaw rate and
+    accelerations. Store the compensated forces at the new motion.
+    """
+    row = memory.row
+    mean = memory.fused
+    use = memory.track.inputs
+    now = memory.track.now
+    index = DriveWheelState
+    observed = memory.mean[index.FORCE : index.FORCE + 4]
+    points = np.empty((B_POINTS, B_STATES))
+    outcomes = np.empty((B_POINTS, B_STATES))
+    predicted = np.empty(B_STATES)
+    state_deviations = np.empty((B_STATES, B_POINTS))
+    deviations = np.empty((B_STATES, B_POINTS))
+    force_x = np.empty(4)
+    force_y = np.empty(4)
     delta = use[S.DELTA : S.DELTA + 4]
-    for act in range(2):
-        sigma_points(mean, root, B_XI, points)
-        for p in range(count):
-            x = points[p]
-            _compensated_forces(
-                row,
-                x,
-                track.inputs_before if act == 0 else use,
-                context.friction,
-                observed,
-                (force_x, force_y),
-            )
-            ax, ay, turn = planar_accelerations(row, force_x, force_y, delta)
-            if act == 0:
-                vx = x[X.VX]
-                vy = x[X.VY]
-                rate = x[X.YAW_RATE]
-                x[X.VX], x[X.VY] = vx + dt * (ax + rate * vy), vy + dt * (ay - rate * vx)
-                x[X.YAW_RATE] = rate + dt * turn
-            else:
-                outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = x[X.YAW_RATE], ax, ay
-        if act == 0:
-            for i in range(B_STATES):
-                noise[i, i] = B_PROCESS[i] * math.sqrt(dt)
-            predict(points, (B_WEIGHT, B_WEIGHT), noise, mean, root, context.work)
+    sigma_points(mean, memory.fused_root, B_XI, points)
+    for p in range(B_POINTS):
+        state = points[p]
+        _compensated_forces(row, state, use, context.friction, observed, (force_x, force_y))
+        ax, ay, _ = planar_accelerations(row, force_x, force_y, delta)
+        outcomes[p, 0] = state[index.YAW_RATE]
+        outcomes[p, 1] = ax
+        outcomes[p, 2] = ay
     weighted_mean(outcomes, B_WEIGHT, predicted)
-    centred_deviations(points, mean, B_WEIGHT, state, 0)
-    centred_deviations(outcomes, predicted, B_WEIGHT, measured, 0)
-    largest = 0.0
-    for r in range(B_STATES):
-        innovation[r] = (now[S.YAW_RATE] if r == 0 else now[S.AX + r - 1]) - predicted[r]
-        spread = 0.0
-        for p in range(count):
-            spread += measured[r, p] ** 2
-        if not math.isnan(innovation[r]):
-            push_innovation(memory.fused_window[r], innovation[r])
-        adapted = weighted_noise(memory.fused_window[r], spread, B_NOISE[r], LEAST, LARGEST)
-        std[r] = math.sqrt(adapted)
-        largest = max(largest, adapted / B_NOISE[r])
+    centred_deviations(points, mean, B_WEIGHT, state_deviations, 0)
+    centred_deviations(outcomes, predicted, B_WEIGHT, deviations, 0)
+    innovation = np.array([now[S.YAW_RATE], now[S.AX], now[S.AY]]) - predicted
+    measurement = Measurement(
+        deviations, innovation, _adapted_noise(memory, deviations, innovation)
+    )
     used, log_likelihood, square = update(
-        mean, root, state, Measurement(measured, innovation, std), context.work
+        mean, memory.fused_root, state_deviations, measurement, context.work
     )
     _compensated_forces(row, mean, use, context.friction, observed, (memory.compensated, force_y))
     memory.nis = square / max(used, 1)
     memory.log_likelihood = log_likelihood
+
+
+@compiled
+def _adapted_noise(
+    memory: CompensatedMemory, deviations: FloatArray, innovation: FloatArray
+) -> FloatArray:
+    """Return the standard deviations (3,) of the measurement noise of WCKF-B, computed from the
+    moving window of innovations, to which the new `innovation` (3,) is added. `deviations`
+    (3, points) are those of the predicted readings. Store the largest factor on the nominal
+    variance.
+    """
+    std = np.empty(B_STATES)
+    largest = 0.0
+    for i in range(B_STATES):
+        spread = 0.0
+        for p in range(B_POINTS):
+            spread += deviations[i, p] ** 2
+        if not math.isnan(innovation[i]):
+            push_innovation(memory.fused_window[i], innovation[i])
+        adapted = weighted_noise(memory.fused_window[i], spread, B_NOISE[i], LEAST, LARGEST)
+        std[i] = math.sqrt(adapted)
+        largest = max(largest, adapted / B_NOISE[i])
     memory.adaptation = largest
+    return std
 
 
 @compiled
@@ -400,7 +454,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "(30), (32)",
         "WCKF-A: 19 states, 9 measurements",
         "as printed",
-        where="compensated_wckf._step_wheel_filter",
+        where="compensated_wckf._predict_wheels",
     ),
     Element(
         "(31)",
@@ -423,7 +477,7 @@ ELEMENTS: Final[tuple[Element, ...]] = (
         "corrected",
         "the tyre model is evaluated at its points: with forces as plain inputs nothing observes "
         "v_x and v_y",
-        "compensated_wckf._step_motion_filter",
+        "compensated_wckf._update_motion",
     ),
     Element(
         "(37), (38)",

@@ -82,6 +82,7 @@ STATES = 7
 ROWS = 7  # number of measurements: speed of the wheels, r, a_y, four longitudinal forces
 RULE = unscented_rule(STATES, 1.0, 2.0, 0.0)
 XI = RULE.xi
+POINTS = XI.shape[0]
 W_MEAN = RULE.w_mean
 W_COV = RULE.w_cov
 # [m/s, m/s, rad/s per s^.5] process noise: offsets of the accelerometers, error of the yaw model
@@ -136,26 +137,27 @@ def make_bank(vehicles: Sequence[Vehicle], tyre: TyreOption | None = None) -> Es
 def _begin_filter(memory: UnscentedMemory, unused: EmptyRecord) -> None:  # noqa: ARG001
     mean = memory.mean
     root = memory.root
-    X = WheelFrictionState
+    index = WheelFrictionState
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
-    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = (
-        speed if known else 0.0,
-        0.0,
-        memory.track.inputs[S.YAW_RATE],
-    )
-    mean[X.MU :] = PRIOR_MU
+    mean[index.VX] = speed if known else 0.0
+    mean[index.VY] = 0.0
+    mean[index.YAW_RATE] = memory.track.inputs[S.YAW_RATE]
+    mean[index.MU :] = PRIOR_MU
     root[:, :] = 0.0
-    root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
-    root[X.YAW_RATE, X.YAW_RATE] = FIRST_RATE_STD
-    root[X.MU :, X.MU :] = PRIOR_ROOT
+    root[index.VX, index.VX] = FIRST_V_STD if known else UNKNOWN_V_STD
+    root[index.VY, index.VY] = FIRST_V_STD
+    root[index.YAW_RATE, index.YAW_RATE] = FIRST_RATE_STD
+    root[index.MU :, index.MU :] = PRIOR_ROOT
     memory.refused = 0.0
 
 
 @compiled
-def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
-    """Compute the friction `mu` (4,) of the wheels at an unscented point x (7,) of the state,
-    limited to the possible range of friction.
+def _limit_point_friction(
+    point: FloatArray, mean: FloatArray, share: float, mu: FloatArray
+) -> None:
+    """Compute the friction `mu` (4,) of the wheels at an unscented point (7,) of the state, limited
+    to the possible range of friction.
 
     First multiply the deviation of the point's friction from that of `mean` (7,) by `share` (0 to
     1). `share` is small at small tyre forces. Such forces hardly depend on friction, so the filter
@@ -163,19 +165,22 @@ def _point_friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArra
     """
     for wheel in range(4):
         i = WheelFrictionState.MU + wheel
-        mu[wheel] = min(max(mean[i] + share * (x[i] - mean[i]), LOWER), UPPER)
+        mu[wheel] = min(max(mean[i] + share * (point[i] - mean[i]), LOWER), UPPER)
 
 
 @compiled
 def _tyre_accelerations(
-    row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray
+    row: FloatArray, state: FloatArray, track: InputTrack, mu: FloatArray
 ) -> tuple[float, float]:
-    """Return (a_y [m/s^2], yaw acceleration [rad/s^2]) that the tyre forces cause at state x (7,)
+    """Return (a_y [m/s^2], yaw acceleration [rad/s^2]) that the tyre forces cause at a state (7,)
     with friction mu (4,).
     """
     use = track.inputs
+    index = WheelFrictionState
     unknown = (math.nan, math.nan, math.nan, math.nan)
-    motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
+    motion = PlanarMotion(
+        state[index.VX], state[index.VY], state[index.YAW_RATE], use[S.AX], use[S.AY]
+    )
     cos = as_four(track.steering[0])
     sin = as_four(track.steering[1])
     omega = as_four(use[S.OMEGA : S.TORQUE])
@@ -187,101 +192,134 @@ def _tyre_accelerations(
 
 @compiled
 def _step_filter(memory: UnscentedMemory, unused: EmptyRecord, dt: float) -> bool:  # noqa: ARG001
-    row = memory.row
-    track = memory.track
+    use = memory.track.inputs
     mean = memory.mean
     root = memory.root
-    use = track.inputs
-    first = WheelFrictionState.MU
-    count = XI.shape[0]
-    points = np.empty((count, STATES))
-    work = np.empty((ROWS + STATES, count + 2 * STATES))
-    noise = np.zeros((STATES, STATES))
-    mu = np.empty(4)
-    middle = mean.copy()
+    points = np.empty((POINTS, STATES))
+    work = np.empty((ROWS + STATES, POINTS + 2 * STATES))
     share = visible_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
-    keep = math.exp(-abs(mean[0]) * dt / FORGET_M)
-    sigma_points(mean, root, XI, points)
-    for p in range(count):
-        x = points[p]
-        _point_friction(x, middle, share, mu)
-        _, turn = _tyre_accelerations(row, x, track, mu)
-        rate = x[WheelFrictionState.YAW_RATE]
-        x[0], x[1] = advance_velocity(x[0], x[1], use[S.AX], use[S.AY], rate, dt)
-        x[WheelFrictionState.YAW_RATE] = rate + dt * turn
-        for wheel in range(first, STATES):
-            x[wheel] = PRIOR_MU + keep * (x[wheel] - PRIOR_MU)
-    for i in range(3):
-        noise[i, i] = DRIFT[i] * math.sqrt(dt)
-    noise[first:, first:] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
-    predict(points, (W_MEAN, W_COV), noise, mean, root, work)
+    _predict_filter(memory, dt, share, points, work)
     sigma_points(mean, root, XI, points)
     _update_filter(memory, dt, share, points, work)
     for wheel in range(4):
-        limit_friction(mean, root, first + wheel, PRIOR_MU_STD)
+        limit_friction(mean, root, WheelFrictionState.MU + wheel, PRIOR_MU_STD)
     return not has_diverged(mean, root, WheelFrictionState.YAW_RATE)
+
+
+@compiled
+def _predict_filter(
+    memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray
+) -> None:
+    """Predict the state over `dt` [s]: the accelerometers move the velocity, the tyre forces turn
+    the car, and friction returns to its prior over the distance FORGET_M. `share` (0 to 1) is the
+    share of a point's deviation in friction that acts on the forces. `points` (15, 7) and `work`
+    are scratch memory.
+    """
+    use = memory.track.inputs
+    mean = memory.mean
+    index = WheelFrictionState
+    mu = np.empty(4)
+    noise = np.zeros((STATES, STATES))
+    keep = math.exp(-abs(mean[index.VX]) * dt / FORGET_M)
+    sigma_points(mean, memory.root, XI, points)
+    for p in range(POINTS):
+        state = points[p]
+        _limit_point_friction(state, mean, share, mu)
+        _, turn = _tyre_accelerations(memory.row, state, memory.track, mu)
+        rate = state[index.YAW_RATE]
+        vx, vy = advance_velocity(state[index.VX], state[index.VY], use[S.AX], use[S.AY], rate, dt)
+        state[index.VX] = vx
+        state[index.VY] = vy
+        state[index.YAW_RATE] = rate + dt * turn
+        for wheel in range(index.MU, STATES):
+            state[wheel] = PRIOR_MU + keep * (state[wheel] - PRIOR_MU)
+    for i in range(len(DRIFT)):
+        noise[i, i] = DRIFT[i] * math.sqrt(dt)
+    noise[index.MU :, index.MU :] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
+    predict(points, (W_MEAN, W_COV), noise, mean, memory.root, work)
 
 
 @compiled
 def _update_filter(
     memory: UnscentedMemory, dt: float, share: float, points: FloatArray, work: FloatArray
 ) -> None:
-    row = memory.row
-    track = memory.track
+    """Update the state with the measurements of a sample. `points` (15, 7) are the unscented points
+    of the predicted state, and `share` and `work` as in `_predict_filter`.
+    """
     mean = memory.mean
-    root = memory.root
-    now = track.now
-    use = track.inputs
-    count = points.shape[0]
-    outcomes = np.empty((count, ROWS))
+    outcomes = np.empty((POINTS, ROWS))
     predicted = np.empty(ROWS)
-    state = np.empty((STATES, count))
-    measured = np.empty((ROWS, count))
-    innovation = np.empty(ROWS)
+    state_deviations = np.empty((STATES, POINTS))
+    deviations = np.empty((ROWS, POINTS))
+    readings = np.empty(ROWS)
     std = np.empty(ROWS)
-    middle = mean.copy()
-    mu = np.empty(4)
-    force_y = np.empty(4)
-    wheels = wheel_inputs(use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4])
-    motion = np.array([0.0, 0.0, 0.0, use[S.AX], use[S.AY]])
-    rate = WheelFrictionState.YAW_RATE
-    for p in range(count):
-        outcomes[p, 0], outcomes[p, 1] = (
-            mean_wheel_velocity(row, track, points[p], rate),
-            points[p, rate],
-        )
-        _point_friction(points[p], middle, share, mu)
-        outcomes[p, 2], _ = _tyre_accelerations(row, points[p], track, mu)
-        motion[:3] = points[p, :3]
-        tyre_forces(row, motion, wheels, mu, DUGOFF, (outcomes[p, 3:], force_y))
+    _predict_readings(memory, share, points, outcomes)
     weighted_mean(outcomes, W_MEAN, predicted)
-    centred_deviations(points, mean, W_COV, state, 0)
-    centred_deviations(outcomes, predicted, W_COV, measured, 0)
-    inflation = math.sqrt(max(INDEPENDENT_S / dt, 1.0))
-    speed, std[0] = slip_free_speed(row, track, dt)
-    innovation[0], innovation[1], innovation[2] = speed, now[S.YAW_RATE], now[S.AY]
-    std[1], std[2] = RATE_STD, inflation * math.hypot(AY_STD, AY_SHARE * use[S.AY])
-    loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
-    for wheel in range(4):
-        force = wheel_force(row, track, wheel, dt)
-        slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(
-            abs(mean[0]), SLOWEST_SLIP_M_S
-        )
-        quiet = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
-        std[3 + wheel] = inflation * math.hypot(
-            quiet, row[Parameter.SLOPE_X] * loads[wheel] * slip_std
-        )
-        missing = math.isnan(now[S.OMEGA + wheel]) or math.isnan(now[S.TORQUE + wheel])
-        innovation[3 + wheel] = math.nan if missing else force
-    for r in range(ROWS):
-        innovation[r] -= predicted[r]
+    centred_deviations(points, mean, W_COV, state_deviations, 0)
+    centred_deviations(outcomes, predicted, W_COV, deviations, 0)
+    _collect_readings(memory, dt, readings, std)
+    innovation = readings - predicted
     std[0] = widened_speed_std(std[0], innovation[0])
     used, log_likelihood, square, refused = update_by_downdate(
-        mean, root, state, Measurement(measured, innovation, std), work
+        mean, memory.root, state_deviations, Measurement(deviations, innovation, std), work
     )
     memory.nis = square / max(used, 1)
     memory.log_likelihood = log_likelihood
     memory.refused += 1.0 if refused else 0.0
+
+
+@compiled
+def _predict_readings(
+    memory: UnscentedMemory, share: float, points: FloatArray, outcomes: FloatArray
+) -> None:
+    """Write the readings that each unscented point (15, 7) predicts into `outcomes` (15, ROWS):
+    speed of the wheels [m/s], yaw rate [rad/s], a_y [m/s^2], four longitudinal forces [N].
+    """
+    row = memory.row
+    track = memory.track
+    use = track.inputs
+    rate = WheelFrictionState.YAW_RATE
+    mu = np.empty(4)
+    force_y = np.empty(4)
+    wheels = wheel_inputs(use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4])
+    motion = np.array([0.0, 0.0, 0.0, use[S.AX], use[S.AY]])
+    for p in range(POINTS):
+        outcomes[p, 0] = mean_wheel_velocity(row, track, points[p], rate)
+        outcomes[p, 1] = points[p, rate]
+        _limit_point_friction(points[p], memory.mean, share, mu)
+        outcomes[p, 2], _ = _tyre_accelerations(row, points[p], track, mu)
+        motion[:3] = points[p, :3]
+        tyre_forces(row, motion, wheels, mu, DUGOFF, (outcomes[p, 3:], force_y))
+
+
+@compiled
+def _collect_readings(
+    memory: UnscentedMemory, dt: float, readings: FloatArray, std: FloatArray
+) -> None:
+    """Fill `readings` (ROWS,) with the measurements of a sample, NaN where missing, and `std`
+    (ROWS,) with their standard deviations. Errors of the tyre model last for INDEPENDENT_S, so
+    their standard deviations are inflated for shorter steps `dt` [s].
+    """
+    row = memory.row
+    track = memory.track
+    now = track.now
+    use = track.inputs
+    speed = abs(memory.mean[WheelFrictionState.VX])
+    inflation = math.sqrt(max(INDEPENDENT_S / dt, 1.0))
+    readings[0], std[0] = slip_free_speed(row, track, dt)
+    readings[1] = now[S.YAW_RATE]
+    std[1] = RATE_STD
+    readings[2] = now[S.AY]
+    std[2] = inflation * math.hypot(AY_STD, AY_SHARE * use[S.AY])
+    loads = wheel_loads(body_of(row), use[S.AX], use[S.AY])
+    slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(speed, SLOWEST_SLIP_M_S)
+    for wheel in range(4):
+        force = wheel_force(row, track, wheel, dt)
+        missing = math.isnan(now[S.OMEGA + wheel]) or math.isnan(now[S.TORQUE + wheel])
+        readings[3 + wheel] = math.nan if missing else force
+        force_std = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
+        stiffness = row[Parameter.SLOPE_X] * loads[wheel]
+        std[3 + wheel] = inflation * math.hypot(force_std, stiffness * slip_std)
 
 
 @compiled
