@@ -20,7 +20,7 @@ accelerometers, yaw rate and steering, and the vehicle file.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -49,6 +49,37 @@ BRAKING: Final = 0.6  # [m/s^2]
 FLAGGED_MU: Final = 0.35  # a lower flagged friction reports the road as slippery
 
 
+class CarGeometry(NamedTuple):
+    """Vehicle data of the slip flag: wheel radius, wheelbase and half of the track [m], and the
+    driven axle's share of the load.
+    """
+
+    radius: float
+    base: float
+    half_track: float
+    driven: float
+
+
+class InertialReading(NamedTuple):
+    """Latest accelerations [m/s^2], smoothed, and latest yaw rate [rad/s] and steering angle [rad]
+    of a car.
+    """
+
+    ax: float
+    ay: float
+    yaw_rate: float
+    steer: float
+
+
+class FlagTimer(NamedTuple):
+    """Time [s] for which the cause of a flag has lasted, short gaps included, and time [s] since
+    the cause was last present.
+    """
+
+    lasted: float
+    since: float
+
+
 def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:
     """Return the friction (T, N) that ordinary ABS and ESC logic would report from wheel slip and
     yaw rate; infinite where no flag is set.
@@ -64,92 +95,123 @@ def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]
         base = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
         rear = vehicle.cg_to_front_axle / base
         driven = rear if split < 0.25 else 1.0 - rear if split > 0.75 else 1.0
-        car = np.array([vehicle.wheel_radius, base, 0.5 * vehicle.track_front, driven])
+        car = CarGeometry(vehicle.wheel_radius, base, 0.5 * vehicle.track_front, driven)
         period = float(t[1, n] - t[0, n]) if len(t) > 1 else 0.01
-        out[:, n] = _follow(np.ascontiguousarray(signals[:, n]), car, period)
+        out[:, n] = _flag_friction(np.ascontiguousarray(signals[:, n]), car, period)
     return out
 
 
 @compiled
-def _median(values: FloatArray, count: int) -> float:
-    ordered = np.sort(values[:count])
-    middle = count // 2
-    return float(ordered[middle] if count % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
-
-
-@compiled
-def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
+def _flag_friction(signals: FloatArray, car: CarGeometry, period: float) -> FloatArray:
     """Return the friction (T,) that ordinary ABS and ESC logic would report for one car; infinite
     where neither the slip flag nor the yaw flag is set.
 
-    The slip flag is set while a wheel's speed differs much from the car's speed. The yaw flag is
-    set while the yaw rate differs much from that expected from steering. While a flag is set, the
-    friction is the car's measured acceleration divided by gravity.
-
     Args:
         signals: sensor readings (T, channels).
-        car: wheel radius, wheelbase and half of the track [m], and the driven axle's share of the
-            load.
+        car: vehicle data.
         period: sampling interval [s].
     """
     out = np.full(signals.shape[0], np.inf)
-    smooth = 1.0 - np.exp(-period / SMOOTH_S)
-    rim = np.zeros(4)
-    found = np.zeros(4)
-    ax = ay = yaw_rate = steer = speed = 0.0
-    agreed = slipping = yawing = 0.0
-    since_slip = since_yaw = np.inf
-    begun = False
+    rim = np.empty(4)
+    inertial = InertialReading(0.0, 0.0, 0.0, 0.0)
+    slip = FlagTimer(0.0, np.inf)
+    yaw = FlagTimer(0.0, np.inf)
+    speed = np.nan
+    agreed = 0.0
     for k in range(signals.shape[0]):
-        row = signals[k]
-        if np.isfinite(row[S.AX]):
-            ax += smooth * (row[S.AX] - ax)
-        if np.isfinite(row[S.AY]):
-            ay += smooth * (row[S.AY] - ay)
-        if np.isfinite(row[S.YAW_RATE]):
-            yaw_rate = row[S.YAW_RATE]
-        if np.isfinite(row[S.DELTA]):
-            steer = 0.5 * (row[S.DELTA] + row[S.DELTA + 1])
-        count = 0
-        for i in range(4):
-            if np.isfinite(row[S.OMEGA + i]):
-                side = -1.0 if i % 2 == 0 else 1.0
-                rim[i] = row[S.OMEGA + i] * car[0] - side * car[2] * yaw_rate
-                found[count] = rim[i]
-                count += 1
-        if count == 0:
+        inertial = _read_inertial(signals[k], inertial, period)
+        _read_rims(signals[k], car, inertial.yaw_rate, rim)
+        if np.isnan(rim).all():
             continue
-        middle = _median(found, count)
-        most = found[:count].max()
-        least = found[:count].min()
-        target = most if ax < -BRAKING else least if ax > BRAKING else middle
-        if not begun:
-            speed = middle
-            begun = True
-        speed = min(max(target, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
-        agrees = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(
-            speed, SLOWEST
-        )
-        agreed = agreed + period if agrees else 0.0
-        if agreed > AGREE_S:
-            speed = middle
-        v = max(speed, SLOWEST)
-        slips = False
-        for i in range(4):
-            moves = max(rim[i], speed) > SLOWEST
-            if (
-                moves
-                and np.isfinite(row[S.OMEGA + i])
-                and abs(rim[i] - speed) > (SLIP_FRONT if i < 2 else SLIP_REAR) * v
-            ):
-                slips = True
-        off = abs(yaw_rate - v * np.tan(steer) / car[1])
-        turns = speed > SLOWEST and off > YAW_OFF + YAW_SHARE * abs(yaw_rate)
-        since_slip = 0.0 if slips else since_slip + period
-        slipping = slipping + period if since_slip <= GAP_S else 0.0
-        since_yaw = 0.0 if turns else since_yaw + period
-        yawing = yawing + period if since_yaw <= GAP_S else 0.0
-        if (slipping > SLIP_S and since_slip == 0.0) or (yawing > YAW_S and since_yaw == 0.0):
-            along = ax / car[3] if ax > 0.0 else ax
-            out[k] = np.hypot(along, ay) / GRAVITY
+        speed, agreed = _follow_rims(speed, agreed, rim, inertial.ax, period)
+        slip = _advance_timer(slip, _slips(rim, speed), period)
+        yaw = _advance_timer(yaw, _turns_unexpectedly(inertial, speed, car.base), period)
+        slip_flag = slip.since == 0.0 and slip.lasted > SLIP_S
+        yaw_flag = yaw.since == 0.0 and yaw.lasted > YAW_S
+        if slip_flag or yaw_flag:
+            ax = inertial.ax
+            along = ax / car.driven if ax > 0.0 else ax
+            out[k] = np.hypot(along, inertial.ay) / GRAVITY
     return out
+
+
+@compiled
+def _read_inertial(row: FloatArray, before: InertialReading, period: float) -> InertialReading:
+    """Return the inertial reading after one sample `row` (channels,), of which NaN is missing."""
+    smooth = 1.0 - np.exp(-period / SMOOTH_S)
+    ax, ay, yaw_rate, steer = before
+    if np.isfinite(row[S.AX]):
+        ax += smooth * (row[S.AX] - ax)
+    if np.isfinite(row[S.AY]):
+        ay += smooth * (row[S.AY] - ay)
+    if np.isfinite(row[S.YAW_RATE]):
+        yaw_rate = row[S.YAW_RATE]
+    if np.isfinite(row[S.DELTA]):
+        steer = 0.5 * (row[S.DELTA] + row[S.DELTA + 1])
+    return InertialReading(ax, ay, yaw_rate, steer)
+
+
+@compiled
+def _read_rims(row: FloatArray, car: CarGeometry, yaw_rate: float, rim: FloatArray) -> None:
+    """Write the speeds of the wheel rims [m/s] without the effect of the yaw rate to `rim` (4,),
+    NaN where the reading is missing.
+    """
+    for i in range(4):
+        rim[i] = np.nan
+        if np.isfinite(row[S.OMEGA + i]):
+            side = -1.0 if i % 2 == 0 else 1.0
+            rim[i] = row[S.OMEGA + i] * car.radius - side * car.half_track * yaw_rate
+
+
+@compiled
+def _follow_rims(
+    speed: float, agreed: float, rim: FloatArray, ax: float, period: float
+) -> tuple[float, float]:
+    """Return the reference speed [m/s] after one sample, and the time [s] for which the speeds of
+    all wheels have agreed. At least one wheel speed in `rim` (4,) must be known.
+
+    `speed` and `agreed` are the previous results, NaN and 0 at the start, and `ax` the measured
+    acceleration [m/s^2].
+    """
+    middle = np.nanmedian(rim)
+    most = np.nanmax(rim)
+    least = np.nanmin(rim)
+    target = most if ax < -BRAKING else least if ax > BRAKING else middle
+    if np.isnan(speed):
+        speed = middle
+    speed = min(max(target, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
+    are_equal = most - least < AGREE * max(middle, SLOWEST)
+    is_near = abs(middle - speed) < FAR * max(speed, SLOWEST)
+    agreed = agreed + period if are_equal and is_near else 0.0
+    if agreed > AGREE_S:
+        speed = middle
+    return speed, agreed
+
+
+@compiled
+def _slips(rim: FloatArray, speed: float) -> bool:
+    """Return True if the speed of a wheel's rim differs much from the reference speed [m/s]."""
+    for i in range(4):
+        if np.isnan(rim[i]) or max(rim[i], speed) <= SLOWEST:
+            continue
+        limit = SLIP_FRONT if i < 2 else SLIP_REAR
+        if abs(rim[i] - speed) > limit * max(speed, SLOWEST):
+            return True
+    return False
+
+
+@compiled
+def _turns_unexpectedly(inertial: InertialReading, speed: float, base: float) -> bool:
+    """Return True if the yaw rate differs much from the one that the steering angle causes at the
+    reference speed [m/s] of a car with the wheelbase `base` [m].
+    """
+    expected = max(speed, SLOWEST) * np.tan(inertial.steer) / base
+    limit = YAW_OFF + YAW_SHARE * abs(inertial.yaw_rate)
+    return bool(speed > SLOWEST and abs(inertial.yaw_rate - expected) > limit)
+
+
+@compiled
+def _advance_timer(timer: FlagTimer, is_present: bool, period: float) -> FlagTimer:
+    """Return the timer after one sample. A gap of at most GAP_S does not end the cause."""
+    since = 0.0 if is_present else timer.since + period
+    return FlagTimer(timer.lasted + period if since <= GAP_S else 0.0, since)
