@@ -38,12 +38,12 @@ def main(
         until = time.monotonic() + within_s
         while not warned and time.monotonic() < until:
             # Report the car's current position.
-            lookout.see([edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())])
+            lookout.set_poses([edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())])
             try:
                 warned = warnings.get(timeout=0.1)
             except queue.Empty:
                 continue
-        outlook = lookout.outlook("my-car")
+        outlook = lookout.latest_outlook("my-car")
         lookout.close()
     if outlook is not None:
         known = int((outlook.runs.basis > 0).sum())

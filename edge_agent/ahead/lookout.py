@@ -1,8 +1,8 @@
 """Lookout: a thread that looks up the map's values for the road ahead of each vehicle. It does so
 once a second, and immediately when alerts change.
 
-The estimation loop passes positions to this thread by the method `see`, which never blocks the
-loop.
+The estimation loop passes positions to this thread by the method `set_poses`, which never blocks
+the loop.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ STALE_S: Final = 3.0  # [s] age of a car's last position from which the lookout 
 # [s] shortest time between two look-ups, so that a burst of alerts causes only one look-up.
 AGAIN_S: Final = 0.1
 
-Hear = Callable[[str, GripWarning], None]
+OnWarning = Callable[[str, GripWarning], None]
 RouteOf = Callable[[int], GivenRoute | None]
 
 
 @dataclass
-class _Watcher:
+class _ServedVehicle:
     name: str
     subscriber: MapSubscriber | None = None
-    active: tuple[Active, ...] = ()
-    due: float = 0.0
-    looked: float = -1.0
-    urgent: bool = False
+    active: tuple[Active, ...] = ()  # active warnings
+    next_look: float = 0.0  # monotonic times [s] of the next and of the last look-up
+    last_look: float = -1.0
+    is_urgent: bool = False
     places: frozenset[int] = frozenset()  # keys of the places on the possible paths ahead
     outlook: Outlook | None = None
 
@@ -90,10 +90,10 @@ class Lookout:
 
     Args:
         names: names of the vehicles; vehicle k below has the name with index k.
-        hear: function that the thread calls with the vehicle's name and each warning.
+        on_warning: function that the thread calls with the vehicle's name and each warning.
         route_of: function that returns the route that the user gave for vehicle k, or None to
             follow the roads visible in the map.
-        listening: function that returns True if the lookout must serve vehicle k; by default it
+        is_served: function that returns True if the lookout must serve vehicle k; by default it
             serves all.
         on_horizons: function called after each look-up with the vehicle's name, its horizons (map
             values along each possible path) and its pose.
@@ -102,22 +102,22 @@ class Lookout:
     def __init__(
         self,
         names: Sequence[str],
-        hear: Hear,
+        on_warning: OnWarning,
         route_of: RouteOf = lambda _: None,
-        listening: Callable[[int], bool] = lambda _: True,
+        is_served: Callable[[int], bool] = lambda _: True,
         on_horizons: Callable[[str, list[Horizon], Pose], None] = lambda *_: None,
     ) -> None:
-        self._hear = hear
+        self._on_warning = on_warning
         self._route_of = route_of
         self._on_horizons = on_horizons
-        self._watchers = {k: _Watcher(name) for k, name in enumerate(names) if listening(k)}
-        self._number = {watcher.name: k for k, watcher in self._watchers.items()}
+        self._served = {k: _ServedVehicle(name) for k, name in enumerate(names) if is_served(k)}
+        self._number = {vehicle.name: k for k, vehicle in self._served.items()}
         self._poses: Sequence[Pose] = ()
         self._prior = MapPrior(len(names))
         self._current_grip = np.full((len(names), 3), np.nan)
         self._wake = threading.Event()
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._look_loop, name="lookout", daemon=True)
+        self._thread = threading.Thread(target=self._run_looks, name="lookout", daemon=True)
         self.counts = LookoutCounts()
 
     def start(self) -> None:
@@ -130,19 +130,21 @@ class Lookout:
         """
         k = self._number.get(name)
         if k is not None:
-            watcher = self._watchers[k]
+            vehicle = self._served[k]
             subscriber = MapSubscriber(
-                name, session, lambda places: self._look_sooner(watcher, places)
+                name, session, lambda places: self._request_look(vehicle, places)
             )
-            watcher.subscriber = self.counts.subscribers[name] = subscriber
+            vehicle.subscriber = self.counts.subscribers[name] = subscriber
 
-    def see(self, poses: Sequence[Pose]) -> None:
+    def set_poses(self, poses: Sequence[Pose]) -> None:
         """Store the present poses (position, heading, speed) of the vehicles; item k belongs to
         vehicle k.
         """
         self._poses = poses
 
-    def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
+    def combine_beliefs(
+        self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None
+    ) -> None:
         """Combine the friction beliefs (probabilities) of the vehicles' filters with the map's
         belief as a prior. Store median and interval of the result as the friction at each vehicle.
 
@@ -155,7 +157,7 @@ class Lookout:
             return
         map_beliefs: dict[int, FloatArray | None] = {}
         for k in self._prior.entered_vehicles(places):
-            subscriber = self._watchers[k].subscriber if k in self._watchers else None
+            subscriber = self._served[k].subscriber if k in self._served else None
             if subscriber is None or places[k] < 0:
                 map_beliefs[k] = None
             # The estimation loop must not wait. If the lock is taken, the loop tries again at its
@@ -170,11 +172,11 @@ class Lookout:
             [mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)]
         )
 
-    def outlook(self, name: str) -> Outlook | None:
+    def latest_outlook(self, name: str) -> Outlook | None:
         """Return the latest outlook of the vehicle `name` (its warnings, and the map values of the
         road ahead). Return None before the first look-up.
         """
-        return self._watchers[self._number[name]].outlook
+        return self._served[self._number[name]].outlook
 
     def close(self, within_s: float = 1.0) -> None:
         """Stop the lookout's thread; the vehicles' sessions stay open."""
@@ -183,45 +185,46 @@ class Lookout:
         if self._thread.ident is not None:
             self._thread.join(within_s)
 
-    def _look_sooner(self, watcher: _Watcher, places: list[int]) -> None:
-        if not watcher.places.isdisjoint(places) or any(
-            not one.places.isdisjoint(places) for one in watcher.active
+    def _request_look(self, vehicle: _ServedVehicle, places: list[int]) -> None:
+        if not vehicle.places.isdisjoint(places) or any(
+            not one.places.isdisjoint(places) for one in vehicle.active
         ):
-            watcher.urgent = True
+            vehicle.is_urgent = True
             self._wake.set()
 
-    def _look_loop(self) -> None:
+    def _run_looks(self) -> None:
         while not self._stop.is_set():
             self._wake.clear()
             now = time.monotonic()
             began = time.thread_time()
             ready = [
                 k
-                for k, watcher in self._watchers.items()
-                if watcher.due <= now or (watcher.urgent and now - watcher.looked >= AGAIN_S)
+                for k, vehicle in self._served.items()
+                if vehicle.next_look <= now
+                or (vehicle.is_urgent and now - vehicle.last_look >= AGAIN_S)
             ]
-            for k in sorted(ready, key=lambda k: not self._watchers[k].urgent):
-                self._watch_vehicle(k, now)
-                if any(watcher.urgent for watcher in self._watchers.values()):
+            for k in sorted(ready, key=lambda k: not self._served[k].is_urgent):
+                self._serve_vehicle(k, now)
+                if any(vehicle.is_urgent for vehicle in self._served.values()):
                     break  # start again with the vehicles that received an alert
             self.counts.busy_s += time.thread_time() - began
             if not ready:
-                urgent = any(watcher.urgent for watcher in self._watchers.values())
+                urgent = any(vehicle.is_urgent for vehicle in self._served.values())
                 next_due = min(
-                    (watcher.due for watcher in self._watchers.values()), default=now + LOOK_S
+                    (vehicle.next_look for vehicle in self._served.values()), default=now + LOOK_S
                 )
                 self._wake.wait(AGAIN_S / 2.0 if urgent else max(next_due - time.monotonic(), 0.0))
 
-    def _watch_vehicle(self, k: int, now: float) -> None:
-        watcher = self._watchers[k]
+    def _serve_vehicle(self, k: int, now: float) -> None:
+        vehicle = self._served[k]
         # Spread the first look-ups over LOOK_S, so that a thousand cars of one process do not look
         # at the same moment.
-        first = watcher.looked < 0.0
-        watcher.due = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
-        watcher.looked = now
-        watcher.urgent = False
+        first = vehicle.last_look < 0.0
+        vehicle.next_look = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
+        vehicle.last_look = now
+        vehicle.is_urgent = False
         poses = self._poses
-        if watcher.subscriber is None or k >= len(poses):
+        if vehicle.subscriber is None or k >= len(poses):
             return
         pose = poses[k]
         if not np.isfinite([pose.latitude, pose.longitude, pose.yaw, pose.speed]).all():
@@ -229,15 +232,17 @@ class Lookout:
         if time.time_ns() - pose.time > STALE_S * NS:
             return
         try:
-            self._look_ahead(k, watcher, watcher.subscriber, pose)
+            self._look_ahead(k, vehicle, vehicle.subscriber, pose)
         except Exception:  # the lookout must continue after any error
             self.counts.failures += 1
             log.exception(
                 "looking ahead for %s failed; it is tried again with the next position",
-                watcher.name,
+                vehicle.name,
             )
 
-    def _look_ahead(self, k: int, watcher: _Watcher, subscriber: MapSubscriber, pose: Pose) -> None:
+    def _look_ahead(
+        self, k: int, vehicle: _ServedVehicle, subscriber: MapSubscriber, pose: Pose
+    ) -> None:
         length = horizon_length(pose.speed)
         with subscriber.map_lock():
             paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
@@ -245,26 +250,26 @@ class Lookout:
                 look_ahead(path.first_metres(length), subscriber.local_map, pose.time)
                 for path in paths
             ]
-            watcher.active, issued = update_warnings(
-                watcher.active, horizons, pose, subscriber.local_map
+            vehicle.active, issued = update_warnings(
+                vehicle.active, horizons, pose, subscriber.local_map
             )
-        watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
+        vehicle.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
-        self._on_horizons(watcher.name, horizons, pose)
+        self._on_horizons(vehicle.name, horizons, pose)
         for warning in issued:
             self.counts.warnings += 1
-            self._hear(watcher.name, warning)
+            self._on_warning(vehicle.name, warning)
         ended = tuple(warning for warning in issued if warning.state == "ended")
-        watcher.outlook = Outlook(
-            watcher.name,
+        vehicle.outlook = Outlook(
+            vehicle.name,
             pose.time,
             paths[0].kind,
-            (*(one.warning for one in watcher.active), *ended),
+            (*(one.warning for one in vehicle.active), *ended),
             runs_of_places(horizons[0]),
             tuple(self._current_grip[k].tolist()),
         )
         subscriber.follow_paths(paths, pose, length)
-        outlook = watcher.outlook
+        outlook = vehicle.outlook
         subscriber.publish_view(lambda: encode_ahead(outlook))
 
 

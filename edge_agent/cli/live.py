@@ -58,8 +58,8 @@ class LookoutPart:
         if pipeline.seen is None:
             return
         columns = (column.tolist() for column in pipeline.seen)
-        self._lookout.see([Pose(*row) for row in zip(*columns, strict=True)])
-        self._lookout.believe(pipeline.places, pipeline.beliefs())
+        self._lookout.set_poses([Pose(*row) for row in zip(*columns, strict=True)])
+        self._lookout.combine_beliefs(pipeline.places, pipeline.beliefs())
 
     def close_part(self) -> Mapping[str, float]:
         """Stop the lookout; return the counts of warnings and messages."""

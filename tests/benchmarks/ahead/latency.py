@@ -118,18 +118,18 @@ def measure_alerts(
             assert session is not None
             stack.callback(session.close)
             lookout.attach(name, session)
-        lookout.see(current_poses())
+        lookout.set_poses(current_poses())
         lookout.start()
         stack.callback(lookout.close)
         while lookout.counts.looks < 2 * vehicles:  # wait until all have subscribed
             time.sleep(0.05)
-            lookout.see(current_poses())
+            lookout.set_poses(current_poses())
         time.sleep(SETTLE_S)
         began = time.perf_counter()
         busy = lookout.counts.busy_s
         looks = lookout.counts.looks
         for k in rng.integers(0, vehicles, alerts).tolist():
-            lookout.see(current_poses())
+            lookout.set_poses(current_poses())
             put = time.perf_counter()
             service.put(_ice_alert(places[k], raised=True))
             try:

@@ -57,7 +57,7 @@ class Driving:
         """
         latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
-        self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
+        self.lookout.set_poses([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def drive_until(self, condition: Callable[[Outlook], object]) -> Outlook:
         """Report the car's pose (position, heading, speed) until the car's outlook (its warnings
@@ -66,11 +66,11 @@ class Driving:
 
         def has_outlook() -> bool:
             self.report_pose()
-            seen = self.lookout.outlook(CAR)
+            seen = self.lookout.latest_outlook(CAR)
             return seen is not None and bool(condition(seen))
 
         until(has_outlook)
-        seen = self.lookout.outlook(CAR)
+        seen = self.lookout.latest_outlook(CAR)
         assert seen is not None
         return seen
 
@@ -221,12 +221,12 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
     with driving(router) as car:
         car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
         router.stop()
-        car.lookout.see(
+        car.lookout.set_poses(
             [HOME._replace(time=time.time_ns() + round((local_map.HELD_S + 60.0) * NS))]
         )
         looks = car.lookout.counts.looks
         until(lambda: car.lookout.counts.looks > looks + 1)
-        seen = car.lookout.outlook(CAR)
+        seen = car.lookout.latest_outlook(CAR)
         assert seen is not None
         assert not seen.runs.basis.any()
         assert np.isnan(seen.runs.mu_lower).all()
@@ -274,16 +274,16 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     here = np.array([keys_on()[0]])
     flat = (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
-        car.lookout.believe(np.array([-1]), flat)
+        car.lookout.combine_beliefs(np.array([-1]), flat)
         car.drive_until(lambda seen: (seen.runs.basis == local_map.MEASURED).sum() > 10)
-        outlook = car.lookout.outlook(CAR)
+        outlook = car.lookout.latest_outlook(CAR)
         assert outlook is not None
         assert outlook.here[0] == pytest.approx(0.625, abs=0.02)
 
         def is_informed(seen: Outlook) -> bool:
-            # As in the agent, `believe` is called for each block. It skips the map while another
-            # thread has locked it.
-            car.lookout.believe(here, flat)
+            # As in the agent, `combine_beliefs` is called for each block. It skips the map while
+            # another thread has locked it.
+            car.lookout.combine_beliefs(here, flat)
             return bool(seen.here[0] < 0.3)
 
         seen = car.drive_until(is_informed)
