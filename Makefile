@@ -107,7 +107,7 @@ page-bench: setup  #= the live page next to MapLibre in the same browser; needs 
 
 ahead-bench: setup  #= warnings in the car, and the map as a prior
 	$(BIN)/python -m tests.benchmarks.ahead; first=$$?; \
-	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
+	$(BIN)/python -m tests.benchmarks.ahead.listening --out .evaluation/listening && exit $$first
 
 iov-bench: setup  #= DENM, routes around ice, planner, Kuksa, MCAP, clients in C and TypeScript
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[cits]'

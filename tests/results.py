@@ -82,9 +82,9 @@ CAMPAIGNS: Final = {
         "ahead",
     ),
     "listening": Campaign(
-        "python -m deploy.listening --out .evaluation/listening",
+        "python -m tests.benchmarks.ahead.listening --out .evaluation/listening",
         ".evaluation/listening",
-        "deploy.listening",
+        "tests.benchmarks.ahead.listening",
     ),
     "study": Campaign(
         "edge-agent tune --study .evaluation/study", ".evaluation/study", "edge-agent tune --study"

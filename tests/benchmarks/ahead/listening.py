@@ -1,7 +1,7 @@
 """Simulate a town whose cars receive the map and its alerts, and measure how many lose grip.
 
-    python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario
-    hills-SEED]
+    python -m tests.benchmarks.ahead.listening --out DIR [--seeds 20] [--vehicles 36]
+        [--duration 150] [--scenario hills-SEED]
 
 No network is used. Every second the cars' observations are fused (combined into a map), as in a
 fleet service. Alerts and, at intervals, tiles are passed to the listening cars as bytes. The drive
@@ -108,11 +108,11 @@ class ListeningTown:
         the true friction.
         """
         for second in range(int(duration_s)):
-            parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
+            parts = [self._simulate_block() for _ in range(round(RATE_HZ / BLOCK))]
             self._fuse([part for part in parts if len(part["cell"])])
             if self._listening:
-                self._hear(second)
-                self._look()
+                self._receive_map(second)
+                self._warn_drivers()
         self.drive.inside = self._check_intervals()
         self.drive.visits = self.fusion.live.visits[: self.fusion.size].sum()
         return self.drive
@@ -131,16 +131,16 @@ class ListeningTown:
         lower, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.95))
         return [bool(inside) for inside in (lower <= truth) & (truth <= upper)]
 
-    def _block(self) -> dict[str, Any]:
+    def _simulate_block(self) -> dict[str, Any]:
         t, signals = self.fleet.step(BLOCK)
         samples = Block(t, to_utc_ns(t, START_NS), signals)
         _, seen, _ = self.pipeline.step(samples)
-        self._truth(float(t[-1, 0]))
+        self._record_truth(float(t[-1, 0]))
         if self._listening:
-            self._believe()
+            self._compare_estimates()
         return seen.columns | {"vehicle": seen.vehicle}
 
-    def _truth(self, now: float) -> None:
+    def _record_truth(self, now: float) -> None:
         """Record, from the true values of the simulator at the time `now` [s], which cars are on
         the new ice and which of them slide there.
         """
@@ -169,7 +169,7 @@ class ListeningTown:
         raised = self.alerts.update(self.fusion.update(observations_in(columns)).slots)
         now = self._now()
         for alert in raised:
-            if alert.raised and self._on_ice(alert.latitude, alert.longitude):
+            if alert.raised and self._is_new_ice(alert.latitude, alert.longitude):
                 if not self.drive.alerts:
                     self.drive.alert_passes = float(len(self.drive.passed))
                 self.drive.alerts += 1
@@ -178,7 +178,7 @@ class ListeningTown:
                 decode_alert_message(key, wire.encode_alert(alert), now), now
             )
 
-    def _hear(self, second: int) -> None:
+    def _receive_map(self, second: int) -> None:
         """Pass the active alerts to the listening cars. Every ASKED_S seconds, also pass all map
         tiles. `second` is the time since the start of the drive [s].
         """
@@ -196,7 +196,7 @@ class ListeningTown:
             )
             self.received_map.store_cells(*decode_cells(keys.map_key(tile), payload, now), now)
 
-    def _look(self) -> None:
+    def _warn_drivers(self) -> None:
         self.drivers.refresh()
         seen = self.pipeline.seen
         assert seen is not None
@@ -217,7 +217,7 @@ class ListeningTown:
                 self.drivers.hear(self.fleet.names[k], warning)
         self.drivers.act()
 
-    def _believe(self) -> None:
+    def _compare_estimates(self) -> None:
         beliefs = self.bank.beliefs()
         seen = self.pipeline.seen
         if beliefs is None or seen is None:
@@ -237,7 +237,7 @@ class ListeningTown:
                 ]
                 self.drive.known_error.append((errors[0], errors[1]))
 
-    def _on_ice(self, latitude: float, longitude: float) -> bool:
+    def _is_new_ice(self, latitude: float, longitude: float) -> bool:
         x, y = self.fleet.scenario.from_latlon(np.array([latitude]), np.array([longitude]))
         near = 12.0
         return bool(
@@ -255,7 +255,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     map, and write the figures.
     """
     parser = argparse.ArgumentParser(
-        prog="deploy.listening", description=(__doc__ or "").splitlines()[0]
+        prog="tests.benchmarks.ahead.listening", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=SEEDS)
@@ -285,7 +285,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 flush=True,
             )
     found = measure(with_, without)
-    campaign = "deploy.listening" + (f" --seeds {args.seeds}" if args.seeds < SEEDS else "")
+    campaign = "tests.benchmarks.ahead.listening" + (
+        f" --seeds {args.seeds}" if args.seeds < SEEDS else ""
+    )
     figures.write(
         args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found
     )

@@ -9,9 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from deploy import listening
-from deploy.listening import Drive, ListeningTown, measure
 from edge_agent.lab.simulation.listeners import WarnedDrivers
+from tests.benchmarks.ahead import listening
+from tests.benchmarks.ahead.listening import Drive, ListeningTown, measure
 
 
 @pytest.mark.campaign
