@@ -8,7 +8,6 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final, TypeVar
 
@@ -158,7 +157,7 @@ def acquire_archive(
         return open_exclusive(config, root)
     lock_file = lock_archive(root)
     try:
-        holding = _acquire_under_lease(config, root, stop, log_line, signs, lock_file)
+        holding = _Candidate(config, root, stop, log_line).acquire(lock_file, signs)
     except BaseException:
         lock_file.close()
         raise
@@ -167,62 +166,117 @@ def acquire_archive(
     return holding
 
 
-def _acquire_under_lease(
-    config: ServiceConfig,
-    root: Path,
-    stop: threading.Event,
-    log_line: Callable[[str], None],
-    signs: Signs | None,
-    lock_file: BinaryIO,
-) -> Ownership | None:
-    url = str(config.archive.second)
-    options = config.archive.options
-    empty = not any((root / folder).exists() for folder in FOLDERS)
-    holder, known = holder_of(root, url)
-    bucket = ObjectBucket(url, options, config.lease_s / REQUESTS, retries=0)
-    lease = Lease(holder, bucket, config.name, config.lease_s)
-    copy = BucketReplica(root, url, options)
-    mirrors = empty or known
+class _Candidate:
+    """Service that waits for the lease of an archive's bucket copy."""
 
-    def prefetch() -> None:
-        if mirrors:
-            copy.prefetch()
-            save_holder(root, url, holder)  # shows that the disk has space, which a take-over needs
+    def __init__(
+        self,
+        config: ServiceConfig,
+        root: Path,
+        stop: threading.Event,
+        log_line: Callable[[str], None],
+    ) -> None:
+        self._config = config
+        self._root = root
+        self._stop = stop
+        self._log_line = log_line
+        self._url = str(config.archive.second)
+        options = config.archive.options
+        is_empty = not any((root / folder).exists() for folder in FOLDERS)
+        self._holder, is_known = holder_of(root, self._url)
+        self._mirrors = is_empty or is_known  # True if the folder may receive the copy's files
+        bucket = ObjectBucket(self._url, options, config.lease_s / REQUESTS, retries=0)
+        self._lease = Lease(self._holder, bucket, config.name, config.lease_s)
+        self._copy = BucketReplica(root, self._url, options)
 
-    def join() -> bool:
-        is_joined = _sync_folder(config, root, copy, lease, stop, log_line)
+    def acquire(self, lock_file: BinaryIO, signs: Signs | None) -> Ownership | None:
+        """Wait for the lease and synchronise the folder with the copy. Return the ownership, or
+        None if the wait was stopped.
+
+        Raises:
+            InputError: the folder belongs to another archive, or the copy cannot be used.
+            OSError: the folder cannot be read or written.
+        """
+        standby = None
+        if signs is not None:
+            standby = Standby(*signs, lambda: _try_on_disk(self._prefetch)[1])
+        try:
+            while self._lease.wait(self._stop, self._log_line, self._copy.largest_epoch, standby):
+                is_joined, problem = self._take_over(standby)
+                if is_joined:
+                    return Ownership(lock_file, self._copy, self._lease)
+                self._lease.release()
+                if not (self._lease.lost or problem):
+                    break
+                self._lease = self._lease.make_new_lease()
+                self._lease.problem = problem
+        except CopyError as error:
+            self._close()
+            raise unusable_copy(self._url, error) from error
+        except BaseException:
+            self._close()
+            raise
+        self._close()
+        return None
+
+    def _take_over(self, standby: Standby | None) -> tuple[bool | None, str]:
+        """Synchronise the folder with the copy under the lease that this service now has. Return
+        True if the folder is synchronised, and the problem of a standby's disk, "" for none.
+        """
+        lease = self._lease
+        lease.start_renewal()
+        if lease.succeeds and not self._mirrors:
+            raise InputError(
+                "archive.path",
+                f"{self._root} is not the archive of {self._url}",
+                "give the service an empty folder",
+            )
+        self._copy.bucket.attach_lease(lambda: lease.may_acknowledge, lease.assert_not_superseded)
+        return (self._join(), "") if standby is None else _try_on_disk(self._join)
+
+    def _prefetch(self) -> None:
+        """Copy files that a take-over will need. Saving the holder shows that the disk has space,
+        which a take-over needs.
+        """
+        if self._mirrors:
+            self._copy.prefetch()
+            save_holder(self._root, self._url, self._holder)
+
+    def _join(self) -> bool:
+        is_joined = self._sync_folder()
         if is_joined:
-            save_holder(root, url, lease.holder)
-            layout.write_epoch(root, lease.term.epoch)
+            save_holder(self._root, self._url, self._lease.holder)
+            layout.write_epoch(self._root, self._lease.term.epoch)
         return is_joined
 
-    standby = None if signs is None else Standby(*signs, lambda: _try_on_disk(prefetch)[1])
-    try:
-        while lease.wait(stop, log_line, copy.largest_epoch, standby):
-            lease.start_renewal()
-            if lease.succeeds and not mirrors:
-                raise InputError(
-                    "archive.path",
-                    f"{root} is not the archive of {url}",
-                    "give the service an empty folder",
-                )
-            copy.bucket.attach_lease(partial(_may_acknowledge, lease), lease.assert_not_superseded)
-            is_joined, problem = (join(), "") if standby is None else _try_on_disk(join)
-            if is_joined:
-                return Ownership(lock_file, copy, lease)
-            lease.release()
-            if not (lease.lost or problem):
-                break
-            lease = lease.make_new_lease()
-            lease.problem = problem
-    except CopyError as error:
-        _release_and_close(lease, copy)
-        raise unusable_copy(url, error) from error
-    except BaseException:
-        _release_and_close(lease, copy)
-        raise
-    _release_and_close(lease, copy)
-    return None
+    def _sync_folder(self) -> bool:
+        """Synchronise the archive's folder with its copy in the bucket. Return False if the wait is
+        stopped, or if another service has the lease. A standby (waiting) service retries while the
+        bucket cannot be reached.
+        """
+        lease = self._lease
+        owner = None if self._config.standby else self._config.name
+        logged = ""
+        while not self._stop.is_set():
+            try:
+                with _wait_for_compaction(self._root) if lease.succeeds else nullcontext():
+                    self._copy.sync_under_lease(owner, lease.term, succeeds=lease.succeeds)
+            except (CopyError, _BusyError) as error:
+                if lease.lost:
+                    return False
+                if isinstance(error, CopyError) and not self._config.standby:
+                    raise
+                if str(error) != logged:
+                    self._log_line(f"waiting: {error}")
+                    logged = str(error)
+                self._stop.wait(AGAIN_S)
+            else:
+                return True
+        return False
+
+    def _close(self) -> None:
+        self._lease.release()
+        self._copy.close()
 
 
 def _try_on_disk(work: Callable[[], T]) -> tuple[T | None, str]:
@@ -239,48 +293,6 @@ def _try_on_disk(work: Callable[[], T]) -> tuple[T | None, str]:
     except OSError as error:
         reason = error.strerror or error
         return None, f"cannot store the files of the archive on this disk ({reason})"
-
-
-def _may_acknowledge(lease: Lease) -> bool:
-    return lease.may_acknowledge
-
-
-def _release_and_close(lease: Lease, copy: BucketReplica) -> None:
-    lease.release()
-    copy.close()
-
-
-def _sync_folder(
-    config: ServiceConfig,
-    root: Path,
-    copy: BucketReplica,
-    lease: Lease,
-    stop: threading.Event,
-    log_line: Callable[[str], None],
-) -> bool:
-    """Synchronise the archive's folder with its copy in the bucket. Return False if `stop` is set,
-    or if another service has the lease. A standby (waiting) service retries while the bucket cannot
-    be reached.
-    """
-    logged = ""
-    while not stop.is_set():
-        try:
-            with _wait_for_compaction(root) if lease.succeeds else nullcontext():
-                copy.sync_under_lease(
-                    None if config.standby else config.name, lease.term, succeeds=lease.succeeds
-                )
-        except (CopyError, _BusyError) as error:
-            if lease.lost:
-                return False
-            if isinstance(error, CopyError) and not config.standby:
-                raise
-            if str(error) != logged:
-                log_line(f"waiting: {error}")
-                logged = str(error)
-            stop.wait(AGAIN_S)
-        else:
-            return True
-    return False
 
 
 class _BusyError(Exception):
