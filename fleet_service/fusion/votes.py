@@ -133,53 +133,74 @@ def discount_vote(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     seconds. The result then does not depend on the kind of storage.
     """
     kind = int(entries[entry].kind)
-    pair = entries[entry].pair
     now = entries[entry].time // NS
-    least = oldest_remembered(now, kind)
-    time = 0
-    mean = np.float32(0.0)
-    std = np.float32(0.0)
+    before, is_known = _find_earlier(entries, pairs, entry)
     spent = np.float32(0.0)
-    earlier = entries[entry].before
-    seen = earlier != NONE
-    while earlier != NONE and entries[earlier].kind != kind:
-        earlier = entries[earlier].before
-    if earlier != NONE:
-        time = entries[earlier].time // NS
-        mean = _from_parts(entries[earlier].last_mean)
-        std = _from_parts(entries[earlier].last_std)
-        spent = _from_parts(entries[earlier].spent)
-    else:
-        seen = (
-            seen
-            or pairs[pair].time[ReportKind.BOUND]
-            >= max(oldest_remembered(now, ReportKind.BOUND), 1)
-            or pairs[pair].time[ReportKind.VALUE]
-            >= max(oldest_remembered(now, ReportKind.VALUE), 1)
-        )
-        time = int(pairs[pair].time[kind])
-        mean = _from_parts(pairs[pair].mean[kind])
-        std = _from_parts(pairs[pair].std)
-        spent = _from_parts(pairs[pair].spent[kind])
+    power = np.float32(1.0)
     new_mean = entries[entry].mean
     new_std = max(entries[entry].std, np.float32(constants.NOVELTY_STD))
-    power = np.float32(1.0)
-    if time > 0 and time >= least:
-        renewed = -math.expm1(-max(now - time, 0) / constants.VOTE_RENEWAL_S)
-        spent *= np.float32(1.0 - renewed)
+    if before.time > 0 and before.time >= oldest_remembered(now, kind):
+        renewed = -math.expm1(-max(now - before.time, 0) / constants.VOTE_RENEWAL_S)
+        spent = before.spent * np.float32(1.0 - renewed)
         novelty = 0.0
-        if now - time >= constants.REVISIT_S:
-            novelty = _novel_share(kind, float(mean), float(std), float(new_mean), float(new_std))
+        if now - before.time >= constants.REVISIT_S:
+            novelty = _novel_share(
+                kind, float(before.mean), float(before.std), float(new_mean), float(new_std)
+            )
         power = np.float32(max(renewed, min(novelty, constants.VOTES - float(spent))))
-        new_mean = mean + power * (new_mean - mean)
-        new_std = std + power * (new_std - std)
-    else:
-        spent = np.float32(0.0)
+        new_mean = before.mean + power * (new_mean - before.mean)
+        new_std = before.std + power * (new_std - before.std)
     entries[entry].power = power
     entries[entry].last_mean = _to_parts(new_mean)
     entries[entry].last_std = _to_parts(new_std)
     entries[entry].spent = _to_parts(spent + power)
-    entries[entry].fresh = 0 if seen else 1
+    entries[entry].fresh = 0 if is_known else 1
+
+
+class EarlierReport(NamedTuple):
+    """Earlier reports of one kind by one vehicle in one cell: time [s] of the last one, 0 for none,
+    running mean and standard deviation of the friction, and number of votes that the vehicle has
+    used up.
+    """
+
+    time: np.int64
+    mean: np.float32
+    std: np.float32
+    spent: np.float32
+
+
+@refcount_free_inlined
+def _find_earlier(
+    entries: RecordArray, pairs: RecordArray, entry: int
+) -> tuple[EarlierReport, bool]:
+    """Return the vehicle's earlier reports in the cell that have the same kind as the observation
+    in row `entry`, and True if it has made a report of either kind there.
+    """
+    kind = int(entries[entry].kind)
+    earlier = entries[entry].before
+    is_known = earlier != NONE
+    while earlier != NONE and entries[earlier].kind != kind:
+        earlier = entries[earlier].before
+    if earlier != NONE:
+        last = entries[earlier]
+        report = EarlierReport(
+            np.int64(last.time // NS),
+            _from_parts(last.last_mean),
+            _from_parts(last.last_std),
+            _from_parts(last.spent),
+        )
+        return report, is_known
+    pair = pairs[entries[entry].pair]
+    now = entries[entry].time // NS
+    for other in (ReportKind.BOUND, ReportKind.VALUE):
+        is_known = is_known or pair.time[other] >= max(oldest_remembered(now, other), 1)
+    report = EarlierReport(
+        np.int64(pair.time[kind]),
+        _from_parts(pair.mean[kind]),
+        _from_parts(pair.std),
+        _from_parts(pair.spent[kind]),
+    )
+    return report, is_known
 
 
 @refcount_free_inlined

@@ -30,7 +30,7 @@ from fleet_service.fusion.store.records import (
 from fleet_service.fusion.store.settled import (
     drop_reports,
     insert_reports,
-    take_resting,
+    remove_settling_pairs,
 )
 from fleet_service.fusion.store.table import places_for
 from schemas.numeric import IntArray
@@ -88,13 +88,13 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     begins[: len(state.settled_begin)] = state.settled_begin
     begins[len(state.settled_begin) :] = reports, values
     state = state._replace(settled_begin=begins)
-    resting = take_resting(state, names, size, now)
+    settling = remove_settling_pairs(state, names, size, now)
     # in place, because a copy would take as much memory again
-    more, more_values = int(resting.kinds.sum()), int(resting.kinds[ReportKind.VALUE])
+    more, more_values = int(settling.kinds.sum()), int(settling.kinds[ReportKind.VALUE])
     state.settled.resize(reports + more, refcheck=False)
     state.settled_keys.resize(reports + more, refcheck=False)
     state.settled_std.resize(values + more_values, refcheck=False)
-    insert_reports(state, resting, now, reports, values, len(names))
+    insert_reports(state, settling, now, reports, values, len(names))
     # The table usually keeps its size, because as many pairs will follow.
     return resize_pairs(state, places) if 2 * places < len(state.pairs) else state
 

@@ -208,7 +208,7 @@ def _drop_reports(state: State, names: RecordArray, now: int) -> int:
     return reports
 
 
-class Resting(NamedTuple):
+class SettlingPairs(NamedTuple):
     """Pairs (one vehicle in one slot each) that settle.
 
     Attributes:
@@ -233,7 +233,7 @@ class _Tally(NamedTuple):
     kinds: IntArray
 
 
-def take_resting(state: State, names: RecordArray, slots: int, now: int) -> Resting:
+def remove_settling_pairs(state: State, names: RecordArray, slots: int, now: int) -> SettlingPairs:
     """Remove the pairs without an observation that is still waiting to become final from the hash
     table `State.pairs`, and return them. These pairs can be settled, that is, moved to compact
     storage.
@@ -248,15 +248,15 @@ def take_resting(state: State, names: RecordArray, slots: int, now: int) -> Rest
         np.zeros(len(names) + 1, np.int32),
         np.zeros(len(ReportKind), np.int64),
     )
-    count = _take_resting(state, names, now, tally, records)
+    count = _remove_settling(state, names, now, tally, records)
     records = records[:count]
     order = np.empty((2, count), np.int64)
-    _sort_resting(records, np.cumsum(tally.slots), np.cumsum(tally.vehicles), order[0], order[1])
-    return Resting(records, order[0], tally.kinds)
+    _sort_pairs(records, np.cumsum(tally.slots), np.cumsum(tally.vehicles), order[0], order[1])
+    return SettlingPairs(records, order[0], tally.kinds)
 
 
 @refcount_free_locked
-def _take_resting(
+def _remove_settling(
     state: State, names: RecordArray, now: int, tally: _Tally, out: RecordArray
 ) -> int:
     """Move the records of the pairs without a waiting observation from the hash table to `out`,
@@ -329,7 +329,7 @@ def _free_place(pairs: RecordArray, place: int) -> None:
 
 
 @refcount_free_locked
-def _sort_resting(
+def _sort_pairs(
     pairs: RecordArray,
     slot_begins: IntArray,
     vehicle_begins: IntArray,
@@ -353,7 +353,7 @@ def _sort_resting(
 
 @refcount_free_locked
 def insert_reports(
-    state: State, resting: Resting, now: int, reports: int, values: int, vehicles: int
+    state: State, settling: SettlingPairs, now: int, reports: int, values: int, vehicles: int
 ) -> None:
     """Insert the reports of pairs (one vehicle in one slot each) into the sorted arrays of settled
     reports. Reports that are no longer remembered at `now` [s] are left out.
@@ -369,7 +369,7 @@ def insert_reports(
     value = values
     to = len(keys)
     to_value = len(state.settled_std)
-    records, order, _ = resting
+    records, order, _ = settling
     k = len(order) - 1
     for slot in range(len(begins) - 2, -1, -1):
         begin = _to_int(begins[slot, 0])

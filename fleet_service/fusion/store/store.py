@@ -233,11 +233,11 @@ class Store:
         """
         now = checkpoint_s - checkpoint_s % constants.FORGOTTEN_EVERY_S
         state = self.state
-        resting = int(state.used[PAIRS]) - self.waiting
-        # A resting pair takes five times the memory of a settled one, but settling reads all
+        settling = int(state.used[PAIRS]) - self.waiting
+        # A settling pair takes five times the memory of a settled one, but settling reads all
         # settled pairs. So settle only if enough pairs rest.
         some = (len(state.settled) + self.size) // 32
-        if now != self.forgotten_at or resting > max(LEAST, self.waiting, some):
+        if now != self.forgotten_at or settling > max(LEAST, self.waiting, some):
             self.state = settle_pairs(state, self.names[: self.vehicles], self.size, now)
         if now != self.forgotten_at:
             self.forgotten_at = now

@@ -20,7 +20,7 @@ from fleet_service.fusion.store.records import (
     VEHICLE,
     Side,
 )
-from fleet_service.fusion.store.settled import take_resting
+from fleet_service.fusion.store.settled import remove_settling_pairs
 from fleet_service.fusion.store.table import LEAST, PLACES_MOST, fill_table, pair_place, rows_of
 from schemas import mugrid
 from schemas.numeric import FloatArray
@@ -76,8 +76,8 @@ def test_pairs_that_stay_are_found_after_others_settle(seed: int) -> None:
         state.pairs[place]["last"] = row if waits[row] else NONE
         entries[row]["pair"] = place
     state.used[PAIRS] = count
-    resting = take_resting(state, np.zeros(count, VEHICLE), 50, 1)
-    settled = resting.records[resting.order]
+    settling = remove_settling_pairs(state, np.zeros(count, VEHICLE), 50, 1)
+    settled = settling.records[settling.order]
     np.testing.assert_array_equal(
         np.int64(settled["slot"]) * count + settled["vehicle"], np.sort(known[~waits])
     )
