@@ -15,19 +15,21 @@ because the vehicle's actual path in between is no longer known.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import refcount_free_locked
+from schemas.runtime.records import RecordArray, records
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 # [m/s] Faster than any road vehicle, even with the error of its clock.
 FASTEST: Final = 70.0
 LEAP_M: Final = 2_000.0  # [m] budget for jumps of the position after a tunnel or a ferry
 LEAP_M_PER_S: Final = 0.5  # [m/s] rate at which this budget is refilled
-ANCHORS: Final = 16  # remembered points of a path; they take 280 bytes per vehicle
+ANCHORS: Final = 16  # remembered points of a path; they take 288 bytes per vehicle
 VEHICLES: Final = 200_000  # largest number of vehicles that are remembered
 # [ns] Added to the age of an anchor. Without it, the newest anchors would count as infinitely
 # dense.
@@ -37,21 +39,33 @@ _RECENT_NS: Final = 10 * NS
 _DETOUR_M: Final = 2_000.0
 _START: Final = 64  # number of vehicles for which memory is allocated at the start
 
+Place = FloatArray | Float32Array
+
+
+class PathRecord:
+    """Path of one vehicle.
+
+    Attributes:
+        count: number of anchors.
+        leap: rest of the budget for jumps [m].
+        time: times of the anchors [ns], ascending.
+        place: latitudes and longitudes of the anchors [deg].
+        is_gap: 1 if an anchor after this one was dropped.
+    """
+
+    count: int
+    leap: float
+    time: Annotated[IntArray, ANCHORS]
+    place: Annotated[Float32Array, ANCHORS, 2]
+    is_gap: Annotated[NDArray[np.int8], ANCHORS]
+
 
 class VehiclePaths:
     """Recent path (times and places) of each vehicle since the start of the service."""
 
     def __init__(self) -> None:
-        self._rows: dict[int, int] = {}  # row of each vehicle in the arrays
-        self._make_room(_START)
-
-    def _make_room(self, rows: int) -> None:
-        self._time: IntArray = np.zeros((rows, ANCHORS), np.int64)
-        self._place: Float32Array = np.zeros((rows, ANCHORS, 2), np.float32)
-        # True if an anchor after this one was dropped
-        self._is_gap: BoolArray = np.zeros((rows, ANCHORS), np.bool_)
-        self._count: IntArray = np.zeros(rows, np.int64)
-        self._leap: FloatArray = np.full(rows, LEAP_M)
+        self._rows: dict[int, int] = {}  # row of each vehicle in the array of paths
+        self._paths = records(PathRecord, _START)
 
     def find_implausible(
         self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray
@@ -64,39 +78,21 @@ class VehiclePaths:
         names, inverse = np.unique(vehicle, return_inverse=True)
         if len(self._rows) + len(names) > max(VEHICLES, len(names)):
             self._rows.clear()
-            self._make_room(_START)
+            self._paths = records(PathRecord, _START)
         row = np.array(
             [self._rows.setdefault(name, len(self._rows)) for name in names.tolist()], np.int64
         )
-        while len(self._rows) > len(self._count):
-            self._grow()
+        while len(self._rows) > len(self._paths):
+            self._paths = np.concatenate([self._paths, records(PathRecord, len(self._paths))])
         place = np.column_stack([latitude, longitude]).astype(np.float64)
         out = np.zeros(len(place), np.bool_)
-        paths = (self._time, self._place, self._is_gap, self._count, self._leap)
-        _find_implausible(row[inverse], np.asarray(time, np.int64), place, paths, out)
+        _find_implausible(row[inverse], np.asarray(time, np.int64), place, self._paths, out)
         return out
-
-    def _grow(self) -> None:
-        time = self._time
-        place = self._place
-        is_gap = self._is_gap
-        count = self._count
-        leap = self._leap
-        rows = len(count)
-        self._make_room(2 * rows)
-        self._time[:rows] = time
-        self._place[:rows] = place
-        self._is_gap[:rows] = is_gap
-        self._count[:rows] = count
-        self._leap[:rows] = leap
-
-
-Paths = tuple[IntArray, Float32Array, BoolArray, IntArray, FloatArray]
 
 
 @refcount_free_locked
 def _find_implausible(
-    row: IntArray, time: IntArray, place: FloatArray, paths: Paths, out: BoolArray
+    row: IntArray, time: IntArray, place: FloatArray, paths: RecordArray, out: BoolArray
 ) -> None:
     """Find the rows that are implausible for their vehicle's path, and add the plausible rows to
     the paths. This is the compiled part of `VehiclePaths.find_implausible`.
@@ -104,57 +100,82 @@ def _find_implausible(
     `row` (n,) is the number of the vehicle's path, `time` (n,) in ns, `place` (n, 2) in degrees.
     The mask `out` (n,), False at first, becomes True for implausible rows.
     """
-    anchors, places, is_gap, count, leap = paths
     for n in range(len(row)):
-        v = row[n]
-        t = time[n]
-        held = count[v]
-        after = held
-        while after > 0 and anchors[v, after - 1] > t:
+        path = paths[row[n]]
+        held = path.count
+        if held == 0:
+            path.leap = LEAP_M
+        after = held  # number of anchors that are not later
+        while after > 0 and path.time[after - 1] > time[n]:
             after -= 1
-        excess = 0.0
-        if after > 0:
-            excess = _excess_distance(t - anchors[v, after - 1], places[v, after - 1], place[n])
-        if after < held:
-            excess = max(
-                excess, _excess_distance(anchors[v, after] - t, places[v, after], place[n])
-            )
-        if 0 < after < held and is_gap[v, after - 1]:
-            gap_start = places[v, after - 1]
-            gap_end = places[v, after]
-            detour = (
-                _distance_m(gap_start, place[n])
-                + _distance_m(place[n], gap_end)
-                - _distance_m(gap_start, gap_end)
-            )
-            if detour > _DETOUR_M:
-                excess = np.inf
+        excess = _excess_at(paths, row[n], after, time[n], place[n])
         if after == held and held > 0:
-            leap[v] = min(LEAP_M, leap[v] + LEAP_M_PER_S * (t - anchors[v, held - 1]) / NS)
-        if excess > leap[v]:
+            refilled = LEAP_M_PER_S * (time[n] - path.time[held - 1]) / NS
+            path.leap = min(LEAP_M, path.leap + refilled)
+        if excess > path.leap:
             out[n] = True
             continue
-        leap[v] -= excess
+        path.leap -= excess
         if held == ANCHORS:
-            dropped = _least_needed(anchors[v])
-            is_gap[v, dropped - 1] = True
-            for k in range(dropped, ANCHORS - 1):
-                anchors[v, k] = anchors[v, k + 1]
-                places[v, k, 0] = places[v, k + 1, 0]
-                places[v, k, 1] = places[v, k + 1, 1]
-                is_gap[v, k] = is_gap[v, k + 1]
-            held -= 1
+            dropped = _least_needed(path.time)
+            _drop_anchor(paths, row[n], dropped)
             after -= after > dropped
-        for k in range(held, after, -1):
-            anchors[v, k] = anchors[v, k - 1]
-            places[v, k, 0] = places[v, k - 1, 0]
-            places[v, k, 1] = places[v, k - 1, 1]
-            is_gap[v, k] = is_gap[v, k - 1]
-        anchors[v, after] = t
-        places[v, after, 0] = place[n, 0]
-        places[v, after, 1] = place[n, 1]
-        is_gap[v, after] = after > 0 and after < held and is_gap[v, after - 1]
-        count[v] = held + 1
+        _insert_anchor(paths, row[n], after, time[n], place[n])
+
+
+@refcount_free_locked
+def _excess_at(paths: RecordArray, row: int, after: int, time: int, place: FloatArray) -> float:
+    """Return by how much the place (2,) [deg] at `time` [ns] is too far [m] from the neighbouring
+    anchors of a path, of which `after` anchors are earlier. The result is 0 for a plausible place,
+    and infinite for a place far from the line between two anchors with a gap.
+    """
+    path = paths[row]
+    excess = 0.0
+    if after > 0:
+        excess = _excess_distance(time - path.time[after - 1], path.place[after - 1], place)
+    if after < path.count:
+        excess = max(excess, _excess_distance(path.time[after] - time, path.place[after], place))
+    if 0 < after < path.count and path.is_gap[after - 1]:
+        start = path.place[after - 1]
+        end = path.place[after]
+        detour = _distance_m(start, place) + _distance_m(place, end) - _distance_m(start, end)
+        if detour > _DETOUR_M:
+            return np.inf
+    return excess
+
+
+@refcount_free_locked
+def _drop_anchor(paths: RecordArray, row: int, dropped: int) -> None:
+    """Remove one anchor of a path, which is neither the first nor the last."""
+    path = paths[row]
+    path.is_gap[dropped - 1] = 1
+    path.count -= 1
+    for k in range(dropped, path.count):
+        _copy_anchor(paths, row, k + 1, k)
+
+
+@refcount_free_locked
+def _insert_anchor(paths: RecordArray, row: int, after: int, time: int, place: FloatArray) -> None:
+    """Insert an anchor with the given time [ns] and place (2,) [deg] into a path, behind its first
+    `after` anchors.
+    """
+    path = paths[row]
+    for k in range(path.count, after, -1):
+        _copy_anchor(paths, row, k - 1, k)
+    path.time[after] = time
+    path.place[after, 0] = place[0]
+    path.place[after, 1] = place[1]
+    path.is_gap[after] = path.is_gap[after - 1] if 0 < after < path.count else 0
+    path.count += 1
+
+
+@refcount_free_locked
+def _copy_anchor(paths: RecordArray, row: int, source: int, to: int) -> None:
+    path = paths[row]
+    path.time[to] = path.time[source]
+    path.place[to, 0] = path.place[source, 0]
+    path.place[to, 1] = path.place[source, 1]
+    path.is_gap[to] = path.is_gap[source]
 
 
 @refcount_free_locked
@@ -175,7 +196,7 @@ def _least_needed(anchors: IntArray) -> int:
 
 
 @refcount_free_locked
-def _excess_distance(elapsed_ns: int, start: Float32Array, end: FloatArray) -> float:
+def _excess_distance(elapsed_ns: int, start: Place, end: Place) -> float:
     """Return the distance between two places (2,) [deg] minus the distance that a vehicle covers at
     the speed FASTEST in the time `elapsed_ns` [ns]. The result is in metres, at least 0.
     """
@@ -183,7 +204,7 @@ def _excess_distance(elapsed_ns: int, start: Float32Array, end: FloatArray) -> f
 
 
 @refcount_free_locked
-def _distance_m(start: Float32Array, end: FloatArray | Float32Array) -> float:
+def _distance_m(start: Place, end: Place) -> float:
     """Return the distance [m] between two places (2,) [deg], the shorter way around the earth."""
     north = end[0] - start[0]
     east = (end[1] - start[1] + 180.0) % 360.0 - 180.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_service.ingest import paths
-from fleet_service.ingest.paths import ANCHORS, FASTEST, LEAP_M, VehiclePaths
+from fleet_service.ingest.paths import FASTEST, LEAP_M, VehiclePaths
 from tests.fleet_service.examples import SECOND, START
 
 METRE = 1.0 / 111_195.0  # [deg] longitude per metre on the equator
@@ -118,4 +118,4 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         cars = np.arange(first, first + 50)
         known.find_implausible(cars, np.full(50, START), np.zeros(50), np.zeros(50))
     assert len(known._rows) <= 100
-    assert known._time.shape == (128, ANCHORS)
+    assert len(known._paths) == 128
