@@ -107,43 +107,52 @@ def fuse_by_rules(
         cells: number of cells.
     """
     reading, std = readings
-    mean = np.full((5, cells), PRIOR_MEAN)
-    variance = np.full((5, cells), PRIOR_VAR)
+    mean = np.full((_KALMAN, cells), PRIOR_MEAN)
+    variance = np.full((_KALMAN, cells), PRIOR_VAR)
     last = np.zeros(cells)
-    out = np.empty((len(read_times), 5, cells, 2))
+    out = np.empty((len(read_times), _KALMAN, cells, 2))
     k = 0
     for t in range(len(read_times)):
         while k < len(place) and seconds[k] < read_times[t]:
             cell = place[k]
-            for rule in range(5):
-                variance[rule, cell] = min(
-                    variance[rule, cell] + DRIFT_VAR * (seconds[k] - last[cell]), PRIOR_VAR
-                )
+            passed = seconds[k] - last[cell]
             last[cell] = seconds[k]
-            m = sent[k, 0]
-            p = sent[k, 1]
-            for rule in range(5):
-                own = 1.0 / variance[rule, cell]
-                m0 = mean[rule, cell]
-                added = 1.0 / p
-                m1 = m
-                if rule == _NEWEST:
-                    own = 0.0
-                elif rule == _ALL:
-                    added *= SAMPLES
-                elif rule == _INTERSECTION:
-                    share = own / (own + added)
-                    own = share * own
-                    added = (1.0 - share) * added
-                elif rule == _FEDERATED:
+            for rule in range(_KALMAN):
+                aged = min(variance[rule, cell] + DRIFT_VAR * passed, PRIOR_VAR)
+                if rule == _FEDERATED:
                     reports = np.isfinite(reading[k])
-                    added, m1 = (1.0 / std[k] ** 2, reading[k]) if reports else (0.0, m0)
-                mean[rule, cell] = (own * m0 + added * m1) / (own + added)
-                variance[rule, cell] = 1.0 / (own + added)
+                    value = reading[k] if reports else mean[rule, cell]
+                    information = 1.0 / std[k] ** 2 if reports else 0.0
+                else:
+                    value = sent[k, 0]
+                    information = 1.0 / sent[k, 1]
+                mean[rule, cell], variance[rule, cell] = _combine(
+                    rule, mean[rule, cell], aged, value, information
+                )
             k += 1
         out[t, :, :, 0] = mean
         out[t, :, :, 1] = variance
     return out
+
+
+@compiled
+def _combine(
+    rule: int, mean: float, variance: float, value: float, information: float
+) -> tuple[float, float]:
+    """Return mean and variance of a cell after a rule has combined them with a reported value. The
+    report's `information` is its inverse variance.
+    """
+    own = 1.0 / variance
+    if rule == _NEWEST:
+        own = 0.0
+    elif rule == _ALL:
+        information *= SAMPLES
+    elif rule == _INTERSECTION:
+        share = own / (own + information)
+        own = share * own
+        information = (1.0 - share) * information
+    whole = own + information
+    return (own * mean + information * value) / whole, 1.0 / whole
 
 
 def recent_medians(visits: Visits, minute: int) -> tuple[FloatArray, FloatArray]:
