@@ -161,6 +161,23 @@ def _load_public(
     return PublicCells(fusion, visitors, least, kept if known else None)
 
 
+def _load_streams(
+    root: Path,
+    is_new: bool,
+    streams: SequenceTrackers,
+    begin: Begin,
+    damaged: Callable[[Path, str], None],
+) -> list[tuple[Kind, ArchivedRows]]:
+    """Read which batches were admitted. If `streams` is new (no checkpoint), record them there.
+    Otherwise return the rows after the checkpoint, which are few. The caller adds them when the
+    replay is complete, because the replay needs `streams` as it was at the checkpoint.
+    """
+    if is_new:
+        restore_streams(root, streams, begin, damaged)
+        return []
+    return list(read_streams(root, begin, damaged))
+
+
 def load_state(
     root: Path,
     config: ServiceConfig,
@@ -182,15 +199,11 @@ def load_state(
     alerts = Alerts(fusion, IdleRoads(), is_private=config.public_vehicles > 1)
     alerts.resume(begin.standing)
     first = first_day(root)
-    # Weather comes first, because it affects how observations are fused.
+    # Weather comes first, because it affects how observations are fused. A report affects the hours
+    # after it, but no day after the next.
+    acts_since = 0 if first is None else (first - 1) * DAY_NS
     fusion.update_weather(
-        archived_reports(
-            root,
-            known=begin.weather,
-            damaged=damaged,
-            # A report affects the hours after it, but no day after the next.
-            acts_since=0 if first is None else (first - 1) * DAY_NS,
-        )
+        archived_reports(root, known=begin.weather, damaged=damaged, acts_since=acts_since)
     )
     shown.mark_all_changed()
     matters = Begin(first, begin.cut, until)
@@ -198,17 +211,8 @@ def load_state(
     updates = replay(
         root, fusion, Since(matters, streams if begin.cut else None), damaged, listener
     )
-
-    def read_later_streams() -> list[tuple[Kind, ArchivedRows]]:
-        # With a checkpoint, the replay needs `streams` as it was at the checkpoint, so the later
-        # rows, which are few, are read now and added afterwards.
-        if begin.cut:
-            return list(read_streams(root, matters, damaged))
-        restore_streams(root, streams, matters, damaged)
-        return []
-
     with ThreadPoolExecutor(1, "streams") as thread:
-        later = thread.submit(read_later_streams)
+        later = thread.submit(_load_streams, root, not begin.cut, streams, matters, damaged)
         for updated in updates:
             alerts.update(updated.slots)
             shown.mark_changed(updated.slots)
