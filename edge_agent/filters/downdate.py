@@ -68,47 +68,54 @@ def update_by_downdate(
     downdate was refused because the result would not be a covariance. In that case
     `householder.update`, which cannot fail, performs the step instead.
     """
-    n, points = state_deviations.shape
-    measured_deviations, innovation, noise_std = measurement
-    rows = innovation.shape[0]
-    place = np.empty(rows, np.int64)
-    used = 0
-    for k in range(rows):
-        if not math.isnan(innovation[k]):
-            place[used] = k
-            used += 1
+    present = np.flatnonzero(~np.isnan(measurement.innovation))
+    used = len(present)
     if used == 0:
         return 0, 0.0, 0.0, False
-    size = points + used
+    innovation = measurement.innovation[present]
+    deviations = measurement.deviations[present]
+    points = deviations.shape[1]
     for a in range(used):
-        for p in range(size):
-            work[a, p] = measured_deviations[place[a], p] if p < points else 0.0
-        work[a, points + a] = noise_std[place[a]]
-    triangularize(work, used, size)
+        work[a, :points] = deviations[a]
+        work[a, points : points + used] = 0.0
+        work[a, points + a] = measurement.noise_std[present[a]]
+    triangularize(work, used, points + used)
     kept = sqrt_cov.copy()
     start = mean.copy()
-    white = np.empty(n)
-    gain = np.zeros((used, n))
+    spare = np.empty_like(mean)
+    gain = _cross_covariance(deviations, state_deviations)
     log_likelihood = -0.5 * used * LOG_TWO_PI
     square = 0.0
-    whitened = np.empty(used)
+    white = innovation
     for a in range(used):
-        whitened[a] = innovation[place[a]]
-        for i in range(n):
-            for p in range(points):
-                gain[a, i] += state_deviations[i, p] * measured_deviations[place[a], p]
         for b in range(a):
-            whitened[a] -= work[a, b] * whitened[b]
+            white[a] -= work[a, b] * white[b]
             gain[a] -= work[a, b] * gain[b]
-        whitened[a] /= work[a, a]
+        white[a] /= work[a, a]
         gain[a] /= work[a, a]
         log_likelihood -= math.log(work[a, a])
-        square += whitened[a] ** 2
-        mean += gain[a] * whitened[a]
-        if not downdate(sqrt_cov, gain[a], white):
-            sqrt_cov[:, :], mean[:] = kept, start
+        square += white[a] ** 2
+        mean += gain[a] * white[a]
+        if not downdate(sqrt_cov, gain[a], spare):
+            sqrt_cov[:, :] = kept
+            mean[:] = start
             used, log_likelihood, square = update(
                 mean, sqrt_cov, state_deviations, measurement, work
             )
             return used, log_likelihood, square, True
     return used, log_likelihood - 0.5 * square, square, False
+
+
+@compiled
+def _cross_covariance(deviations: FloatArray, state_deviations: FloatArray) -> FloatArray:
+    """Return the covariance of each measurement with each state, (k, n), from the deviations of the
+    measurements (k, points) and of the state (n, points).
+    """
+    count, points = deviations.shape
+    n = state_deviations.shape[0]
+    out = np.zeros((count, n))
+    for a in range(count):
+        for i in range(n):
+            for p in range(points):
+                out[a, i] += state_deviations[i, p] * deviations[a, p]
+    return out

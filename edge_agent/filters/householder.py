@@ -123,19 +123,36 @@ def update(
     The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
     """
     n, points = state_deviations.shape
-    measured_deviations, innovation, noise_std = measurement
+    used = _stack_factors(state_deviations, measurement, work)
+    if used == 0:
+        return 0, 0.0, 0.0
+    triangularize(work, used + n, points + used)
+    log_likelihood, square = _apply_innovation(
+        mean, measurement.innovation, used, work, points + used - 1
+    )
+    for i in range(n):
+        for j in range(n):
+            sqrt_cov[i, j] = work[used + i, used + j] if j <= i else 0.0
+    return used, log_likelihood, square
+
+
+@compiled
+def _stack_factors(state_deviations: FloatArray, measurement: Measurement, work: FloatArray) -> int:
+    """Write the array [[Z, diag(r)], [X, 0]] of the measurements that are not missing to `work`.
+    Return their number.
+    """
+    n, points = state_deviations.shape
+    deviations, innovation, noise_std = measurement
     used = 0
     for k in range(innovation.shape[0]):
         if not math.isnan(innovation[k]):
             used += 1
-    if used == 0:
-        return 0, 0.0, 0.0
     row = 0
     for k in range(innovation.shape[0]):
         if math.isnan(innovation[k]):
             continue
         for p in range(points):
-            work[row, p] = measured_deviations[k, p]
+            work[row, p] = deviations[k, p]
         for j in range(used):
             work[row, points + j] = 0.0
         work[row, points + row] = noise_std[k]
@@ -145,7 +162,19 @@ def update(
             work[used + i, p] = state_deviations[i, p]
         for j in range(used):
             work[used + i, points + j] = 0.0
-    triangularize(work, used + n, points + used)
+    return used
+
+
+@compiled
+def _apply_innovation(
+    mean: FloatArray, innovation: FloatArray, used: int, work: FloatArray, spare: int
+) -> tuple[float, float]:
+    """Add the gain times the innovation (k,) to the mean (n,). `work` contains the array
+    [[S^1/2, 0], [P_xz*S^-T/2, L_new]] for the `used` measurements that are not missing.
+
+    Column `spare` of `work` lies right of the diagonal, so it is zero, and the function stores the
+    whitened innovation there. Return the log-likelihood [nat] and nu' S^-1 nu.
+    """
     log_likelihood = -0.5 * used * LOG_TWO_PI
     square = 0.0
     row = 0
@@ -154,16 +183,12 @@ def update(
             continue
         white = innovation[k]
         for j in range(row):
-            white -= work[row, j] * work[j, points + used - 1]
+            white -= work[row, j] * work[j, spare]
         white /= work[row, row]
         log_likelihood -= math.log(work[row, row])
         square += white * white
-        # The part right of the diagonal is zero now, so it can store the whitened innovation.
-        work[row, points + used - 1] = white
-        for i in range(n):
+        work[row, spare] = white
+        for i in range(mean.shape[0]):
             mean[i] += work[used + i, row] * white
         row += 1
-    for i in range(n):
-        for j in range(n):
-            sqrt_cov[i, j] = work[used + i, used + j] if j <= i else 0.0
-    return used, log_likelihood - 0.5 * square, square
+    return log_likelihood - 0.5 * square, square
