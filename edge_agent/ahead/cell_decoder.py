@@ -23,6 +23,9 @@ MOST_TILE_BYTES: Final = 4 << 20
 # Tolerance of range checks: values arrive in single precision, and quantiles may be rounded to the
 # edges of their bins.
 SLACK: Final = 1e-3
+# required columns of a tile, with integers and with numbers
+_INTEGERS: Final = ("cell", "sector", "vehicles", "last_time")
+_NUMBERS: Final = ("mu_lower", "mu_upper", "p_slippery", "age_s")
 _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
@@ -43,29 +46,41 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
             f"query a smaller area: the limit is {MOST_TILE_BYTES} bytes",
         )
     table = decode_tile(payload)
-    names = ("cell", "sector", "vehicles", "last_time")
-    if any(
-        table[name].null_count
-        for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")
-    ):
+    if any(table[name].null_count for name in (*_INTEGERS, *_NUMBERS, "basis")):
         raise WireError("tile", "has null values", "send every required column without nulls")
-    cell, sector, vehicles, last = (_int_column(table, name) for name in names)
-    lower, mu, upper, p, age = (
-        _float_column(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s")
-    )
+    cell, sector, vehicles, last = (_int_column(table, name) for name in _INTEGERS)
+    lower, upper, p_slippery, age = (_float_column(table, name) for name in _NUMBERS)
+    mu = _float_column(table, "mu")
     basis = np.array([_BASIS.get(str(name), -1) for name in table["basis"].to_pylist()], np.int64)
-    measured = np.isfinite(mu)
-    wrong = {
-        "cell": grid.tile_of(cell) != tile,
-        "sector": (sector < 0) | (sector >= grid.SECTORS),
-        "vehicles": vehicles < 1,
-        "last_time": (last <= 0) | (last > now + AHEAD_OF_TIME_S * NS),
-        "basis": (basis < BOUND) | (measured == (basis == BOUND)),
-        "mu_lower": ~_is_ordered(mugrid.LOWER, lower, np.where(measured, mu, lower)),
-        "mu_upper": ~_is_ordered(np.where(measured, mu, lower), upper, mugrid.UPPER),
-        "p_slippery": ~_is_ordered(0.0, p, 1.0),
-        "age_s": ~_is_ordered(0.0, age, OLDEST_S),
-    }
+    is_measured = np.isfinite(mu)
+    middle = np.where(is_measured, mu, lower)
+    _refuse_rows(
+        {
+            "cell": grid.tile_of(cell) != tile,
+            "sector": (sector < 0) | (sector >= grid.SECTORS),
+            "vehicles": vehicles < 1,
+            "last_time": (last <= 0) | (last > now + AHEAD_OF_TIME_S * NS),
+            "basis": (basis < BOUND) | (is_measured == (basis == BOUND)),
+            "mu_lower": ~_is_ordered(mugrid.LOWER, lower, middle),
+            "mu_upper": ~_is_ordered(middle, upper, mugrid.UPPER),
+            "p_slippery": ~_is_ordered(0.0, p_slippery, 1.0),
+            "age_s": ~_is_ordered(0.0, age, OLDEST_S),
+        }
+    )
+    place = cell * grid.SECTORS + sector
+    if len(np.unique(place)) < len(place):
+        raise WireError("cell", "occurs twice", "send each cell and sector once")
+    # Time at which the service made the tile. It may lie well in the past, because the answer may
+    # come from a cache.
+    map_time = np.minimum(last + (age * NS).astype(np.int64), now)
+    belief = belief_of(lower, mu, upper, p_slippery)
+    return tile, ReceivedCells(place, belief, basis, vehicles, np.minimum(last, now), map_time)
+
+
+def _refuse_rows(wrong: dict[str, BoolArray]) -> None:
+    """Raise a `WireError` for the first column with a wrong row. `wrong` are masks of the wrong
+    rows (n,) by column.
+    """
     for name, rows in wrong.items():
         if rows.any():
             raise WireError(
@@ -73,15 +88,6 @@ def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells
                 f"is not possible in row {int(rows.argmax())}",
                 "send values that the table of the map allows",
             )
-    place = cell * grid.SECTORS + sector
-    if len(np.unique(place)) < len(place):
-        raise WireError("cell", "occurs twice", "send each cell and sector once")
-    # Time at which the service made the tile. It may lie well in the past, because the answer may
-    # come from a cache.
-    map_time = np.minimum(last + (age * NS).astype(np.int64), now)
-    return tile, ReceivedCells(
-        place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), map_time
-    )
 
 
 def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
