@@ -31,11 +31,9 @@ def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
     """
     out = np.empty((4, 3))
     for wheel in range(4):
-        out[wheel, 0], out[wheel, 1], out[wheel, 2] = (
-            math.cos(delta[wheel]),
-            math.sin(delta[wheel]),
-            omega[wheel],
-        )
+        out[wheel, 0] = math.cos(delta[wheel])
+        out[wheel, 1] = math.sin(delta[wheel])
+        out[wheel, 2] = omega[wheel]
     return out
 
 

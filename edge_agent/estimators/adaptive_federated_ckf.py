@@ -124,7 +124,9 @@ def make_bank(
 # `design` is unused, because all filters have this signature.
 def _begin_filter(memory: AdaptiveMemory, design: AdaptiveDesign) -> None:  # noqa: ARG001
     begin_motion(memory)
-    memory.actual[:], memory.expected[:], memory.alpha[:] = 0.0, 0.0, 0.0
+    memory.actual[:] = 0.0
+    memory.expected[:] = 0.0
+    memory.alpha[:] = 0.0
 
 
 @compiled

@@ -109,7 +109,9 @@ def make_bank(
 # An argument is unused, because all filters have this signature.
 def _begin_filter(memory: JointMemory, unused: EmptyRecord) -> None:  # noqa: ARG001
     begin_motion(memory)
-    memory.mean[:], memory.root[:], memory.beta = PRIOR_MU, PRIOR_ROOT, 0.5
+    memory.mean[:] = PRIOR_MU
+    memory.root[:] = PRIOR_ROOT
+    memory.beta = 0.5
 
 
 @compiled
@@ -154,11 +156,13 @@ def _step_friction(memory: JointMemory, dt: float) -> None:
         for i in range(WHEELS):
             sizes[sub] += variance(root, i)
         if sub == 0:
-            first_mean[:], first_root[:] = mean, root
+            first_mean[:] = mean
+            first_root[:] = root
     fuse_estimates(first_mean, first_root, mean, root, work)
     for i in range(WHEELS):
         limit_friction(first_mean, first_root, i, PRIOR_MU_STD)
-    memory.mean[:], memory.root[:] = first_mean, first_root
+    memory.mean[:] = first_mean
+    memory.root[:] = first_root
     memory.beta = share_by_information(sizes[0], sizes[1])
 
 
@@ -199,7 +203,9 @@ def _update_sub_filter(
         ax, ay, turn = planar_response(
             body_of(row), motion, WheelInputs(cos, sin, omega, as_four(force_x), as_four(mu))
         )
-        outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = ax, ay, memory.yaw_rate + dt * turn
+        outcomes[p, 0] = ax
+        outcomes[p, 1] = ay
+        outcomes[p, 2] = memory.yaw_rate + dt * turn
     weighted_mean(outcomes, WEIGHT, predicted)
     centred_deviations(points, mean, WEIGHT, state, 0)
     centred_deviations(outcomes, predicted, WEIGHT, measured, 0)

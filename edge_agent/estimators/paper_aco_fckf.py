@@ -162,17 +162,22 @@ def _begin_filter(memory: FuzzyMemory, context: FuzzyContext) -> None:
     use = memory.track.inputs
     speed = rolling_speed(memory.row, memory.track.now)
     known = not math.isnan(speed)
-    mean[PlanarState.VX], mean[PlanarState.VY] = speed if known else 0.0, 0.0
+    mean[PlanarState.VX] = speed if known else 0.0
+    mean[PlanarState.VY] = 0.0
     measured = 0.0 if context.straight else 1.0
-    mean[PlanarState.AX], mean[PlanarState.AY] = measured * use[S.AX], measured * use[S.AY]
-    mean[PlanarState.YAW_RATE], mean[PlanarState.MU] = measured * use[S.YAW_RATE], context.mu
+    mean[PlanarState.AX] = measured * use[S.AX]
+    mean[PlanarState.AY] = measured * use[S.AY]
+    mean[PlanarState.YAW_RATE] = measured * use[S.YAW_RATE]
+    mean[PlanarState.MU] = context.mu
     root[:, :] = 0.0
     for i in range(STATES):
         root[i, i] = context.start[i]
     if not known:
         root[PlanarState.VX, PlanarState.VX] = UNKNOWN_V_STD
     for r in range(ROWS):
-        memory.factor[r], memory.actual[r], memory.theoretical[r] = 1.0, 0.0, 0.0
+        memory.factor[r] = 1.0
+        memory.actual[r] = 0.0
+        memory.theoretical[r] = 0.0
 
 
 @compiled

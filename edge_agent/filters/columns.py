@@ -30,7 +30,8 @@ def spread_points(mean: FloatArray, sqrt_cov: FloatArray, points: FloatArray) ->
     for i in range(n):
         for j in range(n):
             step = size * sqrt_cov[i, j]
-            points[i, j], points[i, n + j] = mean[i] + step, mean[i] - step
+            points[i, j] = mean[i] + step
+            points[i, n + j] = mean[i] - step
 
 
 @inlined

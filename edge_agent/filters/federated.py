@@ -40,8 +40,10 @@ def fuse_estimates(
     n = mean.shape[0]
     for i in range(n):
         for j in range(n):
-            work[i, j], work[i, n + j] = sqrt_cov[i, j], other_root[i, j]
-            work[n + i, j], work[n + i, n + j] = sqrt_cov[i, j], 0.0
+            work[i, j] = sqrt_cov[i, j]
+            work[i, n + j] = other_root[i, j]
+            work[n + i, j] = sqrt_cov[i, j]
+            work[n + i, n + j] = 0.0
     triangularize(work, 2 * n, 2 * n)
     for k in range(n):
         white = other[k] - mean[k]

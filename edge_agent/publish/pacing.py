@@ -143,7 +143,8 @@ class Pacer:
         elif self._stale > 0:
             self._stale -= 1
         elif now - self._halved >= HALVED_S:
-            self._halved, self._window = now, max(self._window / 2.0, LEAST_WINDOW)
+            self._halved = now
+            self._window = max(self._window / 2.0, LEAST_WINDOW)
             self._sure = self._window
 
     def record_reconnect(self, now: float) -> None:

@@ -225,7 +225,8 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
         steps = min(math.ceil(whole / _STEP), _STEPS)
         share = np.float32(min(whole / steps, _STEP))
         for _ in range(steps):
-            padded[0], padded[_BINS + 1] = p[0], p[_BINS - 1]
+            padded[0] = p[0]
+            padded[_BINS + 1] = p[_BINS - 1]
             for i in range(_BINS):
                 padded[i + 1] = p[i]
             for i in range(_BINS):

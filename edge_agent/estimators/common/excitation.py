@@ -44,7 +44,9 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
     place = ring.newest
     if not time - ring.time[place] < SLOT_S:
         place = (place + 1) % SLOTS
-        ring.newest, ring.time[place], ring.used[place] = place, time, used
+        ring.newest = place
+        ring.time[place] = time
+        ring.used[place] = used
     else:
         ring.used[place] = max(ring.used[place], used)
     if ring.used[place] >= ring.largest:

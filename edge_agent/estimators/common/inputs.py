@@ -92,7 +92,8 @@ def _reset_track(track: InputTrack) -> None:
     track.started = True
     track.position_time = -math.inf
     for wheel in range(4):
-        track.steering[0, wheel], track.steering[1, wheel] = 1.0, 0.0
+        track.steering[0, wheel] = 1.0
+        track.steering[1, wheel] = 0.0
     begin_excitation(track.excitation)
 
 
@@ -117,10 +118,8 @@ def _fill_inputs(track: InputTrack, row: FloatArray, anew: bool) -> None:
     for k in range(S.YAW_RATE, S.OMEGA):
         value = now[k] if now[k] == now[k] else 0.0 if anew else use[k]
         if k >= S.DELTA and value != use[k]:
-            track.steering[0, k - S.DELTA], track.steering[1, k - S.DELTA] = (
-                math.cos(value),
-                math.sin(value),
-            )
+            track.steering[0, k - S.DELTA] = math.cos(value)
+            track.steering[1, k - S.DELTA] = math.sin(value)
         use[k] = value
     speed = rolling_speed(row, now)
     use[S.AX] = 0.0 if math.isnan(now[S.AX]) else now[S.AX]

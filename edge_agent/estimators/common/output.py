@@ -38,9 +38,12 @@ def write_motion(
     vx, vy, yaw_rate = motion
     var_x, var_y, var_rate = variances
     speed = max(abs(vx), SLOWEST_M_S)
-    output[Column.VX], output[Column.VY], output[Column.YAW_RATE] = vx, vy, yaw_rate
+    output[Column.VX] = vx
+    output[Column.VY] = vy
+    output[Column.YAW_RATE] = yaw_rate
     output[Column.SIDESLIP] = math.atan2(vy, speed)
-    output[Column.VX_STD], output[Column.VY_STD] = math.sqrt(var_x), math.sqrt(var_y)
+    output[Column.VX_STD] = math.sqrt(var_x)
+    output[Column.VY_STD] = math.sqrt(var_y)
     output[Column.YAW_RATE_STD] = math.sqrt(var_rate)
     output[Column.SIDESLIP_STD] = math.sqrt(var_y + (vy / speed) ** 2 * var_x) / speed
 
@@ -66,8 +69,10 @@ def write_quality(
     (normalised squared difference of measurement and prediction), `adaptation` (largest factor on
     the measurement noise R), and the log-likelihood of the measurements.
     """
-    output[Column.MU_UTILISED], output[Column.INNOVATION_NIS] = utilised, nis
-    output[Column.ADAPTATION], output[Column.INNOVATION_LOG_LIKELIHOOD] = adaptation, log_likelihood
+    output[Column.MU_UTILISED] = utilised
+    output[Column.INNOVATION_NIS] = nis
+    output[Column.ADAPTATION] = adaptation
+    output[Column.INNOVATION_LOG_LIKELIHOOD] = log_likelihood
 
 
 @compiled
@@ -83,10 +88,8 @@ def write_friction(output: FloatArray, first: int, mu: float, std: float) -> Non
         output[Column.P_SLIPPERY] = 0.5 * math.erfc((mu - SLIPPERY_MU) / (std * math.sqrt(2.0)))
     wide = Z_95 * std
     output[first] = min(max(mu, LOWER), UPPER)
-    output[first + 1], output[first + 2] = (
-        min(max(mu - wide, LOWER), UPPER),
-        min(max(mu + wide, LOWER), UPPER),
-    )
+    output[first + 1] = min(max(mu - wide, LOWER), UPPER)
+    output[first + 2] = min(max(mu + wide, LOWER), UPPER)
 
 
 @compiled
@@ -98,7 +101,8 @@ def write_prior(output: FloatArray, first: int) -> None:
     if first == Column.MU:
         output[Column.P_SLIPPERY] = (SLIPPERY_MU - LOWER) / (UPPER - LOWER)
     output[first] = 0.5 * (LOWER + UPPER)
-    output[first + 1], output[first + 2] = 0.95 * LOWER + 0.05 * UPPER, 0.05 * LOWER + 0.95 * UPPER
+    output[first + 1] = 0.95 * LOWER + 0.05 * UPPER
+    output[first + 2] = 0.05 * LOWER + 0.95 * UPPER
 
 
 @compiled

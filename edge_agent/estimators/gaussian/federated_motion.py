@@ -141,14 +141,17 @@ def begin_motion(memory: FederatedMemory) -> None:
     known = not math.isnan(speed)
     mean[:] = 0.0
     mean[PlanarState.VX] = speed if known else 0.0
-    mean[PlanarState.AX], mean[PlanarState.AY] = use[S.AX], use[S.AY]
+    mean[PlanarState.AX] = use[S.AX]
+    mean[PlanarState.AY] = use[S.AY]
     mean[PlanarState.YAW_RATE] = use[S.YAW_RATE]
     root[:, :] = 0.0
     for i in range(STATES):
         root[i, i] = motion.start[i]
     if not known:
         root[PlanarState.VX, PlanarState.VX] = UNKNOWN_V_STD
-    motion.beta, motion.factor[:], motion.gamma[:] = 0.5, 1.0, 1.0
+    motion.beta = 0.5
+    motion.factor[:] = 1.0
+    motion.gamma[:] = 1.0
 
 
 @compiled
@@ -182,9 +185,11 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
         predict(points, (WEIGHT, WEIGHT), process, mean, root, work)
         _update_sub_filter(memory, SubFilter(sub, mean, root, points, work), dt)
         if sub == 0:
-            first_mean[:], first_root[:] = mean, root
+            first_mean[:] = mean
+            first_root[:] = root
     fuse_estimates(first_mean, first_root, mean, root, work)
-    motion.mean[:], motion.root[:] = first_mean, first_root
+    motion.mean[:] = first_mean
+    motion.root[:] = first_root
 
 
 @compiled

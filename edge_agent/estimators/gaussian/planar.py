@@ -176,13 +176,11 @@ def _apply_heun_step(
         felt_x, felt_y, next_turn = planar_response(
             vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with_friction(end, mu)
         )
-        column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = (
-            vx,
-            vy,
-            felt_x,
-            felt_y,
-            rate,
-        )
+        column_v[p] = vx
+        column_u[p] = vy
+        column_x[p] = felt_x
+        column_y[p] = felt_y
+        column_r[p] = rate
         column_z[p] = next_turn if by_torque else z
 
 

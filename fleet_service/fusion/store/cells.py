@@ -96,7 +96,8 @@ def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
     window = target.cells[to].window
     reporters = target.cells[to].reporters
     target.cells[to] = source.cells[at]
-    target.cells[to].window, target.cells[to].reporters = window, reporters
+    target.cells[to].window = window
+    target.cells[to].reporters = reporters
 
 
 @refcount_free_inlined

@@ -90,7 +90,8 @@ def settle_pairs(state: State, names: RecordArray, size: int, now: int) -> State
     state = state._replace(settled_begin=begins)
     settling = remove_settling_pairs(state, names, size, now)
     # in place, because a copy would take as much memory again
-    more, more_values = int(settling.kinds.sum()), int(settling.kinds[ReportKind.VALUE])
+    more = int(settling.kinds.sum())
+    more_values = int(settling.kinds[ReportKind.VALUE])
     state.settled.resize(reports + more, refcheck=False)
     state.settled_keys.resize(reports + more, refcheck=False)
     state.settled_std.resize(values + more_values, refcheck=False)

@@ -268,7 +268,8 @@ class Store:
         live = self.state.live
         belief = no_beliefs(len(stay))
         cells = rows_of_lines(len(stay), CELL)
-        belief[:], cells[:] = live.belief[stay], live.cells[stay]
+        belief[:] = live.belief[stay]
+        cells[:] = live.cells[stay]
         begins = self.state.settled_begin
         begins = begins[np.append(stay[stay < len(begins) - 1], len(begins) - 1)]
         live = live._replace(belief=belief, cells=cells)
