@@ -38,48 +38,48 @@ class Pacer:
     """Pacing of one vehicle's batches towards the service of one region.
 
     Attributes:
-        flying: number of batches in flight: sent, not answered and not timed out.
-        silent: True while the service does not answer.
+        in_flight: number of batches in flight: sent, not answered and not timed out.
+        is_silent: True while the service does not answer.
     """
 
     __slots__ = (
         "_answered",
-        "_halved",
+        "_halved_at",
         "_probe_at",
         "_probe_s",
-        "_stale",
-        "_sure",
-        "_turn",
+        "_probes",
+        "_sent_before",
+        "_threshold",
         "_unanswered_since",
         "_waiting",
         "_window",
-        "flying",
-        "silent",
+        "in_flight",
+        "is_silent",
     )
 
     def __init__(self) -> None:
-        self.flying = 0
-        self.silent = False
+        self.in_flight = 0
+        self.is_silent = False
         self._waiting: list[int] = []  # heap of keys; keys of removed batches may remain
         self._window = FIRST_WINDOW
         # Size up to which the window grows by one per answered batch (slow-start threshold).
-        self._sure = LARGEST_WINDOW
+        self._threshold = LARGEST_WINDOW
         self._unanswered_since: float | None = None  # [s] start of the wait for an answer
-        self._halved = -float("inf")
+        self._halved_at = -float("inf")
         self._answered = False
         # Batches in flight that were sent before the service became silent. Their loss does not
         # indicate overload.
-        self._stale = 0
+        self._sent_before = 0
         self._probe_at = 0.0
         self._probe_s = FIRST_PROBE_S
-        self._turn = 0
+        self._probes = 0
 
     @property
     def is_idle(self) -> bool:
         """Return True if no batch of this vehicle and region is in flight (sent, not answered) and
         no batch waits to be sent.
         """
-        return not self.flying and not self._waiting
+        return not self.in_flight and not self._waiting
 
     @property
     def unanswered_since(self) -> float | None:
@@ -101,7 +101,7 @@ class Pacer:
 
     def record_sent(self, now: float) -> None:
         """Record that a batch was sent at time `now` [s] and waits for its answer."""
-        self.flying += 1
+        self.in_flight += 1
         if self._unanswered_since is None:
             self._unanswered_since = now
 
@@ -109,8 +109,8 @@ class Pacer:
         """Record that a batch in flight (sent, not answered) was answered. The window (limit of
         batches in flight) may then grow.
         """
-        self.flying -= 1
-        grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
+        self.in_flight -= 1
+        grown = self._window + (1.0 if self._window < self._threshold else 1.0 / self._window)
         self._window = min(grown, LARGEST_WINDOW)
 
     def record_answer(self) -> None:
@@ -118,40 +118,40 @@ class Pacer:
         the silent state, in which only single batches are sent as probes.
         """
         self._answered = True
-        if self.silent:
-            self.silent = False
+        if self.is_silent:
+            self.is_silent = False
             self._window = FIRST_WINDOW
-            self._sure = LARGEST_WINDOW
-            self._stale = self.flying
+            self._threshold = LARGEST_WINDOW
+            self._sent_before = self.in_flight
 
     def record_timeout(self, now: float, jitter: float) -> None:
         """Record that a batch in flight (sent, not answered) was not answered in time. After
         SILENT_S without an answer, enter the silent state, in which only single batches are sent as
         probes. Before that, halve the window.
         """
-        self.flying -= 1
-        if self.silent:
+        self.in_flight -= 1
+        if self.is_silent:
             return
         if (
             not self._answered
             and self._unanswered_since is not None
             and now - self._unanswered_since >= SILENT_S
         ):
-            self.silent = True
+            self.is_silent = True
             self._probe_s = FIRST_PROBE_S
             self._probe_at = now + jitter * self._probe_s
-        elif self._stale > 0:
-            self._stale -= 1
-        elif now - self._halved >= HALVED_S:
-            self._halved = now
+        elif self._sent_before > 0:
+            self._sent_before -= 1
+        elif now - self._halved_at >= HALVED_S:
+            self._halved_at = now
             self._window = max(self._window / 2.0, LEAST_WINDOW)
-            self._sure = self._window
+            self._threshold = self._window
 
     def record_reconnect(self, now: float) -> None:
         """Record that a router is available again at time `now` [s]. Batches in flight count as
         lost. In the silent state (no service answers), a probe is sent immediately.
         """
-        self.flying = 0
+        self.in_flight = 0
         self._unanswered_since = None
         self._probe_at = now
         self._probe_s = FIRST_PROBE_S
@@ -162,11 +162,11 @@ class Pacer:
         """
         if self._answered:
             self._answered = False
-            self._unanswered_since = now if self.flying else None
-        if self.silent:
+            self._unanswered_since = now if self.in_flight else None
+        if self.is_silent:
             return self._take_probe(now, jitter, held)
         out: list[int] = []
-        free = min(most, int(self._window) - self.flying)
+        free = min(most, int(self._window) - self.in_flight)
         while self._waiting and len(out) < free:
             key = heapq.heappop(self._waiting)
             if key in held:
@@ -187,5 +187,5 @@ class Pacer:
         self._probe_at = now + jitter * self._probe_s
         if not self._waiting:
             return []
-        self._turn ^= 1
-        return [self._waiting.pop(0 if self._turn else -1)]
+        self._probes += 1
+        return [self._waiting.pop(0 if self._probes % 2 else -1)]

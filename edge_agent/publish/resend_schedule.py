@@ -69,7 +69,7 @@ class ResendSchedule:
         """Mark the new batch with the row number `key` as in flight, and return True. If the
         service of the batch's region is silent, queue the batch and return False.
         """
-        if self._pacer_of(self._held[key]).silent:
+        if self._pacer_of(self._held[key]).is_silent:
             self.queue_batch(key)
             return False
         self.mark_in_flight(key, now)
@@ -149,14 +149,16 @@ class ResendSchedule:
 
         for pacer in pacers:
             take_from(pacer, 0, self._random_jitter())  # only probes of silent regions
-        by_age = [(pacer.oldest, n) for n, pacer in enumerate(pacers) if not pacer.silent]
+        by_age = [(pacer.oldest, n) for n, pacer in enumerate(pacers) if not pacer.is_silent]
         heapq.heapify(by_age)
         while by_age and len(keys) < limit:
             _, n = heapq.heappop(by_age)
             if take_from(pacers[n], 1):
                 heapq.heappush(by_age, (pacers[n].oldest, n))
         self._pacers = {
-            name: pacer for name, pacer in self._pacers.items() if not pacer.is_idle or pacer.silent
+            name: pacer
+            for name, pacer in self._pacers.items()
+            if not pacer.is_idle or pacer.is_silent
         }
         return sorted(keys)
 
