@@ -19,12 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import ByteArray, FloatArray
+from schemas.thresholds import SLIPPERY_MU
 
 BINS: Final = 32
 LOWER: Final = 0.05
 UPPER: Final = 1.20
 EDGES: Final[FloatArray] = np.linspace(LOWER, UPPER, BINS + 1)
 CENTRES: Final[FloatArray] = (EDGES[:-1] + EDGES[1:]) / 2
+# share of each bin that lies below SLIPPERY_MU, (32,)
+SLIPPERY_SHARE: Final[FloatArray] = np.clip(
+    (SLIPPERY_MU - LOWER) / ((UPPER - LOWER) / BINS) - np.arange(BINS), 0.0, 1.0
+)
 PRIOR: Final[FloatArray] = np.full(BINS, 1.0 / BINS)
 STEPS_PER_NAT: Final = 16
 FLOOR_STEPS: Final = 255

@@ -35,10 +35,6 @@ MOST_ALERTS: Final = 4096
 # Bit of a place's key that differs between the two directions of one road. Sectors 0 and 2 are
 # opposite headings, and so are 1 and 3.
 OTHER_WAY: Final = 2
-# Share of each friction bin that lies below SLIPPERY_MU.
-SLIPPERY_BINS: Final[FloatArray] = np.clip(
-    (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
-)
 
 
 class ReceivedCells(NamedTuple):
@@ -208,7 +204,7 @@ class LocalMap:
             np.where(cells.basis == BOUND, np.nan, mu),
             lower,
             upper,
-            np.where(is_known, faded @ SLIPPERY_BINS, np.nan),
+            np.where(is_known, faded @ mugrid.SLIPPERY_SHARE, np.nan),
             np.where(is_known, np.maximum(now - cells.last_time, 0) / NS, np.nan),
             np.where(is_known, cells.basis, UNKNOWN),
             np.where(is_known, cells.vehicles, 0),

@@ -32,7 +32,6 @@ from fleet_service.fusion import constants
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free_inlined, refcount_free_locked
-from schemas.thresholds import SLIPPERY_MU
 
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
@@ -58,9 +57,6 @@ _STEPS: Final = math.ceil(_DIFFUSION * 24 * 3600 / _STEP)
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
-_EDGE: Final = (SLIPPERY_MU - mugrid.LOWER) / constants.BIN_WIDTH
-# share of each bin that lies below SLIPPERY_MU
-SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
 FULL: Final = np.uint16(65535)
 # Number of bins on each side at which the bias kernel is cut off: 3.6 of its largest standard
@@ -351,5 +347,5 @@ def describe_likelihood(likelihood: Bins, mean: float) -> tuple[float, float]:
     slippery = 0.0
     for i in range(_BINS):
         second += likelihood[i] * (_CENTRES[i] - mean) ** 2
-        slippery += likelihood[i] * SLIPPERY_SHARE[i]
+        slippery += likelihood[i] * mugrid.SLIPPERY_SHARE[i]
     return math.sqrt(second / _BINS), slippery / _BINS

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import constants
-from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack_belief
+from fleet_service.fusion.belief import unpack_belief
 from fleet_service.fusion.neighbours import ReadRule, road_beliefs
 from fleet_service.fusion.observations import SmallArray
 from fleet_service.fusion.shared import KERNELS, UNKNOWN_SHAPE, read_slippery, shape_class
@@ -26,7 +26,7 @@ from schemas.thresholds import NS
 # Contribution of each bin of a stored belief to P(slippery) of the road, and to the sum of its
 # probabilities. One array (kernels, 2, 32) per slope in `shared.SHAPES`.
 SLIPPERY_WEIGHTS: Final = tuple(
-    np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
+    np.stack([k @ mugrid.SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS
 )
 
 

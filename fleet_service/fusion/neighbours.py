@@ -75,7 +75,7 @@ from fleet_service.fusion.adjacent import (
     SearchSide,
     find_neighbour,
 )
-from fleet_service.fusion.belief import PADDED, SLIPPERY_SHARE, Bins, forget, unpack_belief
+from fleet_service.fusion.belief import PADDED, Bins, forget, unpack_belief
 from fleet_service.fusion.shared import read_road, read_slippery
 from fleet_service.fusion.sources import is_border
 from fleet_service.fusion.store.records import AGED, MANOEUVRES, NONE, WEIGHT, Rows
@@ -315,14 +315,14 @@ def _set_slippery(road: FloatArray, required: float) -> bool:
     current = 0.0
     square = 0.0
     for i in range(_BINS):
-        current += SLIPPERY_SHARE[i] * road[i]
-        square += SLIPPERY_SHARE[i] ** 2 * road[i]
+        current += mugrid.SLIPPERY_SHARE[i] * road[i]
+        square += mugrid.SLIPPERY_SHARE[i] ** 2 * road[i]
     spread = square - current**2
     missing = required - current
     if missing * current > spread or -missing * (1.0 - current) > spread or spread <= 0.0:
         return False
     for i in range(_BINS):
-        road[i] *= 1.0 + missing / spread * (SLIPPERY_SHARE[i] - current)
+        road[i] *= 1.0 + missing / spread * (mugrid.SLIPPERY_SHARE[i] - current)
     return True
 
 
@@ -468,7 +468,7 @@ def _recent_values(cells: RecordArray, row: int) -> float:
 def _slippery_probability(road: Bins) -> float:
     whole = 0.0
     for i in range(_BINS):
-        whole += SLIPPERY_SHARE[i] * road[i]
+        whole += mugrid.SLIPPERY_SHARE[i] * road[i]
     return whole
 
 
@@ -481,7 +481,7 @@ def _stored_slippery(live: Rows, row: int) -> float:
     slippery = 0.0
     for i in range(_BINS):
         whole += live.belief[row, i]
-        slippery += SLIPPERY_SHARE[i] * live.belief[row, i]
+        slippery += mugrid.SLIPPERY_SHARE[i] * live.belief[row, i]
     return slippery / whole
 
 

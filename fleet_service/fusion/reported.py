@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free_locked
@@ -70,7 +69,7 @@ def _describe_rows(steps: ByteArray, reported: Float32Array, likelihood: FloatAr
         for i in range(mugrid.BINS):
             whole += likelihood[i]
             first += likelihood[i] * mugrid.CENTRES[i]
-            slippery += likelihood[i] * SLIPPERY_SHARE[i]
+            slippery += likelihood[i] * mugrid.SLIPPERY_SHARE[i]
         mean = first / whole
         for i in range(mugrid.BINS):
             second += likelihood[i] * (mugrid.CENTRES[i] - mean) ** 2

@@ -14,7 +14,6 @@ from fleet_service.fusion import constants
 from fleet_service.fusion.belief import (
     PADDED,
     REACH,
-    SLIPPERY_SHARE,
     Bins,
     ReportKind,
     apply_vote,
@@ -354,8 +353,8 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
     least = 0.0
     for i in range(mugrid.BINS):
         whole += p[i]
-        slippery += SLIPPERY_SHARE[i] * p[i]
-        least += SLIPPERY_SHARE[i] * prior[i]
+        slippery += mugrid.SLIPPERY_SHARE[i] * p[i]
+        least += mugrid.SLIPPERY_SHARE[i] * prior[i]
     least = max(least, constants.UNSURE)
     share = slippery / whole
     if share <= least:
@@ -363,7 +362,7 @@ def note_silence(p: Bins, noticed: float, prior: Bins) -> None:
     kept = max(1.0 - noticed, least * (1.0 - share) / (share * (1.0 - least)))
     scale = whole / (whole - (1.0 - kept) * slippery)
     for i in range(mugrid.BINS):
-        p[i] *= scale * (1.0 - (1.0 - kept) * SLIPPERY_SHARE[i])
+        p[i] *= scale * (1.0 - (1.0 - kept) * mugrid.SLIPPERY_SHARE[i])
 
 
 @refcount_free_inlined

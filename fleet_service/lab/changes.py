@@ -11,12 +11,12 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.fusion import Fusion, observations_of
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.town import LENGTH, Town
 from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
+from schemas import mugrid
 from schemas.numeric import FloatArray, IntArray
 
 DRY = 0.85
@@ -70,7 +70,7 @@ def detection_delays(rng: Generator, before: float, after: float) -> IntArray:
 
 def _has_seen(fusion: Fusion, cell: int, ice: bool) -> bool:
     slot = fusion.slots_of(CELL[cell : cell + 1], np.zeros(1, np.int64))[0]
-    slippery = float(fusion.beliefs_at_last_report(np.array([slot]))[0] @ SLIPPERY_SHARE)
+    slippery = float(fusion.beliefs_at_last_report(np.array([slot]))[0] @ mugrid.SLIPPERY_SHARE)
     return slippery > RAISE_ABOVE if ice else slippery < CLEAR_BELOW
 
 

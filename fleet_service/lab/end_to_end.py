@@ -17,7 +17,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.fusion import Fusion, Observations, observations_of
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.resampled import DrivenVisits, TrueVisits, attach_truth
 from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe_share
@@ -116,7 +115,9 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited_vehicles(fusion, visits)[slots])
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
-    with_value = is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE)
+    with_value = is_measured(
+        lower, upper, fusion.live.values[slots], belief @ mugrid.SLIPPERY_SHARE
+    )
     pure = with_value & one_surface(fusion, visits)[slots]
     found = _score_figures(scores, with_value) | {
         "rmse.one_surface": mean_or_nan(scores.error[pure] ** 2) ** 0.5,

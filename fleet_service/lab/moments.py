@@ -18,7 +18,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import end_to_end
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.end_to_end import OBSERVATIONS, SEVERAL, TRUTH
@@ -81,7 +80,9 @@ def ask_moments(folder: Path) -> list[AskedWay]:
         out.append(
             AskedWay(
                 scores,
-                is_measured(lower, upper, fusion.live.values[slots], belief @ SLIPPERY_SHARE),
+                is_measured(
+                    lower, upper, fusion.live.values[slots], belief @ mugrid.SLIPPERY_SHARE
+                ),
             )
         )
     return out

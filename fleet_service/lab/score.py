@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.town import CELLS, Town, Visits
 from schemas import mugrid
@@ -136,7 +135,7 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
     bin_ = place.astype(np.int64)
     mass = np.take_along_axis(belief, bin_[:, None], axis=1)[:, 0]
     rank = np.take_along_axis(cdf, bin_[:, None], axis=1)[:, 0] - mass * (1.0 - (place - bin_))
-    scores = of_intervals(quantiles, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
+    scores = of_intervals(quantiles, truth, vehicles, rank, belief @ mugrid.SLIPPERY_SHARE)
     return replace(scores, crps=crps_of(belief, truth))
 
 

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.fusion import Fusion, Observations, observations_of
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors, Passes
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
@@ -166,7 +165,7 @@ def read_map(place: Town, traffic: TownTraffic) -> Readings:
         width = mugrid.quantiles(belief, 0.95) - mugrid.quantiles(belief, 0.05)
         under = np.isin(slots, list(alerts.slots)) & known
         rules = (two_events(traffic, 60.0 * minute), slippery_median(traffic, 60.0 * minute))
-        read.append((place.mu[minute], width, belief @ SLIPPERY_SHARE, under, *rules))
+        read.append((place.mu[minute], width, belief @ mugrid.SLIPPERY_SHARE, under, *rules))
     return Readings(*(np.array(column) for column in zip(*read, strict=True)))
 
 

@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion, constants
-from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import PRIOR, quantiles
 from fleet_service.fusion.store.records import NONE, SOURCES, Side
 from fleet_service.fusion.witnesses import stretch_slots, stretch_sources, witnesses_of
 from fleet_service.serve.idle_roads import OTHERS_NEEDED, IdleRoads
 from fleet_service.serve.view import LOWER, UPPER, coarse_counts
-from schemas import grid
+from schemas import grid, mugrid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import CALLED_SHARE, NS, SLIPPERY_MU
 from schemas.wire import Alert
@@ -27,7 +27,7 @@ from schemas.wire import Alert
 RAISE_ABOVE: Final = CALLED_SHARE
 # Smallest P(slippery) from the cell's own reports with which an alert may be raised: that of the
 # prior.
-LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
+LIKELY: Final = float(mugrid.SLIPPERY_SHARE @ PRIOR)
 # P(slippery) below which an alert is cleared. It is stricter than raising, because clearing too
 # early is the more serious error.
 CLEAR_BELOW: Final = 0.05
@@ -117,8 +117,10 @@ class Alerts:
         vehicles reported ice. They are some of the slots `updated`, (n,).
         """
         likely = self._suspects(icy)
-        likely = likely[self._fusion.beliefs_for_alerts(likely) @ SLIPPERY_SHARE > RAISE_ABOVE]
-        believed = self._fusion.beliefs_at_last_report(likely) @ SLIPPERY_SHARE
+        likely = likely[
+            self._fusion.beliefs_for_alerts(likely) @ mugrid.SLIPPERY_SHARE > RAISE_ABOVE
+        ]
+        believed = self._fusion.beliefs_at_last_report(likely) @ mugrid.SLIPPERY_SHARE
         # An alert that an update of a neighbouring cell causes gets the newest time of the update.
         time = self._fusion.live.time
         raised = np.where(np.isin(likely, updated), time[likely], time[updated].max(initial=0))
@@ -207,7 +209,7 @@ class Alerts:
         """
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, Side.ICE, now - QUIET_NS)[:, 0] == 0
-        faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten
+        faded = (self._fusion.beliefs(slots, now) @ mugrid.SLIPPERY_SHARE < FADE_BELOW) & forgotten
         reason = "no recent visit has confirmed the alert"
         return [self._clear(int(slot), now, reason) for slot in slots[faded]]
 
@@ -233,7 +235,7 @@ class Alerts:
             mu=mu,
             mu_lower=lower,
             mu_upper=upper,
-            p_slippery=float(belief[0] @ SLIPPERY_SHARE),
+            p_slippery=float(belief[0] @ mugrid.SLIPPERY_SHARE),
             vehicles=vehicles,
             latitude=float(latitude),
             longitude=float(longitude),

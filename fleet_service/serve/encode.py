@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import quantiles
 from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured, view_cells
-from schemas import grid, tables
+from schemas import grid, mugrid, tables
 from schemas.numeric import IntArray
 from schemas.query import Format
 from schemas.thresholds import GRAVITY
@@ -32,7 +32,7 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
-    slippery = cells.belief @ SLIPPERY_SHARE
+    slippery = cells.belief @ mugrid.SLIPPERY_SHARE
     basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values, slippery))
     columns: dict[str, Any] = {
         "cell": cells.cell,

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.fusion.belief import FULL, SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import FULL, quantiles
 from fleet_service.fusion.fuse import voted_keys
 from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
 from fleet_service.fusion.store.records import CELL, Rows
@@ -225,7 +225,7 @@ class PublicCells:
         """
         current = self._fusion.beliefs(slots, now)
         shown = self.beliefs(slots, now)
-        worse = (current - shown) @ SLIPPERY_SHARE >= MORE_SLIPPERY
+        worse = (current - shown) @ mugrid.SLIPPERY_SHARE >= MORE_SLIPPERY
         worse |= quantiles(shown, (0.5,))[0] - quantiles(current, (0.5,))[0] >= LESS_MU
         slots = slots[worse]
         self._copy(slots)

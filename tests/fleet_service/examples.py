@@ -10,7 +10,6 @@ import zenoh
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.likelihoods import make_evidence
 from schemas import grid, keys, mugrid, wire
 from schemas.numeric import FloatArray
@@ -106,7 +105,7 @@ def interval(p: FloatArray) -> tuple[float, float]:
 
 def slippery(p: FloatArray) -> float:
     """Return P(μ < 0.4) of a belief `p` (32,) about friction."""
-    return float(p @ SLIPPERY_SHARE)
+    return float(p @ mugrid.SLIPPERY_SHARE)
 
 
 def batch(

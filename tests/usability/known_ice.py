@@ -37,12 +37,11 @@ from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main
 from fleet_service.client import watching
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.page.records import CELL_LEVEL, LEAST_LEVEL
 from fleet_service.replay.rebuild import Since, fusion_with_weather, replay
 from fleet_service.serve.encode import arrow_stream, cell_table, encode_tile
 from fleet_service.serve.view import view_cells
-from schemas import grid, keys, tables
+from schemas import grid, keys, mugrid, tables
 from schemas.config import ZenohSettings
 from schemas.query import Format
 from schemas.thresholds import NS
@@ -103,7 +102,7 @@ class KnownIce:
 
 def _find_slippery(fusion: Fusion, slots: Any) -> tuple[Places, Places]:  # noqa: ANN401 an array
     view = view_cells(fusion, slots, NOW)
-    slippery = view.belief @ SLIPPERY_SHARE > KNOWN
+    slippery = view.belief @ mugrid.SLIPPERY_SHARE > KNOWN
     every = list(zip(view.cell.tolist(), view.sector.tolist(), strict=True))
     return (
         {every[k] for k in np.flatnonzero(slippery)},

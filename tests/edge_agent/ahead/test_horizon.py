@@ -140,7 +140,7 @@ def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
     bin_width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     for share, value in ((0.05, 0.31), (0.5, 0.5), (0.95, 0.8)):
         assert mugrid.quantiles(belief, share)[0] == pytest.approx(value, abs=bin_width)
-    assert (belief @ local_map.SLIPPERY_BINS)[0] == pytest.approx(0.17, abs=0.05)
+    assert (belief @ mugrid.SLIPPERY_SHARE)[0] == pytest.approx(0.17, abs=0.05)
 
 
 def test_without_a_network_the_horizon_fades_to_unknown() -> None:

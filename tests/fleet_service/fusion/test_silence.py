@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from fleet_service.fusion import Fusion, constants
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.likelihoods import at_least as normal_bound
 from fleet_service.fusion.likelihoods import states_more_grip
 from fleet_service.fusion.store.records import USED
@@ -20,7 +19,7 @@ from schemas.numeric import FloatArray
 from tests.fleet_service.examples import at_least, belief, interval, observations, slippery, value
 
 QUIET = 40
-UNKNOWN = float(SLIPPERY_SHARE @ mugrid.PRIOR)
+UNKNOWN = float(mugrid.SLIPPERY_SHARE @ mugrid.PRIOR)
 
 
 def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.store.records import Side
 from fleet_service.serve.alerts import LIKELY, RAISE_ABOVE, Alerts
-from schemas import grid
+from schemas import grid, mugrid
 from tests.fleet_service.examples import (
     CELL,
     SECOND,
@@ -62,7 +61,7 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
         )
     alerts = Alerts(fusion)
     slots = np.arange(fusion.size)
-    believed = fusion.beliefs_at_last_report(slots) @ SLIPPERY_SHARE
+    believed = fusion.beliefs_at_last_report(slots) @ mugrid.SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
     known = {
@@ -165,7 +164,7 @@ def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(
         )
     slots = fusion.slots_of(np.array([here]), np.array([0]))
     own = float(fusion.slippery(slots)[0])
-    believed = float(fusion.beliefs_at_last_report(slots)[0] @ SLIPPERY_SHARE)
+    believed = float(fusion.beliefs_at_last_report(slots)[0] @ mugrid.SLIPPERY_SHARE)
     assert own < 0.5
     assert believed > RAISE_ABOVE or not found
     assert bool(Alerts(fusion).update(slots)) is raised is (own > LIKELY and found == 2)

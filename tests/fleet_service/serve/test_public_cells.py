@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.serve.public_cells import PERIOD_NS, PublicCells
 from fleet_service.serve.visitors import PART_NS, Visitors
+from schemas import mugrid
 from schemas.numeric import IntArray
 from tests.fleet_service.examples import CELL, SECOND, START, observations, value
 
@@ -45,7 +45,7 @@ class Map:
             return []
         found = self.public.beliefs(slot, now)
         share = found.cumsum(axis=1)[0]
-        return [*np.interp((0.05, 0.95), share, np.arange(32)), *(found @ SLIPPERY_SHARE)]
+        return [*np.interp((0.05, 0.95), share, np.arange(32)), *(found @ mugrid.SLIPPERY_SHARE)]
 
     def slots(self, cell: int = CELL) -> IntArray:
         return self.fusion.slots_of(np.array([cell]), np.array([0]))

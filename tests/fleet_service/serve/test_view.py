@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import PRIOR, quantiles
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured
 from schemas import mugrid
@@ -54,7 +54,7 @@ def test_known_slippery_is_measured_over_all_beliefs() -> None:
     rng = np.random.default_rng(5)
     beliefs = rng.dirichlet(np.full(len(mugrid.CENTRES), 0.1), 2000)
     lower, upper = quantiles(beliefs, (LOWER, UPPER))
-    slippery = beliefs @ SLIPPERY_SHARE
+    slippery = beliefs @ mugrid.SLIPPERY_SHARE
     found = is_measured(lower, upper, np.zeros(len(beliefs), np.float32), slippery)
     assert (found == (slippery > 0.5)).all()
     assert 0 < found.sum() < len(beliefs)
