@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -252,98 +253,136 @@ def ack_delays_s(
     return out
 
 
+@dataclass
+class ServiceTimes:
+    """Measured times of a service: queries of a tile and of a box, and the same bytes from a bare
+    queryable [ms]; alerts [ms]; acknowledgements under load and without other load [s]. `cells` are
+    the numbers of cells in the tile and in the box.
+    """
+
+    tile_ms: list[float]
+    box_ms: list[float]
+    bare_tile_ms: list[float]
+    bare_box_ms: list[float]
+    cells: list[int]
+    alerts_ms: list[float]
+    acks_s: list[float]
+    idle_acks_s: list[float]
+
+
 def service() -> list[Figure]:
     """Measure the times of queries, alerts and acknowledgements of a service that receives 20 000
     observations/s. Compare the queries with those of a bare Zenoh queryable (program that only
     answers queries). Return the figures.
     """
-    tile = keys.map_key(_TILE)
-    # Bounds of the first cell. The queried box begins there and covers all columns and half of the
-    # lines. It is slightly smaller than these cells, because a box includes its borders.
-    west, south, east, north = (
-        float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
-    )
-    wide = COLUMNS * (east - west)
-    high = LINES // 2 * (north - south)
-    box = f"{west + 1e-6},{north - high + 1e-6},{west + wide - 1e-6},{north - 1e-6}"
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
-        config = folder / "service.json"
-        config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
-        words = (
-            "-m",
-            "fleet_service.cli",
-            "run",
-            "--archive",
-            str(folder / "archive"),
-            "--config",
-            str(config),
-        )
-        stack.enter_context(run_process(*words))
-        client = open_session(ZenohSettings(connect=[endpoint]))
-        assert client is not None
-        stack.enter_context(client)
-        first = make_batch("first", 1, np.zeros(1, int), np.zeros(1, int), False)
-
-        def serves_a_cell() -> bool:
-            put_batch(client, first)
-            return len(fetch_reply(client, f"{keys.ROOT}/map/**")) > 0
-
-        poll_until(serves_a_cell)
-        idle = ack_delays_s(client, "acked-1", (0.5, 1.5), IDLE_ACKS)
-        stack.enter_context(
-            run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
-        )
-        poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
-        time.sleep(10.0)  # wait until the window is full
-        asked = (tile, f"{tile}?bbox={box}")
-        for key, selector in zip((BARE, BARE_BOX), asked, strict=True):
-            (folder / Path(key).name).write_bytes(fetch_reply(client, selector))
-        cells = [
-            decode_tile((folder / Path(key).name).read_bytes()).num_rows for key in (BARE, BARE_BOX)
-        ]
-        nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(folder)!r})"
-        stack.enter_context(run_process("-c", nothing))
-        poll_until(lambda: len(fetch_reply(client, BARE)))
-        ours, boxed, *least = durations_ms(
-            *(
-                lambda selector=selector: fetch_reply(client, selector)
-                for selector in (*asked, BARE, BARE_BOX)
-            )
-        )
-        alerts = alert_delays_ms(client)
-        acks = ack_delays_s(client, "acked-0", (0.0, 0.3), ACKS)
-    limits = [statistics.median(times) for times in least]
-    vs = [f"of {limit:.1f} ms, {number} cells" for limit, number in zip(limits, cells, strict=True)]
+        client = _start_service(stack, folder, endpoint)
+        times = _measure_times(stack, folder, endpoint, client)
+    tile, box = (statistics.median(bare) for bare in (times.bare_tile_ms, times.bare_box_ms))
+    tile_note, box_note = (
+        f"of {limit:.1f} ms, {number} cells"
+        for limit, number in zip((tile, box), times.cells, strict=True)
+    )
+    queries = times.tile_ms + times.box_ms
     return [
-        Figure("bench.query.tile_vs_bare", statistics.median(ours) / limits[0], vs[0], 2),
-        Figure("bench.query.bbox_vs_bare", statistics.median(boxed) / limits[1], vs[1], 1.25),
+        Figure("bench.query.tile_vs_bare", statistics.median(times.tile_ms) / tile, tile_note, 2),
+        Figure("bench.query.bbox_vs_bare", statistics.median(times.box_ms) / box, box_note, 1.25),
         Figure(
             "bench.query.p99_ms",
-            float(np.quantile(ours + boxed, 0.99)),
+            float(np.quantile(queries, 0.99)),
             "ms, under 20 000 observations/s",
             25,
         ),
         Figure(
             "bench.alert.p50_ms",
-            statistics.median(alerts),
+            statistics.median(times.alerts_ms),
             "ms, publish to subscriber, under load",
             50,
         ),
-        Figure("bench.alert.p99_ms", float(np.quantile(alerts, 0.99)), "ms", 15),
+        Figure("bench.alert.p99_ms", float(np.quantile(times.alerts_ms, 0.99)), "ms", 15),
         Figure(
             "bench.ack.p50_s",
-            statistics.median(acks),
+            statistics.median(times.acks_s),
             "s, publish to acknowledgement, under load",
             0.3,
         ),
         Figure(
             "bench.ack.idle_p50_s",
-            statistics.median(idle),
+            statistics.median(times.idle_acks_s),
             "s, publish to acknowledgement, a single vehicle without other load",
             0.05,
         ),
-        Figure("bench.ack.p99_s", float(np.quantile(acks, 0.99)), "s", 2.5),
+        Figure("bench.ack.p99_s", float(np.quantile(times.acks_s, 0.99)), "s", 2.5),
     ]
+
+
+def _start_service(stack: ExitStack, folder: Path, endpoint: str) -> zenoh.Session:
+    """Start a service in a process, and wait until it answers with a first cell. Return the session
+    of a client. `stack` ends both.
+    """
+    config = folder / "service.json"
+    config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
+    command = ["-m", "fleet_service.cli", "run", "--archive", str(folder / "archive")]
+    stack.enter_context(run_process(*command, "--config", str(config)))
+    client = open_session(ZenohSettings(connect=[endpoint]))
+    assert client is not None
+    stack.enter_context(client)
+    first = make_batch("first", 1, np.zeros(1, int), np.zeros(1, int), False)
+
+    def serves_a_cell() -> bool:
+        put_batch(client, first)
+        return len(fetch_reply(client, f"{keys.ROOT}/map/**")) > 0
+
+    poll_until(serves_a_cell)
+    return client
+
+
+def _measure_times(
+    stack: ExitStack, folder: Path, endpoint: str, client: zenoh.Session
+) -> ServiceTimes:
+    idle = ack_delays_s(client, "acked-1", (0.5, 1.5), IDLE_ACKS)
+    stack.enter_context(
+        run_process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})")
+    )
+    poll_until(lambda: len(fetch_reply(client, f"{keys.ROOT}/map/**")))
+    time.sleep(10.0)  # wait until the window is full
+    tile = keys.map_key(_TILE)
+    selectors = (tile, f"{tile}?bbox={_queried_box()}")
+    cells = []
+    for key, selector in zip((BARE, BARE_BOX), selectors, strict=True):
+        reply = fetch_reply(client, selector)
+        cells.append(decode_tile(reply).num_rows)
+        (folder / Path(key).name).write_bytes(reply)
+    answer = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(folder)!r})"
+    stack.enter_context(run_process("-c", answer))
+    poll_until(lambda: len(fetch_reply(client, BARE)))
+    asked = (*selectors, BARE, BARE_BOX)
+    tile_ms, box_ms, bare_tile_ms, bare_box_ms = durations_ms(
+        *(lambda selector=selector: fetch_reply(client, selector) for selector in asked)
+    )
+    return ServiceTimes(
+        tile_ms,
+        box_ms,
+        bare_tile_ms,
+        bare_box_ms,
+        cells,
+        alerts_ms=alert_delays_ms(client),
+        acks_s=ack_delays_s(client, "acked-0", (0.0, 0.3), ACKS),
+        idle_acks_s=idle,
+    )
+
+
+def _queried_box() -> str:
+    """Return west, south, east and north of the queried box [deg]. The box begins at the first cell
+    and covers all columns and half of the lines. It is slightly smaller than these cells, because a
+    box includes its borders.
+    """
+    west, south, east, north = (
+        float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
+    )
+    wide = COLUMNS * (east - west)
+    high = LINES // 2 * (north - south)
+    return f"{west + 1e-6},{north - high + 1e-6},{west + wide - 1e-6},{north - 1e-6}"
