@@ -9,7 +9,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -59,6 +59,19 @@ def _count_and_send(parcels: list[Parcel], link: AmqpLink, parcel: Parcel) -> No
     link.send(parcel)
 
 
+class Transfer(NamedTuple):
+    """One step of the benchmark: number of messages, and the time [s] and processor time [s] until
+    the interchange has accepted them.
+    """
+
+    messages: int
+    seconds: float
+    processor_s: float
+
+
+Received = list[tuple[bytes, dict[str, object]]]
+
+
 def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     """Simulate hazard events (DENM) that begin, change and end, and restart the gateway after each
     step.
@@ -67,85 +80,13 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
     ended, and the message rates. A further figure counts errors of the filter `quadTree`, with
     which a receiver selects the events in a map square.
     """
-    from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
-
-    draw = np.random.default_rng(4202)
-    url = free_url()
-    path = folder / "cits.json"
-    path.unlink(missing_ok=True)
     events = 500 if quick else 2000
-    now = [START]
-    stretches = [_stretch(number, draw) for number in range(events)]
-    steps = [
-        stretches,
-        [replace(one, cells=one.cells + 1) if k % 2 else one for k, one in enumerate(stretches)],
-        stretches[events // 2 :],
-        [],
-    ]
-    originator = Originator("SE", "SE00001")
-    seconds = list[tuple[int, float, float]]()
-    received = list[tuple[bytes, dict[str, object]]]()
-    with separate_interchange(url) as there:
-        for standing in steps:
-            settled: list[str] = []
-            link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
-            until(lambda link=link: link.is_connected)  # type: ignore[misc]
-            parcels: list[Parcel] = []
-            output = DenmOutput(
-                STATION, originator, path, partial(_count_and_send, parcels, link), lambda: now[0]
-            )
-            now[0] += NS
-            before = len(received)
-            began = time.perf_counter()
-            processor_began = time.process_time()
-            output.keep_up(standing, lambda *_: True)
-            sent = len(parcels)
-            until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
-            worked = time.process_time() - processor_began
-            seconds.append((sent, time.perf_counter() - began, worked))
-            for name in settled:
-                output.mark_accepted(name)
-            output.keep_up(standing, lambda *_: True)
-            link.close()
-            there.send(True)
-            received = there.recv()
-            assert len(received) - before == sent
-    oracle = DENM_PDU_Descriptions.DENM
-    invalid = 0
-    first: dict[int, tuple[float, float]] = {}
-    doubled = 0
-    last = dict[int, str | None]()
-    for body, _ in received:
-        oracle.from_uper(body)
-        invalid += oracle.to_uper() != body
-        denm = decode_denm(body)
-        doubled += first.setdefault(denm.sequence, denm.position) != denm.position
-        last[denm.sequence] = denm.termination
-    whole = [step for step in seconds if step[0] > events // 4]
-    rate = max(count / took for count, took, _ in whole)
-    processor_rate = max(count / worked for count, _, worked in whole)
+    transfers, received = _send_events(folder / "cits.json", events)
+    whole = [transfer for transfer in transfers if transfer.messages > events // 4]
+    rate = max(one.messages / one.seconds for one in whole)
+    processor_rate = max(one.messages / one.processor_s for one in whole)
     return [
-        Figure(
-            "denm.invalid",
-            float(invalid),
-            "messages that a second decoder does not write byte for byte",
-            0.0,
-        ),
-        Figure(
-            "denm.duplicated", float(doubled + len(first) - events), "events over restarts", 0.0
-        ),
-        Figure(
-            "denm.unterminated",
-            float(sum(end is None for end in last.values())),
-            "events over restarts",
-            0.0,
-        ),
-        Figure(
-            "denm.selector",
-            float(_selected_wrongly(received)),
-            "events of a quadTree selector",
-            0.0,
-        ),
+        *_check_received(received, events),
         Figure("denm.per_s", rate, "messages/s, encoded, sent and accepted", 2000.0, "more"),
         Figure(
             "denm.per_processor_s",
@@ -158,6 +99,83 @@ def measure_denm(folder: Path, quick: bool) -> list[Figure]:
             "times the general encoder's rate, in one run",
             3.0,
             "more",
+        ),
+    ]
+
+
+def _send_events(path: Path, events: int) -> tuple[list[Transfer], Received]:
+    """Send all events, changes of every second one, the ends of the first half and the ends of the
+    others. Each step uses a new gateway with the state file `path`. Return the transfers, and the
+    messages that the interchange received.
+    """
+    draw = np.random.default_rng(4202)
+    url = free_url()
+    path.unlink(missing_ok=True)
+    now = [START]
+    stretches = [_stretch(number, draw) for number in range(events)]
+    steps = [
+        stretches,
+        [replace(one, cells=one.cells + 1) if k % 2 else one for k, one in enumerate(stretches)],
+        stretches[events // 2 :],
+        [],
+    ]
+    transfers: list[Transfer] = []
+    received: Received = []
+    with separate_interchange(url) as there:
+        for standing in steps:
+            settled: list[str] = []
+            link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
+            until(lambda link=link: link.is_connected)  # type: ignore[misc]
+            parcels: list[Parcel] = []
+            send = partial(_count_and_send, parcels, link)
+            output = DenmOutput(STATION, Originator("SE", "SE00001"), path, send, lambda: now[0])
+            now[0] += NS
+            before = len(received)
+            began = time.perf_counter()
+            processor_began = time.process_time()
+            output.keep_up(standing, lambda *_: True)
+            sent = len(parcels)
+            until(lambda settled=settled, sent=sent: len(settled) >= sent)  # type: ignore[misc]
+            worked = time.process_time() - processor_began
+            transfers.append(Transfer(sent, time.perf_counter() - began, worked))
+            for name in settled:
+                output.mark_accepted(name)
+            output.keep_up(standing, lambda *_: True)
+            link.close()
+            there.send(True)
+            received = there.recv()
+            assert len(received) - before == sent
+    return transfers, received
+
+
+def _check_received(received: Received, events: int) -> list[Figure]:
+    """Return the figures about the received messages. A second decoder checks each message."""
+    from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
+
+    oracle = DENM_PDU_Descriptions.DENM
+    invalid = 0
+    first: dict[int, tuple[float, float]] = {}
+    doubled = 0
+    last: dict[int, str | None] = {}
+    for body, _ in received:
+        oracle.from_uper(body)
+        invalid += oracle.to_uper() != body
+        denm = decode_denm(body)
+        doubled += first.setdefault(denm.sequence, denm.position) != denm.position
+        last[denm.sequence] = denm.termination
+    unterminated = sum(end is None for end in last.values())
+    different = "messages that a second decoder does not write byte for byte"
+    return [
+        Figure("denm.invalid", float(invalid), different, 0.0),
+        Figure(
+            "denm.duplicated", float(doubled + len(first) - events), "events over restarts", 0.0
+        ),
+        Figure("denm.unterminated", float(unterminated), "events over restarts", 0.0),
+        Figure(
+            "denm.selector",
+            float(_selected_wrongly(received)),
+            "events of a quadTree selector",
+            0.0,
         ),
         Figure("denm.events", float(len(first)), "events", 100.0, "more"),
     ]
@@ -179,7 +197,7 @@ def _encode_speedup(bodies: list[bytes]) -> float:
     return (between - began) / (ended - between)
 
 
-def _selected_wrongly(received: list[tuple[bytes, dict[str, object]]]) -> int:
+def _selected_wrongly(received: Received) -> int:
     """Test the filter `quadTree LIKE '%,DIGITS%'` by which a receiver selects the events in a map
     square; DIGITS is the number of the square. Return the number of errors: events outside the
     square that it selects, or events inside that it omits.
