@@ -94,18 +94,7 @@ def make_publication(
         InputError: `before` is not a publication.
     """
     old = {} if before is None else _parse_records(before)
-    root = ET.Element(
-        _qualified_name("d2:payload"),
-        {
-            _qualified_name("xsi:type"): "sit:SituationPublication",
-            "lang": "en",
-            "modelBaseVersion": "3",
-        },
-    )
-    _add_text(root, "com:publicationTime", format_time(now))
-    creator = ET.SubElement(root, _qualified_name("com:publicationCreator"))
-    _add_text(creator, "com:country", supplier.country)
-    _add_text(creator, "com:nationalIdentifier", supplier.name)
+    root = _make_payload(supplier, now)
     written: set[str] = set()
     for alert in standing:
         known = alert.id if alert.id in old else _same_place(alert, old, written)
@@ -124,6 +113,27 @@ def make_publication(
         ended = _end_record(record, now) if _has_ended(record) or has_service(*place) else record
         if ended is not None:
             root.append(_make_situation(supplier, ended))
+    return _serialise_payload(root)
+
+
+def _make_payload(supplier: Supplier, now: int) -> ET.Element:
+    """Return a publication of the time `now` [ns UTC] without situations."""
+    root = ET.Element(
+        _qualified_name("d2:payload"),
+        {
+            _qualified_name("xsi:type"): "sit:SituationPublication",
+            "lang": "en",
+            "modelBaseVersion": "3",
+        },
+    )
+    _add_text(root, "com:publicationTime", format_time(now))
+    creator = ET.SubElement(root, _qualified_name("com:publicationCreator"))
+    _add_text(creator, "com:country", supplier.country)
+    _add_text(creator, "com:nationalIdentifier", supplier.name)
+    return root
+
+
+def _serialise_payload(root: ET.Element) -> bytes:
     ET.indent(root)
     text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
     # The payload's type needs this namespace even if there is no situation.
