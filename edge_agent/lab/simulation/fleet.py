@@ -180,6 +180,16 @@ def check_live_fleet(vehicles: int) -> None:
         )
 
 
+def _check_arguments(vehicles: int, rate_hz: float, rough: float, winter: float) -> None:
+    if vehicles < 1:
+        raise InputError("vehicles", f"{vehicles} vehicles cannot drive", "give a positive number")
+    if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+        raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
+    for name, share in (("rough", rough), ("winter", winter)):
+        if not 0.0 <= share <= 1.0:
+            raise InputError(name, f"{share} is not a share", "give a number from 0 to 1")
+
+
 class SimulatedFleet:
     """N vehicles on the roads of a scenario. A vehicle's drive depends only on its index and the
     other arguments, not on how many vehicles there are.
@@ -207,15 +217,7 @@ class SimulatedFleet:
         rough: float = 0.0,
         winter: float = 0.0,
     ) -> None:
-        if vehicles < 1:
-            raise InputError(
-                "vehicles", f"{vehicles} vehicles cannot drive", "give a positive number"
-            )
-        if not (math.isfinite(rate_hz) and rate_hz > 0.0):
-            raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
-        for name, share in (("rough", rough), ("winter", winter)):
-            if not 0.0 <= share <= 1.0:
-                raise InputError(name, f"{share} is not a share", "give a number from 0 to 1")
+        _check_arguments(vehicles, rate_hz, rough, winter)
         seed = checked_seed(seed)
         self.scenario = scenario_named(scenario)
         self.rate_hz = rate_hz
