@@ -24,7 +24,8 @@ from fleet_service.fusion.reported import Evidence, as_reported
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import refcount_free_locked
-from schemas.thresholds import EXCITED_SHARE, Z_95
+from schemas.signals import FLAGS
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU, Z_95
 
 # Half a standard deviation of the grip used. A bound is flat from the grip used minus this.
 _LESS: Final = 0.5 * constants.UTILISED_STD
@@ -54,6 +55,8 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
     If the sender gave no likelihood, the posterior is used as a friction value where `mu_utilised ≥
     0.6·mu`. If less grip was used, or if `mu` is absent, only the lower bound "μ is at least
     `mu_utilised`" is used. If `mu_utilised` is absent, the likelihood is flat.
+
+    A slide (`find_slides`) is a friction value, see `sliding_likelihood`.
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
@@ -65,8 +68,11 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
             for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
         )
         value = used >= EXCITED_SHARE * mu  # False where either is NaN
+        slides = find_slides(columns, with_likelihood)
         log_likelihood = np.where(
-            value[:, None], interval_likelihood(mu, lower, upper), at_least(used)
+            value[:, None],
+            interval_likelihood(mu, lower, upper),
+            np.where(slides[rest, None], sliding_likelihood(used), at_least(used)),
         )
         steps, reported[rest] = as_reported(mugrid.encode_log_likelihood(log_likelihood))
         out[rest] = bound_by_used(level_above_used(steps, used), used)
@@ -179,6 +185,42 @@ def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) ->
     above = _side_std(upper - mu)[:, None]
     distance = mugrid.CENTRES - np.nan_to_num(mu)[:, None]
     return -0.5 * np.square(distance / np.where(distance < 0, below, above))
+
+
+def sliding_likelihood(used: FloatArray) -> FloatArray:
+    """Return the log-likelihoods (n, 32) of visits in which a slip controller intervened at the
+    grip used u (n,). In simulated slides on ice, u was .67 to .92 of μ. So the 90 % interval is
+    from u to u/EXCITED_SHARE, and the median is u/SHARED_SHARE; the error of u is added.
+    """
+    error = Z_95 * np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
+    return interval_likelihood(used / constants.SHARED_SHARE, used - error, used / EXCITED_SHARE + error)
+
+
+def find_slides(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> BoolArray:
+    """Return a mask of visits (n,) whose slide is evidence of slippery road: a slip controller
+    intervened at little grip (`find_limited`), and the sender gave neither a likelihood nor a
+    value. Otherwise the likelihood or value already contains the slide, which must not count twice.
+    """
+    slides = find_limited(columns, columns["mu_utilised"]) & ~with_likelihood
+    if slides.any():
+        slides &= ~(columns["mu_utilised"] >= EXCITED_SHARE * columns["mu"])
+    return slides
+
+
+def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
+    """Return a mask (n,): True where ABS, ESC or traction control intervened although the grip used
+    was below the slippery limit.
+
+    `used` (n,) is first raised by one standard deviation of its error. An intervention at more grip
+    is not informative, because it also happens on dry road. A flag that is missing or unknown
+    counts as no intervention.
+    """
+    active = np.zeros(len(used), np.bool_)
+    for name in FLAGS:
+        if name in columns:
+            active |= columns[name] == 1
+    most = used + np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
+    return np.asarray(active & (most < SLIPPERY_MU))
 
 
 def _side_std(to_bound: FloatArray) -> FloatArray:

@@ -11,13 +11,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants
-from fleet_service.fusion.likelihoods import make_evidence, states_more_grip
+from fleet_service.fusion.likelihoods import (
+    find_limited,
+    find_slides,
+    make_evidence,
+    states_more_grip,
+)
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
-from schemas.signals import FLAGS
 from schemas.thresholds import MU_RANGE, SLIPPERY_MU, US_STEP
 from schemas.wire import MAX_ROWS
 
@@ -84,10 +87,13 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     """
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
+    limited = find_limited(columns, columns["mu_utilised"])
     steps, reported = make_evidence(columns, columns["with_likelihood"])
     used = np.where(
         np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"]
     )
+    # A sliding vehicle used all of the grip, so the error of the tyre curve does not apply.
+    used = np.where(find_slides(columns, columns["with_likelihood"]), SLIPPERY_MU, used)
     other, share = other_cells(
         columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
     )
@@ -105,25 +111,7 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         reported=reported,
         used=used,
         manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
-        limited=np.where(
-            find_limited(columns, columns["mu_utilised"]), 1, -1 * states_more_grip(columns, used)
-        ).astype(np.int8),
+        limited=np.where(limited, 1, -1 * states_more_grip(columns, used)).astype(np.int8),
         other=other,
         other_share=share,
     )
-
-
-def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> BoolArray:
-    """Return a mask (n,): True where ABS, ESC or traction control intervened although the grip used
-    was below the slippery limit.
-
-    `used` (n,) is first raised by one standard deviation of its error. An intervention at more grip
-    is not informative, because it also happens on dry road. A flag that is missing or unknown
-    counts as no intervention.
-    """
-    active = np.zeros(len(used), np.bool_)
-    for name in FLAGS:
-        if name in columns:
-            active |= columns[name] == 1
-    most = used + np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
-    return np.asarray(active & (most < SLIPPERY_MU))

@@ -1,6 +1,6 @@
 """Tests of the flags by which vehicles report that their slip controller acted. A flag may support
-an alert, but changes no friction belief. It counts only if the vehicle's earlier flags agreed with
-friction values of other vehicles.
+an alert if the vehicle's earlier flags agreed with friction values of other vehicles. It changes
+the belief only if the report contains neither a likelihood nor a value.
 """
 
 from __future__ import annotations
@@ -10,12 +10,23 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion, Observations
-from fleet_service.fusion.observations import find_limited
+from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.likelihoods import find_limited
 from fleet_service.fusion.store.records import Side
 from fleet_service.serve.alerts import Alerts
+from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray
-from tests.fleet_service.examples import CELL, at_least, belief, observations, value
+from tests.fleet_service.examples import (
+    CELL,
+    LATITUDE,
+    REGION,
+    START,
+    at_least,
+    belief,
+    observations,
+    slippery,
+    value,
+)
 
 ICY = 0.15
 FLAGGED = 1  # number of the vehicle with a working slip controller
@@ -100,3 +111,65 @@ def test_only_an_intervention_at_little_grip_counts(
 def test_unknown_use_is_no_intervention_at_little_grip() -> None:
     assert not find_limited({"esc_active": np.ones(1, np.int8)}, np.array([np.nan])).any()
     assert not find_limited({}, np.array([0.1])).any()
+
+
+def slides(
+    vehicle: int, seconds: float, *, active: bool = True, mu: float = np.nan
+) -> Observations:
+    """Return one observation of a vehicle that sends no likelihood: it used a grip of .12, and
+    `active` is the flag of its ABS. `mu` is the friction that it measured; NaN if it measured none.
+    """
+    numbers = {
+        "leave_time": START + int(seconds * 1e9),
+        "cell": CELL,
+        "sector": 0,
+        "boot": vehicle + 1,
+        "region": REGION,
+        "seq": int(seconds) + 1,
+        "row": 0,
+    }
+    floats = {
+        "latitude": LATITUDE,
+        "yaw": 0.0,
+        "position_std": 1.5,
+        "mu": mu,
+        "mu_lower": mu - 0.1,
+        "mu_upper": mu + 0.1,
+        "mu_utilised": 0.12 if np.isnan(mu) else 0.9 * mu,
+        "used_longitudinal": np.nan,
+        "used_lateral": np.nan,
+    }
+    columns = {name: np.array([number]) for name, number in (numbers | floats).items()}
+    columns["abs_active"] = np.array([active], np.int8)
+    columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
+    columns["with_likelihood"] = np.array([False])
+    return observations_of(columns, np.array([vehicle]))
+
+
+def raises_alert(parts: list[Observations]) -> bool:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    return any(alert.raised for part in parts for alert in alerts.update(fusion.update(part).slots))
+
+
+def test_slides_of_vehicles_without_values_raise_an_alert() -> None:
+    assert raises_alert([slides(k, 60.0 * k) for k in range(2)])
+    assert not raises_alert([slides(k, 60.0 * k, active=False) for k in range(40)])
+
+
+def test_slides_of_one_vehicle_alone_raise_no_alert() -> None:
+    assert not raises_alert([slides(1, 60.0 * k) for k in range(40)])
+
+
+def test_slides_on_a_road_with_measured_grip_raise_no_alert() -> None:
+    gripping = [slides(10 + k, 30.0 * k, mu=0.8, active=False) for k in range(6)]
+    assert not raises_alert([*gripping, slides(1, 200.0), slides(2, 260.0)])
+
+
+def test_slide_limits_friction_from_above_but_not_to_one_number() -> None:
+    fusion = Fusion(120.0)
+    fusion.update(slides(1, 0.0))
+    assert slippery(belief(fusion)) > 0.6
+    evidence = slides(1, 0.0).evidence[0]
+    near = np.interp([0.13, 0.18], mugrid.CENTRES, evidence / mugrid.STEPS_PER_NAT)
+    assert (near < 1.0).all()
