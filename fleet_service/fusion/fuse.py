@@ -11,17 +11,17 @@ and not on the time of its arrival.
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from fleet_service.fusion import constants
 from fleet_service.fusion.belief_map import BeliefMap
-from fleet_service.fusion.late import LATE_MOST_NS, delay_observations, fused_at
+from fleet_service.fusion.late import LATE_MOST_NS, fused_at
 from fleet_service.fusion.observations import Observations
 from fleet_service.fusion.shared import shared_parts
-from fleet_service.fusion.store.records import CLAIMED, HEEDED, UNLIMITED, USED
+from fleet_service.fusion.store.records import CLAIMED, HEEDED, LATE_NS, UNLIMITED, USED
 from fleet_service.fusion.store.store import Store, distinct_values
 from fleet_service.fusion.trust import compute_vote_weights, initial_trust, shape_of
 from fleet_service.fusion.vote_weights import VoteWeights, initial_vote_weights
@@ -76,7 +76,7 @@ class Fusion(BeliefMap):
 
     Args:
         lateness_s: allowed lateness L [s]; an observation older than the checkpoint (latest time -
-            L) is late, and is fused with an aged (less certain) likelihood.
+            L) is late, and may be fused with an aged (less certain) likelihood.
         enrolled: True if the service accepts only vehicles on the operator's list. Then nobody can
             invent a name, so a vehicle without a history has full weight (`trust.initial_trust`).
 
@@ -141,7 +141,7 @@ class Fusion(BeliefMap):
         """Fuse observations in any order and return the outcome for each.
 
         A late observation is fused at the checkpoint (the time before which observations are
-        final), with its likelihood aged to that time (`late.aged_evidence`).
+        final), as a report of the time of its visit (`late`).
 
         Args:
             observations: n observations.
@@ -157,12 +157,12 @@ class Fusion(BeliefMap):
             most_waiting = _ANY
         delayed = late_by > 0
         if delayed.any():
-            observations = delay_observations(observations, late_by, self._weather)
+            observations = replace(observations, time=observations.time + late_by)
         left_out = late & ~delayed
         vehicle = self.store.vehicles_of(observations.vehicle)
         epoch = observations.time // constants.EPOCH_NS
         # The loop writes weight and flags of one epoch after the other into these arrays.
-        arrivals = _make_arrivals(observations, vehicle, delayed)
+        arrivals = _make_arrivals(observations, vehicle, late_by)
         touched = [np.zeros(0, np.int64)]
         for current in distinct_values(epoch[~left_out]).tolist():
             self._advance(current)
@@ -292,8 +292,9 @@ def _find_late(time: IntArray, checkpoint: int | None) -> tuple[BoolArray, IntAr
     return late, late_by
 
 
-def _make_arrivals(observations: Observations, vehicle: IntArray, delayed: BoolArray) -> Arrivals:
-    """Return the columns of n observations that the windows store. Weights are 0, and reports of an
+def _make_arrivals(observations: Observations, vehicle: IntArray, late_by: IntArray) -> Arrivals:
+    """Return the columns of n observations that the windows store; `late_by` (n,) is their delay
+    [ns]. Weights are 0, and reports of an
     intervention (`limited`) are not marked as heeded or claimed yet.
     """
     n = len(observations.time)
@@ -309,7 +310,7 @@ def _make_arrivals(observations: Observations, vehicle: IntArray, delayed: BoolA
         used=(np.clip(observations.used, 0.0, 2.5) * USED).astype(np.uint8),
         shared=shared_parts(observations.reported),
         manoeuvre=observations.manoeuvre,
-        late=delayed,
+        late=(-(-late_by // LATE_NS)).astype(np.uint8),
         limited=np.where(observations.limited < 0, np.int8(UNLIMITED), np.int8(0)),
     )
 

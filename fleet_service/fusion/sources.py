@@ -14,7 +14,8 @@ from schemas.thresholds import NS
 @refcount_free
 def note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time: int) -> None:
     """Record that a vehicle reported ice or grip (`side`) in a cell at the time `time` [ns]. The
-    record replaces the vehicle's earlier one, or else the oldest one in the cell's list.
+    record replaces the vehicle's earlier one, or else the oldest one in the cell's list. A record
+    never replaces a newer one.
     """
     source = reporters[row].source
     source_time = reporters[row].source_time
@@ -25,6 +26,8 @@ def note_source(reporters: RecordArray, row: int, side: Side, vehicle: int, time
             break
         if source_time[side, k] < source_time[side, place]:
             place = k
+    if time // NS < source_time[side, place]:
+        return
     source[side, place] = vehicle
     source_time[side, place] = time // NS
 

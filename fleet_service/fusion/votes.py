@@ -33,6 +33,7 @@ from fleet_service.fusion.store.records import (
     AGED,
     FINE,
     HEEDED,
+    LATE_NS,
     NONE,
     UNLIMITED,
     UNTRUSTED,
@@ -66,6 +67,7 @@ class ScratchRow(IntEnum):
 _GRIP_MEAN: Final = 0.5 * (EXCITED_SHARE + mugrid.UPPER)
 _GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, SLIPPERY_MU))  # first bin above SLIPPERY_MU
 _WITNESS_SLOPE: Final = UNKNOWN_SHAPE.alarm
+_UNIFORM: Final = np.ones(mugrid.BINS, np.float32)  # likelihood of mean 1 that says nothing
 # probability of a value by grip used, in units of 1/USED, and friction bin (256, 32)
 _VALUE_PROBABILITY: Final = value_probability(
     np.arange(np.iinfo(np.uint8).max + 1)[:, None] / USED / mugrid.CENTRES
@@ -257,16 +259,21 @@ def update_cell(
     """
     row, sources = place
     cells = rows.cells
-    time = entries[entry].time
+    time = entries[entry].time - entries[entry].late * LATE_NS
     is_value = entries[entry].kind == ReportKind.VALUE
     is_new = cells[row].time == 0
+    is_outdated = time < cells[row].time
     p = scratch[ScratchRow.BELIEF]
     unpack_belief(rows.belief, row, p)
-    change, prior = _age_belief(cells, row, time, weather, scratch)
-    weight = _reduce_untrusted(cells, row, entries, entry)
+    change, prior = 0.0, 0
+    if is_outdated:
+        _age_likelihood(scratch, weather, cells[row].key, time, cells[row].time)
+    else:
+        change, prior = _age_belief(cells, row, time, weather, scratch)
+    weight = _limited_weight(cells, row, entries, entry, is_outdated)
     strength = weight * entries[entry].power * entries[entry].share
     if is_value:
-        if not is_new:
+        if not is_new and not is_outdated:
             ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
         certainty = min(
             (1.0 - constants.CONTAMINATION) * strength, 1.0 - constants.CONTAMINATION_LEAST
@@ -275,7 +282,7 @@ def update_cell(
     else:
         certainty = (1.0 - constants.BOUND_CONTAMINATION) * min(strength, 1.0)
         apply_vote(p, scratch[ScratchRow.LIKELIHOOD], certainty)
-        if entries[entry].limited <= 0:
+        if entries[entry].limited <= 0 and not is_outdated:
             values = float(cells[row].values)
             noticed = values / (float(cells[row].visits) + 1.0)  # this visit included
             note_silence(p, constants.SILENCE * min(noticed * strength, 1.0), weather.prior[prior])
@@ -283,14 +290,14 @@ def update_cell(
                 doubted = (1.0 - constants.BOUND_CONTAMINATION) * min(values, 1.0)
                 note_silent_use(p, int(entries[entry].used), doubted * min(strength, 1.0))
     pack_belief(p, rows.belief, row)
-    cells[row].time = time
+    cells[row].time = max(time, cells[row].time)
     _count_visit(cells, row, entries, entry)
     if is_value:
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
-    if weight * entries[entry].share >= constants.SOURCE_TRUST:
-        _note_source(rows, sources, entries, entry)
+    if entries[entry].weight * entries[entry].share >= constants.SOURCE_TRUST:
+        _note_source(rows, sources, entries, entry, time)
 
 
 @refcount_free_inlined
@@ -312,8 +319,7 @@ def _age_belief(
         if initial:
             mix_prior(p, 1.0, weather.prior[initial])
     else:
-        passed = (time - cells[row].time) * 1e-9
-        seconds = max(passed, 0.0) + cells[row].aged / AGED
+        seconds = (time - cells[row].time) * 1e-9 + cells[row].aged / AGED
         fade_weights(cells, row, cells[row].time, time)
     if seconds < constants.FORGET_S:
         cells[row].aged = _remembered_parts(seconds)
@@ -325,12 +331,13 @@ def _age_belief(
 
 
 @refcount_free_inlined
-def _note_source(rows: Rows, sources: int, entries: RecordArray, entry: int) -> None:
-    """Record the vehicle of an observation (row `entry`) in the cell's list of vehicles that
-    reported ice or grip (row `sources`), if the observation shows either clearly.
+def _note_source(
+    rows: Rows, sources: int, entries: RecordArray, entry: int, time: int
+) -> None:
+    """Record the vehicle of an observation (row `entry`) of the visit at `time` [ns] in the cell's
+    list of vehicles that reported ice or grip (row `sources`), if it shows either clearly.
     """
     vehicle = entries[entry].vehicle
-    time = entries[entry].time
     if is_ice_source(entries, entry):
         note_source(rows.reporters, sources, Side.ICE, vehicle, time)
     elif entries[entry].slippery <= 1.0 - constants.SOURCE_SHARE:
@@ -490,19 +497,37 @@ def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int)
 
 
 @refcount_free_inlined
-def _reduce_untrusted(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> float:
-    """Return the weight in [0, 1] of the vehicle that made an observation (row `entry`) in a cell,
-    and count its vote if the vehicle is untrusted. The k-th untrusted vehicle of a cell counts
-    1/k², so all together count at most 1.6 votes. The weight of a trusted vehicle is unchanged.
+def _limited_weight(
+    cells: RecordArray, row: int, entries: RecordArray, entry: int, is_outdated: bool
+) -> float:
+    """Return the weight in [0, 1] of an observation (row `entry`) in a cell. It is reduced, and the
+    vote is counted, if the vehicle is untrusted or the visit is older than the cell's last one
+    (`is_outdated`). The k-th vote of these two sorts counts 1/k², so all together count at most 1.6
+    votes.
 
-    Therefore an attacker gains nothing from many new names. Repeated votes of one vehicle are
-    already discounted by `power` (share of new information).
+    Therefore an attacker gains nothing from many new names. And many old reports do not overrule
+    the few of the road as it is now, because one change of the road makes all of them wrong.
+    Repeated votes of one vehicle are already discounted by `power` (share of new information).
     """
     weight = float(entries[entry].weight)
-    if not 0.0 < weight < constants.SOURCE_TRUST:
+    if not is_outdated and not 0.0 < weight < constants.SOURCE_TRUST:
         return weight
     kind = int(entries[entry].kind)
     power = float(entries[entry].power)
     others = np.float32(cells[row].untrusted[kind] / UNTRUSTED)
     cells[row].untrusted[kind] = np.uint16(min(float(others + power) * UNTRUSTED + 0.5, 65535.0))
     return weight / float((np.float32(1.0) + others) ** 2)
+
+
+@refcount_free_inlined
+def _age_likelihood(scratch: Bins, weather: Weather, key: int, begin: int, end: int) -> None:
+    """Age the likelihood in `scratch`, which is about the road at the time `begin` [ns], to the
+    time `end` of the belief: the road may have changed between them.
+
+    The model of a changing road is a Markov chain: a diffusion with reflecting ends, and sudden
+    changes to any friction. The chain is reversible, so a likelihood ages like a belief.
+    """
+    drift, change, _ = road_time(weather, key, begin, end)
+    likelihood = scratch[ScratchRow.LIKELIHOOD]
+    forget(likelihood, drift, change, _UNIFORM, scratch[ScratchRow.PADDED])
+    _clear_padding(scratch)

@@ -68,7 +68,7 @@ class Arrivals(NamedTuple):
     used: ByteArray
     shared: ByteArray
     manoeuvre: NDArray[np.int8]
-    late: BoolArray
+    late: ByteArray
     limited: NDArray[np.int8]
 
 

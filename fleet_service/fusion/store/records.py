@@ -32,7 +32,7 @@ from fleet_service.fusion.belief import PackedArray
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.records import RecordArray, record_type
-from schemas.thresholds import UNKNOWN
+from schemas.thresholds import NS, UNKNOWN
 
 NONE: Final = UNKNOWN  # no row, no vehicle, or no known kind of manoeuvre
 
@@ -66,6 +66,7 @@ USED: Final = 100.0
 SHARED: Final = 400.0
 WEIGHT: Final = 16.0
 UNTRUSTED: Final = 64.0
+LATE_NS: Final = 60 * NS  # [ns] unit of the age of a late report
 # Intervention of a slip controller: none; reported by a vehicle whose interventions often disagree
 # with values of others; reported by a vehicle whose interventions usually agree.
 UNLIMITED, _NO_FLAG, CLAIMED, HEEDED = range(-1, 3)
@@ -142,7 +143,7 @@ class EntryRecord:
         spent: votes that the vehicle has used up in this cell up to this entry, in units of
             1/FINE; a report with `power` 1 uses up one vote. The number decreases with time, and a
             vehicle has at most VOTES.
-        time: end of the visit [ns].
+        time: end of the visit [ns]; for a late observation, a time directly after the checkpoint.
         weight: trust in the vehicle, see `vote_weights`; about 0 to 1.
         share: P(the vehicle was in this cell), 0 to 1; below 1 if its position is inaccurate.
         power: share, 0 to 1, of the observation that is new information after the vehicle's earlier
@@ -157,8 +158,9 @@ class EntryRecord:
         shared: relative error that the value has in common with values of other vehicles, see
             `shared.shared_parts`; in units of 1/SHARED.
         manoeuvre: kind of manoeuvre, see `shared.manoeuvre_of`.
-        late: 1 if the observation arrived after the checkpoint had passed its time; it is then
-            compared with no other vehicle.
+        late: time from the visit to `time`, in units of LATE_NS, of an observation that arrived
+            after the checkpoint had passed the visit; it is then compared with no other vehicle. 0
+            for other observations.
         limited: CLAIMED if a slip controller (ABS, ESC, traction control) intervened below the
             slippery limit; HEEDED if in addition the vehicle's earlier interventions agreed with
             other vehicles; UNLIMITED if the vehicle states that it did not use all of the road's
@@ -190,7 +192,7 @@ class EntryRecord:
     used: np.uint8
     shared: np.uint8
     manoeuvre: np.int8
-    late: np.int8
+    late: np.uint8
     limited: np.int8
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion, Updated, constants
 from fleet_service.fusion.fuse import RecordedResult
+from fleet_service.serve.alerts import Alerts
 from tests.fleet_service.examples import CELL, START, belief, observations, slippery, value
 from tests.fleet_service.fusion.test_order import difference, drive
 
@@ -43,6 +44,47 @@ def test_late_visit_to_an_unvisited_cell_counts_as_if_in_time() -> None:
         found.append(belief(fusion, now=START + 3600 * 10**9))
     assert 0.5 < slippery(found[0]) < 0.95
     np.testing.assert_allclose(found[0], found[1], atol=0.02)
+
+
+def judge_after_backlog(present: float, past: float) -> tuple[float, bool]:
+    """Let two vehicles report the friction `present` of a cell, and then let the reports of twelve
+    other vehicles arrive that measured `past` there 20 to 55 minutes earlier. Return P(slippery) of
+    the cell, and True if it has an alert.
+    """
+    fusion = Fusion(120.0, enrolled=True)
+    alerts = Alerts(fusion)
+    new = observations([3300.0, 3320.0], [1, 2], value([present, present]))
+    who = 10 + np.arange(12)
+    old = observations(180.0 * np.arange(12), who, value(np.full(12, past)))
+    for part in (new, LIVE, old):
+        updated = fusion.update(part)
+        alerts.update(updated.slots)
+    assert updated.late.all()
+    found = belief(fusion, now=START + 3600 * 10**9)
+    return slippery(found), bool(alerts.standing_alerts)
+
+
+def test_backlog_of_dry_road_does_not_hide_the_ice_of_now() -> None:
+    probability, has_alert = judge_after_backlog(present=0.15, past=0.8)
+    assert probability > 0.8
+    assert has_alert
+
+
+def test_backlog_of_ice_does_not_hide_the_grip_of_now() -> None:
+    probability, has_alert = judge_after_backlog(present=0.8, past=0.15)
+    assert probability < 0.2
+    assert not has_alert
+
+
+def test_late_reports_of_ice_raise_an_alert_at_the_time_of_the_visits() -> None:
+    for mu in (0.15, 0.8):
+        fusion = Fusion(120.0, enrolled=True)
+        fusion.update(LIVE)
+        updated = fusion.update(observations([3000.0, 3060.0], [1, 2], value([mu, mu])))
+        assert updated.late.all()
+        raised = Alerts(fusion).update(updated.slots)
+        assert len(raised) == (mu < 0.4)
+        assert all(START + 2990 * 10**9 < alert.time <= START + 3060 * 10**9 for alert in raised)
 
 
 def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> None:
