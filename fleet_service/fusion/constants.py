@@ -183,8 +183,8 @@ VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same 
 NOISE_DROP_STEPS: Final = VALUE_DROP_STEPS // 2
 # Number of cells on each side that may get a part. A position that is less accurate has no use.
 SPREAD_CELLS: Final = 2
-# A vote counts as a visit to a cell, and is compared with other vehicles there, only if the vehicle
-# was in this cell with at least this probability.
+# A vote counts as a visit to a cell only if the vehicle was in this cell with at least this
+# probability.
 HERE_SHARE: Final = 0.5
 
 # --- Trust: comparison of values of different vehicles in the same cell ---

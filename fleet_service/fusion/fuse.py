@@ -270,11 +270,11 @@ class Fusion(BeliefMap):
         """
         # Sort by time, so that no row of the batch makes the belief after another one stale.
         rows = rows[np.argsort(observations.time[rows], kind="stable")]
-        at, keys, share = _spread_votes(observations, rows)
+        at, keys, share, is_own = _spread_votes(observations, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
         return slots, absorb_votes(
-            self.store.state, self._weather, arrivals, Votes(at, slots, share, most_waiting)
+            self.store.state, self._weather, arrivals, Votes(at, slots, share, is_own, most_waiting)
         )
 
 
@@ -324,10 +324,10 @@ def voted_keys(observations: Observations) -> IntArray:
 
 def _spread_votes(
     observations: Observations, rows: IntArray
-) -> tuple[IntArray, IntArray, Float32Array]:
+) -> tuple[IntArray, IntArray, Float32Array, BoolArray]:
     """Return the votes of the selected observations, sorted by time. A vote is the effect of one
-    observation on one cell and heading sector. The three arrays contain the row of the observation,
-    the key (cell · 4 + sector), and P(the vehicle was in this cell).
+    observation on one cell and heading sector. The four arrays contain the row of the observation,
+    the key (cell · 4 + sector), P(the vehicle was in this cell), and True for the reported cell.
 
     Besides its own cell and sector, an observation may affect a second sector and neighbouring
     cells.
@@ -351,11 +351,13 @@ def _spread_votes(
         )
         share.append(observations.other_share[rows[elsewhere], which])
     whole = np.concatenate(at)
+    is_own = np.arange(len(whole)) < len(rows) + len(second)
     order = np.argsort(observations.time[whole], kind="stable") if len(at) > 1 else slice(None)
     return (
         whole[order],
         np.concatenate(keys)[order],
         np.concatenate(share)[order].astype(np.float32),
+        is_own[order],
     )
 
 

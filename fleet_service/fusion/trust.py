@@ -86,7 +86,7 @@ def compare_reports(
         entries: observations (`EntryRecord`).
         entry: row of the new value in `entries`.
     """
-    if entries[entry].share < constants.HERE_SHARE or entries[entry].late:
+    if not entries[entry].own or entries[entry].late:
         return
     here = reporters[row]
     vehicle = int(entries[entry].vehicle)
@@ -188,7 +188,7 @@ def judge_flag(
     from SLIPPERY. The vehicle's own value of the same visit is not a confirmation, because the flag
     and the value come from the same slip.
     """
-    if entries[entry].share < constants.HERE_SHARE or entries[entry].late:
+    if not entries[entry].own or entries[entry].late:
         return
     here = reporters[row]
     vehicle = int(entries[entry].vehicle)

@@ -296,7 +296,7 @@ def update_cell(
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
-    if entries[entry].weight * entries[entry].share >= constants.SOURCE_TRUST:
+    if entries[entry].weight >= constants.SOURCE_TRUST and entries[entry].own:
         _note_source(rows, sources, entries, entry, time)
 
 

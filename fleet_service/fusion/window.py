@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import PADDED, Bins, ReportKind
 from fleet_service.fusion.store.cells import copy_row, copy_sources
 from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pair, pair_of
@@ -74,7 +75,8 @@ class Arrivals(NamedTuple):
 
 class Votes(NamedTuple):
     """Votes of a batch, arrays of shape (k,). A vote is the effect of one observation on one cell:
-    row of the observation, slot (cell and heading sector), and P(the vehicle was in this cell).
+    row of the observation, slot (cell and heading sector), P(the vehicle was in this cell), and
+    True for the reported cell.
 
     Among the votes of one observation, the vote for its own cell comes first. At most `most`
     observations of a vehicle may wait in one cell.
@@ -83,6 +85,7 @@ class Votes(NamedTuple):
     row: IntArray
     slot: IntArray
     share: Float32Array
+    is_own: BoolArray
     most: int
 
 
@@ -152,6 +155,7 @@ def _absorb_votes(
         entry = _fill_entry(state, arrivals, row)
         new = entries[entry]
         new.share = votes.share[k]
+        new.own = votes.is_own[k] and new.share >= c.SPREAD_LEAST
         describe_vote(entries, entry, arrivals.reported[row], scratch)
         window = int(cells[slot].window)
         if window == NONE:

@@ -165,6 +165,7 @@ class EntryRecord:
             slippery limit; HEEDED if in addition the vehicle's earlier interventions agreed with
             other vehicles; UNLIMITED if the vehicle states that it did not use all of the road's
             grip (`likelihoods.states_more_grip`); else 0.
+        own: 1 in the cell that the vehicle reported, 0 in other cells in which it may have been.
     """
 
     previous: np.int32
@@ -194,6 +195,7 @@ class EntryRecord:
     manoeuvre: np.int8
     late: np.uint8
     limited: np.int8
+    own: np.int8
 
 
 class WindowRecord:

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion, space
+from fleet_service.serve.alerts import Alerts
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from tests.fleet_service.examples import CELL, LATITUDE, observations, value
@@ -112,3 +113,33 @@ def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
     assert fusion.live.vehicles[slots].tolist() == fusion.live.visits[slots].tolist() == [1, 0]
     # A new vehicle's weight is 0.75.
     assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)
+
+
+def drive_inaccurately(mu: dict[int, float]) -> tuple[Fusion, bool]:
+    """Let 12 vehicles pass three cells three times. Each measures its friction `mu` (number of the
+    vehicle: friction), with a position error of 15 m. Return the fusion, and True if there was an
+    alert.
+    """
+    fusion = Fusion(120.0, enrolled=True)
+    alerts = Alerts(fusion)
+    was_raised = False
+    x, y = grid.deinterleave(CELL)
+    for k in range(36):
+        row = int(grid.interleave(x + k % 3, y))
+        cells, share = spread(15.0, 0.0, row)
+        o = observations([40.0 * k], [k // 3], value([mu[k // 3]]), cell=row)
+        o = dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32))
+        was_raised |= any(alert.raised for alert in alerts.update(fusion.update(o).slots))
+    fusion.update(observations([2000.0, 2100.0], [50, 50], value([0.8, 0.8]), cell=CELL + 4000))
+    return fusion, was_raised
+
+
+def test_vehicles_with_poor_positions_find_ice_and_raise_no_alert_on_grip() -> None:
+    assert drive_inaccurately(dict.fromkeys(range(12), 0.15))[1]
+    assert not drive_inaccurately(dict.fromkeys(range(12), 0.8))[1]
+
+
+def test_wrong_values_cost_trust_also_with_poor_positions() -> None:
+    fusion, was_raised = drive_inaccurately(dict.fromkeys(range(12), 0.8) | {4: 0.15})
+    assert not was_raised
+    assert fusion.trust(4) < 0.5 < 0.8 < fusion.trust(7)
