@@ -193,7 +193,8 @@ def sliding_likelihood(used: FloatArray) -> FloatArray:
     from u to u/EXCITED_SHARE, and the median is u/SHARED_SHARE; the error of u is added.
     """
     error = Z_95 * np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
-    return interval_likelihood(used / constants.SHARED_SHARE, used - error, used / EXCITED_SHARE + error)
+    lower, upper = used - error, used / EXCITED_SHARE + error
+    return interval_likelihood(used / constants.SHARED_SHARE, lower, upper)
 
 
 def find_slides(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> BoolArray:

@@ -74,8 +74,8 @@ def compare_reports(
 ) -> None:
     """Compare a vehicle's friction value with the recent values of other vehicles in the cell, and
     record how well each pair of vehicles agrees. Then store the value in the place of the vehicle's
-    earlier value, or else of the oldest value. Do nothing if the value is late or probably belongs
-    to another cell.
+    earlier value, or else of the oldest value. Do nothing if the value is late, or if the vehicle
+    reported another cell: a vehicle with inaccurate positions is compared where it says it was.
 
     Args:
         reporters: recent values of each cell (`ReportersRecord`).

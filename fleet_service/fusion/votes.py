@@ -331,9 +331,7 @@ def _age_belief(
 
 
 @refcount_free_inlined
-def _note_source(
-    rows: Rows, sources: int, entries: RecordArray, entry: int, time: int
-) -> None:
+def _note_source(rows: Rows, sources: int, entries: RecordArray, entry: int, time: int) -> None:
     """Record the vehicle of an observation (row `entry`) of the visit at `time` [ns] in the cell's
     list of vehicles that reported ice or grip (row `sources`), if it shows either clearly.
     """
