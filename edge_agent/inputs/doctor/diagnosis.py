@@ -61,6 +61,10 @@ class Diagnosis:
         """Return True if the check found every channel to be free of faults."""
         return not self.findings and not self.unknown
 
+    def faulty_channels(self) -> set[str]:
+        """Return the channels and devices that have a fault."""
+        return {finding.channel for finding in self.findings}
+
     def list_channel(self, channel: str, *, is_sound: bool) -> None:
         """Add a channel to `sound`, or to `unknown` if `is_sound` is False."""
         listed = self.sound if is_sound else self.unknown

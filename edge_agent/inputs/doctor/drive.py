@@ -58,6 +58,7 @@ class EvenDrive:
     v: FloatArray
     r_wheels: FloatArray
     v_ground: FloatArray
+    v_positions: FloatArray  # speed over ground from positions alone [m/s]
     course: FloatArray
     course_yaw: FloatArray  # yaw angle of the log at the same times, not smoothed [rad]
     # 1 where the car moves and no wheel slips relative to the other wheels, else 0
@@ -262,7 +263,8 @@ def prepare_drive(
     place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
     located = np.isfinite(place[0]).sum() > 5
     missing = np.full(len(at), np.nan)
-    v_ground, course = over_ground(even, *place) if located else (missing, missing)
+    v_positions, course = over_ground(even, *place) if located else (missing, missing)
+    v_ground = v_positions
     if ground is not None and np.isfinite(ground).sum() > 5:
         v_ground = even.smooth_channel(ground)
     yaw = signals[:, S.YAW]
@@ -282,6 +284,7 @@ def prepare_drive(
         v=v,
         r_wheels=r_wheels,
         v_ground=v_ground,
+        v_positions=v_positions,
         course=course,
         course_yaw=yaw_at,
         moving=((np.abs(v) > CREEP * fast) & ~is_slipping(raw, fast)).astype(float),

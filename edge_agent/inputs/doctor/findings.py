@@ -28,7 +28,11 @@ from edge_agent.inputs.doctor.drive import (
 from edge_agent.inputs.doctor.identities import fit_identities
 from edge_agent.inputs.doctor.lift import is_on_lift
 from edge_agent.inputs.doctor.offset_faults import find_offsets, find_radii
-from edge_agent.inputs.doctor.places import has_exchanged_position, yaw_findings
+from edge_agent.inputs.doctor.places import (
+    has_exchanged_position,
+    position_findings,
+    yaw_findings,
+)
 from edge_agent.inputs.doctor.scale_faults import CHANNELS_OF, find_receiver_scale, find_scales
 from edge_agent.inputs.doctor.scales import Verdict, explain_fits
 from edge_agent.inputs.doctor.slip import (
@@ -80,6 +84,7 @@ def diagnose(
     has_wrong_unit = any(fault is not None for fault in verdict.faults.values())
     if not find_late_clocks(diagnosis) and not has_wrong_unit:
         measure_clocks(t, signals, vehicle, diagnosis)
+    diagnosis.findings += position_findings(signals, drive)
     diagnosis.findings += yaw_findings(signals, drive)
     if not has_wrong_unit:
         diagnosis.findings += find_radii(drive, vehicle, diagnosis.doubts)
@@ -140,7 +145,7 @@ def _find_exchanged_ends(
 
 def _list_sound_channels(verdict: Verdict, diagnosis: Diagnosis) -> None:
     """List each channel without a finding as sound or as unknown in the diagnosis."""
-    faulty = {finding.channel for finding in diagnosis.findings}
+    faulty = diagnosis.faulty_channels()
     for quantity, channel in CHANNELS_OF.items():
         if channel not in faulty:
             is_sound = verdict.is_settled(quantity) and quantity not in diagnosis.doubts
@@ -155,9 +160,10 @@ def _judge_receiver(
     """
     fit = diagnosis.fits["ground"]
     has_speed = ground is not None and np.isfinite(ground).any()
-    diagnosis.findings += find_receiver_scale(GROUND if has_speed else "latitude", verdict, fit)
-    faulty = {finding.channel for finding in diagnosis.findings}
-    if np.isfinite(signals[:, S.LATITUDE]).any() and not faulty & {"latitude", "yaw", GROUND}:
+    if diagnosis.faulty_channels().isdisjoint(("latitude", "longitude")):
+        diagnosis.findings += find_receiver_scale(GROUND if has_speed else "latitude", verdict, fit)
+    is_faulty = diagnosis.faulty_channels() & {"latitude", "longitude", "yaw", GROUND}
+    if np.isfinite(signals[:, S.LATITUDE]).any() and not is_faulty:
         diagnosis.list_channel("latitude", is_sound=fit.is_known)
 
 

@@ -1,5 +1,5 @@
-"""Faults of position and heading: exchanged latitude and longitude, or a compass angle in place of
-yaw.
+"""Faults of position and heading: positions in a wrong unit, exchanged latitude and longitude, or a
+compass angle in place of yaw.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ LEAST_TURN: Final = 0.5
 # Exchanging latitude and longitude must reduce the spread of ground speed over wheel speed to this
 # share.
 STEADIER: Final = 0.5
+STRAY: Final = 0.01  # largest share of positions out of range that counts as errors of transmission
+# Largest |ln| of the ratio between the speed from positions and that of receiver or wheels.
+PLACES_AGREE: Final = 0.4
 # Angles that a log may contain in place of yaw [rad, counter-clockwise from east], each with its
 # conversion to yaw.
 COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
@@ -31,6 +34,30 @@ COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
     "compass, deg": lambda yaw: np.pi / 2.0 - np.radians(yaw),
     "sign": lambda yaw: -yaw,
 }
+
+
+def position_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
+    """Return findings (reported faults) about positions outside the degrees of the globe, or that
+    move neither at the speed that the receiver reports nor at that of the wheels.
+    """
+    findings = []
+    for channel, index, limit in (("latitude", S.LATITUDE, 90), ("longitude", S.LONGITUDE, 180)):
+        size = np.abs(signals[:, index])
+        known = size[np.isfinite(size)]
+        if len(known) and np.mean(known > limit) > STRAY:
+            words = f"reaches {known.max():.6g}, beyond {limit} deg: its unit?"
+            findings.append(Finding(channel, "range", words))
+    moves = np.isfinite(drive.v_positions) & (np.abs(drive.v) > CREEP * drive.fast)
+    if findings or moves.sum() < FEWEST:
+        return findings
+    ratios = [
+        float(np.nanmedian(drive.v_positions[moves] / np.maximum(np.abs(other[moves]), 1e-3)))
+        for other in (drive.v_ground, drive.v)
+    ]
+    if min(abs(np.log(max(ratio, 1e-9))) for ratio in ratios) > PLACES_AGREE:
+        words = f"positions move {ratios[0]:.3g} times as fast as the receiver reports: their unit?"
+        findings.append(Finding("latitude", "scale", words))
+    return findings
 
 
 def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:

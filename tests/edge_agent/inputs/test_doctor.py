@@ -173,7 +173,13 @@ def test_positions_in_another_unit_are_a_fault(rough: Recorded, unit: float) -> 
     signals = rough.signals.copy()
     signals[:, S.LATITUDE : S.LONGITUDE + 1] *= unit
     said = diagnose(rough.t, signals, rough.vehicle)
-    assert [(one.channel, one.kind) for one in said.findings] == [("latitude", "scale")]
+    is_beyond = unit > 1.0
+    kind = "range" if is_beyond else "scale"
+    assert (said.findings[0].channel, said.findings[0].kind) == ("latitude", kind)
+    assert len(said.findings) == 1 + is_beyond
+    even = prepare_drive(*rough)
+    ground = np.interp(rough.t, even.t, np.nan_to_num(even.v))
+    assert diagnose(rough.t, signals, rough.vehicle, ground).findings[0].kind == kind
 
 
 def test_speed_over_ground_in_another_unit_is_a_fault(rough: Recorded) -> None:
