@@ -50,6 +50,10 @@ UNIT_SPELLINGS: Final = {
 # [s] Unix times of the years 2000 and 2100: a first time between them is a date.
 FIRST_DATE: Final = 946_684_800.0
 LAST_DATE: Final = 4_102_444_800.0
+# [s] Time steps beyond these suggest that the unit of the numbers is not the assumed one.
+LONGEST_STEP_S: Final = 2.0
+SHORTEST_STEP_S: Final = 1e-4
+DAY_BACK_S: Final = 43_200.0  # [s] a larger step back is midnight
 MOST_NAMES: Final = 20  # maximum number of column names in an error message
 RACECHRONO: Final = "racechrono"
 LONGEST_PREAMBLE: Final = 50  # [lines] maximum length of the text before the table
@@ -92,14 +96,10 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
     titles = _plain_names(table.column_names)
     column = _time_column(path, titles, time)
     title = titles[column]
-    t, start_ns = _parse_seconds(table[title], column, time_unit or _unit_in(title) or None)
-    back = np.flatnonzero(~((np.diff(t) >= 0.0) & np.isfinite(t[1:])))
-    if len(back):
-        raise InputError(
-            column,
-            f"is missing or goes back at row {int(back[0]) + 1}",
-            "sort the recording by time",
-        )
+    unit = time_unit or _unit_in(title) or None
+    t, start_ns = _parse_seconds(table[title], column, unit)
+    _check_order(column, t)
+    notes += [f"{path.name}: {doubt}" for doubt in _time_doubts(column, table[title].type, t, unit)]
     recording = Recording(path.name, {}, start_ns, rows=True, notes=notes)
     left = []
     for name, title in titles.items():
@@ -314,7 +314,7 @@ def _parse_seconds(
         return (values - values[0]) / NS, int(values[0])
     if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
         problem = f"has the value {_first_text(column)!r}, which is not a time"
-        raise InputError(name, problem, "write seconds or time stamps, and no row of units")
+        raise InputError(name, problem, "write seconds or ISO 8601 times, and no row of units")
     raw = np.asarray(column.to_numpy(zero_copy_only=False))
     if not np.isfinite(raw[0]):
         raise InputError(name, "is missing at row 0", "give every sample its time")
@@ -330,6 +330,33 @@ def _parse_seconds(
     start = int(raw[0]) if dated and unit == "ns" and whole else round(first * NS)
     t: FloatArray = np.asarray(exact, dtype=np.float64)
     return (t - t[0] if dated else t), start if dated else None
+
+
+def _check_order(name: str, t: FloatArray) -> None:
+    """Raise an InputError if a time in the column `name`, t (n,) [s], is missing or goes back."""
+    back = np.flatnonzero(~((np.diff(t) >= 0.0) & np.isfinite(t[1:])))
+    if not len(back):
+        return
+    row = int(back[0]) + 1
+    if not np.isfinite(t[row]):
+        raise InputError(name, f"is missing at row {row}", "give every sample its time")
+    if t[row - 1] - t[row] > DAY_BACK_S:
+        fix = "add 86400 s to the times after midnight"
+    else:
+        fix = "sort the recording by time"
+    raise InputError(name, f"goes back at row {row}", fix)
+
+
+def _time_doubts(name: str, kind: pa.DataType, t: FloatArray, unit: str | None) -> list[str]:
+    """Return notes on times t (n,) [s] in the column `name` whose unit or zone was assumed. `unit`
+    is the stated unit of numbers of the Arrow type `kind`, None if there is none.
+    """
+    if pa.types.is_timestamp(kind):
+        return [f"{name} has no time zone; taken as UTC"] if kind.tz is None else []
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    if unit is None and (step > LONGEST_STEP_S or 0.0 < step < SHORTEST_STEP_S):
+        return [f'{name}: a row every {step:.3g} s; if not, set "time_unit" in the profile']
+    return []
 
 
 def _parse_numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow columns are not generic

@@ -191,8 +191,10 @@ def test_a_time_column_has_its_stated_unit_or_that_of_a_date(
         ("time [lap],ax\n0,1.0\n1,2.0\n", "'lap', which is not a unit of time.*time_unit"),
         ("t,ax\n,1.0\n0.01,2.0\n", "t: is missing at row 0"),
         ("t,ax\ninf,1.0\n0.01,2.0\n", "t: is missing at row 0"),
-        ("t,ax\n0.0,1.0\n,2.0\n", "t: is missing or goes back at row 1"),
-        ("t,ax\n0.0,1.0\ninf,2.0\n", "t: is missing or goes back at row 1"),
+        ("t,ax\n0.0,1.0\n,2.0\n", "t: is missing at row 1"),
+        ("t,ax\n0.0,1.0\ninf,2.0\n", "t: is missing at row 1"),
+        ("t,ax\n1.0,1.0\n0.9,2.0\n", "t: goes back at row 1; sort"),
+        ("t,ax\n86399.9,1.0\n0.0,2.0\n", "t: goes back at row 1; add 86400 s"),
     ],
 )
 def test_an_unknown_unit_or_a_missing_time_is_named(
@@ -209,6 +211,23 @@ def test_a_profile_states_the_unit_and_a_date_needs_none(tmp_path: Path) -> None
     dated = read_table(write(tmp_path / "b.csv", text))
     assert dated.signals["ax"].t[1] == pytest.approx(0.01)
     assert dated.start_ns == 1_714_557_600_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("times", "note"),
+    [
+        (("0", "10", "20"), "time: a row every 10 s; if not"),
+        (("2024-05-01 10:00:00.00", "2024-05-01 10:00:00.01"), "time has no time zone; taken as"),
+        (("2024-05-01 10:00:00.00Z", "2024-05-01 10:00:00.01Z"), None),
+        (("0.0", "0.01", "0.02"), None),
+    ],
+)
+def test_assumed_unit_or_zone_of_times_is_noted(
+    tmp_path: Path, times: tuple[str, ...], note: str | None
+) -> None:
+    text = "\n".join(["time,ax", *(f"{time},1.0" for time in times)])
+    notes = read_table(write(tmp_path / "a.csv", text)).notes
+    assert notes == [] if note is None else notes[0].startswith(f"a.csv: {note}")
 
 
 def test_columns_with_the_same_name_are_all_kept(tmp_path: Path) -> None:
