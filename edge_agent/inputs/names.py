@@ -16,6 +16,9 @@ from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.units import QUANTITY, unit_of_channel
 from schemas.signals import WHEELS
 
+UMLAUTS: Final = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
+)
 _WORDS: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 PLACES: Final = {
     "fl": ("fl", "lf", "vl", "frontleft", "leftfront", "front left"),
@@ -56,7 +59,7 @@ RULES: Final[dict[str, Rule]] = {
         for name, words in (("abs", "abs"), ("esc", "esc|esp|vsc|vdc"), ("tcs", "tcs|asr|trc|eds"))
     },
     "air_temperature": (
-        r"(outside|outdoor|ambient|aussen|out|air) (air )?temp",
+        r"(outside|outdoor|ambient|out|air) (air )?temp|aussen ?temp",
         rf"{STATES}|set|incar|cabin|intake|qbit|ind|int air",
     ),
     "wiper": (
@@ -76,7 +79,7 @@ COURSE: Final = re.compile(r"heading|course|track")
 
 def split_words(name: str) -> str:
     """Return the name of a signal as lower-case words separated by blanks."""
-    return " ".join(_WORDS.findall(name)).lower()
+    return " ".join(_WORDS.findall(name.translate(UMLAUTS))).lower()
 
 
 def place_of(plain: str) -> str | None:

@@ -12,6 +12,7 @@ go backwards. A position at exactly 0°, 0° is a missing reading.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,7 +146,8 @@ def require_no_estimates(path: Path, names: Collection[str]) -> None:
 
 def conversion_command(path: Path) -> str:
     """Return the command that converts a recording to a signal log."""
-    return f"edge-agent import {path} --out {path.with_suffix('.parquet')}"
+    words = [str(path), "--out", str(path.with_suffix(".parquet"))]
+    return f"edge-agent import {shlex.join(words)}"
 
 
 def _not_parquet(path: Path, reason: str) -> InputError:

@@ -434,6 +434,11 @@ def test_names_of_context_signals_are_drafted() -> None:
     assert {c.full_name(str(c.signal)): name for name, c in drafted.channels.items()} == names
 
 
+def test_german_names_with_umlauts_are_recognised() -> None:
+    names = {"Längsbeschleunigung": "g", "Außentemperatur": "°C"}
+    assert set(draft_profile(names, "p").channels) == {"ax", "air_temperature"}
+
+
 def test_check_names_a_flag_that_is_always_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -271,6 +271,19 @@ def test_a_rim_speed_without_a_radius_is_an_error(
     assert "radius" in capsys.readouterr().err
 
 
+def test_import_refuses_an_ending_other_than_parquet(tmp_path: Path, capsys: Output) -> None:
+    assert main(["import", str(BLF), "--out", str(tmp_path / "a.csv")]) == 2
+    assert capsys.readouterr().err.startswith("error: out: a.csv has no known ending; ")
+
+
+def test_advised_command_quotes_a_path_with_spaces(tmp_path: Path, capsys: Output) -> None:
+    path = tmp_path / "my drive.csv"
+    path.write_text("t,ax\n")
+    assert main(["check", str(path), "--vehicle", "class:suv"]) == 2
+    log = path.with_suffix(".parquet")
+    assert f"edge-agent import '{path}' --out '{log}'" in capsys.readouterr().err
+
+
 def test_the_shipped_profiles_are_listed(capsys: Output) -> None:
     assert main(["import", "--list"]) == 0
     assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(
