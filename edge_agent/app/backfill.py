@@ -102,10 +102,8 @@ def estimate_drives(
     A drive that fails does not stop the others. After Ctrl-C no further drive begins.
 
     Raises:
-        InputError: `jobs` is below 1, or the operating system ended one of the processes.
+        InputError: the operating system ended one of the processes.
     """
-    if jobs < 1:
-        raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
     count = min(jobs, len(tasks))
     if count < 2:
         for task in tasks:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.config import NAME_PATTERN
@@ -53,13 +54,13 @@ def require_valid_signals(diagnosis: Diagnosis) -> None:
         )
 
 
-def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
+def warn_about_faults(diagnosis: Diagnosis, log: Path) -> list[str]:
     """Print on stderr the faults that the signal doctor found in a log. Return notes about these
     faults, which the caller prints after the estimates.
     """
     found = diagnosis.findings
     for fault in found:
-        print(f"warning: {fault}", file=sys.stderr)
+        print(f"warning: {log}: {fault}", file=sys.stderr)
     if found:
         print(
             "warning: the estimates below are invalid until this is corrected; run edge-agent "
@@ -69,9 +70,9 @@ def warn_about_faults(diagnosis: Diagnosis) -> list[str]:
     notes = []
     if found:
         notes.append(
-            "note: the signal doctor did not pass this log; replay --publish would refuse it"
+            f"note: the signal doctor did not pass {log}; replay --publish would refuse it"
         )
     elif not diagnosis.is_passed:
         channels = ", ".join(diagnosis.unknown)
-        notes.append(f"note: the signal doctor did not pass this log: it cannot judge {channels}")
+        notes.append(f"note: the signal doctor did not pass {log}: it cannot judge {channels}")
     return notes

@@ -168,7 +168,7 @@ def _replay_one(
     if args.publish and not args.trust:
         require_valid_signals(diagnosis)
     else:
-        notes += warn_about_faults(diagnosis)
+        notes += warn_about_faults(diagnosis, path)
     code = 0
     if is_report:
         names = [estimator, *_split_names(args.compare)]
@@ -260,6 +260,8 @@ def _write_report(
 
 
 def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
+    if jobs < 1:
+        raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
     if engine not in (LOCAL, SPARK):
         raise InputError("engine", f"{engine!r} is unknown", f"use {LOCAL} or {SPARK}")
     if engine == SPARK and not several:

@@ -223,7 +223,7 @@ def _tuning_drives(
             raise InputError("log", f"{path}: most samples have the same time", fix)
         signed = replace(log, signals=sign_wheels(log.t, log.signals, vehicle))
         logs.append((signed, vehicle))
-        for note in warn_about_faults(diagnose(log.t, log.signals, vehicle, log.ground)):
+        for note in warn_about_faults(diagnose(log.t, log.signals, vehicle, log.ground), path):
             print(note, file=sys.stderr)
     return own_drives(logs, duration_s)
 

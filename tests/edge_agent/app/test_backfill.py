@@ -196,8 +196,14 @@ def test_logs_of_one_name_and_estimates_over_their_log_are_refused(
     assert tasks_of([log], None, tmp_path) == [
         Task(log, drives / "d0.json", tmp_path / "d0.parquet")
     ]
-    with pytest.raises(InputError, match="jobs: 0 is below 1"):
-        list(estimate_drives([], "ckf", 0))
+
+
+def test_no_job_is_refused_for_one_log_too(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["replay", str(drives / "d0.parquet"), "--out", str(tmp_path / "d0.parquet")]
+    assert main([*command, "--jobs", "0"]) == 2
+    assert capsys.readouterr().err.startswith("error: jobs: 0 is below 1; ")
 
 
 def test_faulty_signals_and_implausible_estimates_are_reported(

@@ -403,7 +403,9 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(
     assert "4000 samples, 40.0 s; speed" in capsys.readouterr().err
     bad = write(tmp_path / "bad.parquet", PLANTED["wheels in rpm"].spoil(cut))
     assert main(["replay", *bad, "--estimator", "ckf", "--out", str(tmp_path / "o.parquet")]) == 3
-    assert "NOT PLAUSIBLE" in capsys.readouterr().err
+    reported = capsys.readouterr().err
+    assert "NOT PLAUSIBLE" in reported
+    assert f"warning: {bad[0]}: omega " in reported
 
 
 @pytest.mark.campaign
