@@ -27,6 +27,15 @@ def _checked_host(host: str) -> str:
     return host
 
 
+def _checked_address(host: str) -> str:
+    if host != "localhost":
+        try:
+            ipaddress.ip_address(host)
+        except ValueError:
+            raise ValueError(f"{host[:60]!r} is no address, as 127.0.0.1 or :: (all)") from None
+    return host
+
+
 Step = Literal["next", "switch", "drop"]  # steps of a change of the certificate authority
 Host = Annotated[str, AfterValidator(_checked_host)]
 
@@ -39,7 +48,9 @@ class Router(Settings):
         min_length=1,
         description="host names and addresses of the router",
     )
-    listen: Host = Field(default="127.0.0.1", description="listen address; :: for all")
+    listen: Annotated[str, AfterValidator(_checked_address)] = Field(
+        default="127.0.0.1", description="listen address; :: for all"
+    )
     port: int = Field(
         default=7447,
         ge=1,

@@ -184,6 +184,11 @@ def test_what_is_no_host_is_refused(host: str) -> None:
             "error: routers.r-1.hosts.0: 'a b' is neither a host name",
         ),
         (
+            {"routers": {"r-1": {"listen": "notanip"}}},
+            [],
+            "error: routers.r-1.listen: 'notanip' is no address, as 127.0.0.1 or :: (all)",
+        ),
+        (
             {"routers": {"r-1": {"hosts": [LONG]}}},
             [],
             "error: routers.r-1.hosts.0: 'aaaa",
