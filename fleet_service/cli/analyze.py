@@ -15,6 +15,7 @@ from fleet_service.cli.common import (
     compact_first,
     describe_covered_box,
     duration_s,
+    require_past,
     time_span,
 )
 from schemas import mugrid
@@ -114,10 +115,12 @@ def run(arguments: argparse.Namespace) -> int:
         roads = read_roads(arguments.roads)
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*time_span(arguments), bbox)
+    at = None if arguments.at is None else moment(arguments.at, "at")
+    if question.name == "replay":
+        require_past(*((part.until, "to") if at is None else (at, "at")))
     if not arguments.as_it_lies:
         compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
-    at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
     options = Options(
         at=at,
@@ -204,6 +207,8 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
     if arguments.level is not None and not mugrid.LOWER < arguments.level < mugrid.UPPER:
         problem = f"{arguments.level} lies outside {mugrid.LOWER} to {mugrid.UPPER}"
         raise InputError("level", problem, "give a friction, e.g. .35")
+    if arguments.step is not None and arguments.at is not None:
+        raise InputError("step", "cannot be combined with --at", "give --from and --to")
     _within_seconds(arguments.within)
     if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
         raise InputError(

@@ -41,8 +41,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             "give the time between two frames in seconds, e.g. 600",
         )
     at = options.at if options.at is not None else engine.part.until
-    last = at if options.step_s is None else max(at, engine.part.until)
-    fusion = fusion_with_weather(engine.root, options.lateness_s, last)
+    fusion = fusion_with_weather(engine.root, options.lateness_s, at)
     if options.step_s is None:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):

@@ -199,6 +199,21 @@ def test_the_first_question_as_geojson_has_its_days_as_text(archive: Path, tmp_p
     assert first["geometry"]["type"] == "Polygon"
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--at", "2200-01-01"], "error: at: lies in the future; "),
+        (["--to", "2200-01-01"], "error: to: lies in the future; "),
+        (["--at", "2026-01-27", "--step", "600"], "error: step: cannot be combined with --at; "),
+    ],
+)
+def test_replay_refuses_a_future_map_and_a_time_with_a_step(
+    archive: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert analyze(archive, "replay", *options) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(message)
+
+
 @pytest.mark.parametrize("step", ["-5", "0.0001", "nan", "inf"])
 def test_a_step_that_is_none_is_refused_at_once(
     archive: Path, step: str, capsys: pytest.CaptureFixture[str]
