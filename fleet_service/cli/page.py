@@ -89,6 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("page", f"the package {error.name} is missing", fix) from error
     connection = map_client.connection_settings(arguments.connect, arguments.config)
     configuration(connection)  # here, because the thread that opens the session cannot end the page
+    for address in arguments.metrics:
+        if not address.startswith(("http://", "https://")):
+            raise InputError(
+                "metrics", f"{address!r} is not an address", "write it like http://127.0.0.1:9464"
+            )
     if arguments.archive is not None:
         _check_archive(arguments.archive)
     settings = server.PageSettings(

@@ -168,11 +168,11 @@ def api_definition(base: str) -> dict[str, Any]:
         describe_parameter(
             "bbox",
             "query",
-            "west, south, east, north [deg]",
+            "west, south, east, north [deg]; with heights six numbers, of which they are ignored",
             type="array",
             items={"type": "number"},
             minItems=4,
-            maxItems=4,
+            maxItems=6,
         )
         | {"style": "form", "explode": False},
         describe_parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),

@@ -45,8 +45,9 @@ class ServiceHealth:
             return self._answers
 
     def _ask(self, address: str) -> dict[str, Any]:
+        place = f"{address.rstrip('/').removesuffix('/metrics')}/metrics"
         try:
-            with urllib.request.urlopen(f"{address.rstrip('/')}/metrics", timeout=READ_S) as answer:
+            with urllib.request.urlopen(place, timeout=READ_S) as answer:
                 text = answer.read(MOST_BYTES).decode("utf-8", "replace")
         except (OSError, ValueError, HTTPException):
             return {"address": address, "answers": False}

@@ -9,7 +9,7 @@ from typing import Final
 
 from starlette.requests import Request
 
-from fleet_service.page.features import FEW, MOST, FeatureQuestion
+from fleet_service.page.features import FEW, MOST, Box, FeatureQuestion
 from fleet_service.page.records import CELL_LEVEL, LEAST_LEVEL
 from fleet_service.page.watchers import View
 from schemas import grid, query
@@ -65,11 +65,19 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
     parameters = request.query_params
     if unknown := [name for name in parameters if name not in _OF_FEATURES]:
         raise InputError(unknown[0][:40], "is not a parameter", f"use {', '.join(_OF_FEATURES)}")
-    box = query.parse({"bbox": parameters["bbox"]}).bbox if "bbox" in parameters else None
+    box = _parse_box(parameters["bbox"]) if "bbox" in parameters else None
     since, at = _parse_interval(parameters.get("datetime", "../.."), now)
     limit = _parse_whole("limit", parameters["limit"], 1, 1 << 31) if "limit" in parameters else FEW
     after = parse_feature_id(parameters["after"]) if "after" in parameters else -1
     return FeatureQuestion(box, since, at, min(limit, MOST), after)
+
+
+def _parse_box(text: str) -> Box | None:
+    """Return the box in the parameter `bbox` of a query for features: west, south, east, north
+    [deg]. Heights, the third and the sixth of six numbers, are ignored.
+    """
+    sides = text.split(",")
+    return query.parse({"bbox": ",".join(sides[:2] + sides[3:5]) if len(sides) == 6 else text}).bbox
 
 
 def parse_feature_id(text: str) -> int:

@@ -23,6 +23,8 @@ from schemas.numeric import FloatArray, IntArray
 AHEAD: Final = 3
 # Cells of the moving average. Without it, lanes and position errors would make the line zigzag.
 SMOOTHED: Final = 5
+LONGITUDES: Final = 180.0  # [deg] largest size of a longitude
+LATITUDES: Final = 90.0  # [deg] largest size of a latitude
 LEAST_CELLS: Final = 3  # fewer cells give no line, because they have no direction
 MOST_LINES: Final = 50_000
 # column and row of the next cell, by heading sector: east, north, west, south
@@ -65,16 +67,20 @@ def read_roads(path: Path) -> RoadMap:
     Raises:
         InputError: the file cannot be read, or contains no line.
     """
+    fix = "give GeoJSON of LineString features in degrees"
     try:
-        features = json.loads(path.read_bytes())["features"]
-        found = RoadMap([], [])
-        for feature in features:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError("roads", f"{path} cannot be read ({str(error)[:80]})", fix) from error
+    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
+        raise InputError("roads", f"{path} is no GeoJSON FeatureCollection", fix)
+    found = RoadMap([], [])
+    for index, feature in enumerate(document["features"]):
+        try:
             _add_feature(found, feature["geometry"], feature.get("properties") or {})
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        problem = f"{path} cannot be read ({str(error)[:80]})"
-        raise InputError(
-            "roads", problem, "give GeoJSON of LineString features in degrees"
-        ) from error
+        except (AttributeError, ValueError, KeyError, TypeError, IndexError) as error:
+            problem = f"{path}: feature {index} has no usable geometry"
+            raise InputError("roads", problem, fix) from error
     if not found.lines or len(found.lines) > MOST_LINES:
         raise InputError(
             "roads", f"{path} contains {len(found.lines)} lines", f"give 1 to {MOST_LINES}"
@@ -105,6 +111,8 @@ def _add_feature(found: RoadMap, geometry: dict[str, Any], about: dict[str, Any]
     directions = _directions_of(str(about.get("oneway") or "").lower())
     for line in lines:
         kept = [[round(float(x), 7), round(float(y), 7)] for x, y, *_ in line]
+        if not all(abs(x) <= LONGITUDES and abs(y) <= LATITUDES for x, y in kept):
+            raise ValueError("not in degrees")
         if len(kept) > 1:
             found.lines.append(Line(name, kept, directions))
 

@@ -131,6 +131,9 @@ def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
     assert {one["properties"]["cell"] for one in inside["features"]} == {
         int(street.cells(street.PARTS["ice"])[2])
     }
+    with_heights = f"{west + 1e-7},{south + 1e-7},-10,{east - 1e-7},{north - 1e-7},10"
+    again = fetch_document(page, f"{ITEMS}?bbox={with_heights}")
+    assert again["features"] == inside["features"]
     assert (
         fetch_document(page, f"{ITEMS}?bbox={west + 9},{south},{east + 9},{north}")["features"]
         == []
@@ -187,6 +190,7 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
     "asked",
     [
         "?bbox=1,2",
+        "?bbox=1,2,x,3,4",
         "?bbox=9,2,1,3",
         "?limit=0",
         "?limit=x",

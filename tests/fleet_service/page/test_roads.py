@@ -75,9 +75,19 @@ def test_lines_of_a_file_have_names_and_directions(tmp_path: Path) -> None:
     found = read_roads(path)
     assert [(one.name, one.directions) for one in found.lines] == [("One", 3), ("", 1), ("", 1)]
     assert found.places == [("Town", 11.0, 57.0)]
-    for text in ("no", "{}", '{"features": []}', '{"features": [{"geometry": null}]}'):
+    metres = json.dumps(
+        {"features": [feature("LineString", [[319000, 6400000], [319100, 6400000]])]}
+    )
+    for text, problem in (
+        ("no", "cannot be read"),
+        ("{}", "is no GeoJSON FeatureCollection"),
+        ("[]", "is no GeoJSON FeatureCollection"),
+        ('{"features": []}', "contains 0 lines"),
+        ('{"features": [{"geometry": null}]}', "feature 0 has no usable geometry"),
+        (metres, "feature 0 has no usable geometry; .* in degrees"),
+    ):
         path.write_text(text)
-        with pytest.raises(InputError, match="roads"):
+        with pytest.raises(InputError, match=problem):
             read_roads(path)
 
 

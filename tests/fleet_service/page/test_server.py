@@ -393,6 +393,11 @@ def test_files_of_the_map_that_are_missing_are_refused(
         assert "none" in capsys.readouterr().err
 
 
+def test_metrics_that_are_no_address_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["page", "--connect", "tcp/127.0.0.1:1", "--metrics", "foo"]) == 2
+    assert capsys.readouterr().err.startswith("error: metrics: 'foo' is not an address; ")
+
+
 def test_connection_that_zenoh_refuses_ends_the_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
