@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return NOBODY
-    if arguments.bbox is not None and answer.table is not None and not answer.table.num_rows:
+    if arguments.bbox is not None and answer.is_empty:
         _say_what_is_covered(arguments)
     if arguments.out is None:
         print(map_client.format_answer(answer))

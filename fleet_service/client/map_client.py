@@ -64,6 +64,14 @@ class Answer:
     regions: tuple[str, ...] = ()
 
     @property
+    def is_empty(self) -> bool:
+        """Return True if the answer has no cell."""
+        if self.table is not None:
+            return not self.table.num_rows
+        document = self.document or {}
+        return not (document.get("features") or document.get("tiles"))
+
+    @property
     def gap_description(self) -> str | None:
         """Return a description of the regions that are missing from the answer; None if it is
         complete.

@@ -464,6 +464,10 @@ def test_every_option_of_a_query_changes_the_answer(
 
     assert cells() == {here, far}
     assert cells(bbox="11.96,57.69,11.98,57.71") == {here}
+    for form in ("json", "geojson", "arrow"):
+        swapped = usual | {"--format": form, "--bbox": "57.69,11.96,57.71,11.98"}
+        assert main(["query", *(word for pair in swapped.items() for word in pair)]) == 0
+        assert "longitude comes before latitude" in capsys.readouterr().err
     assert cells(route=f"{FAR[1] - 1e-4},{FAR[0]}|{FAR[1] + 1e-4},{FAR[0]}") == {far}
     assert cells(min_vehicles="2") == {here}
     assert cells(at="2024-10-05") == set()
