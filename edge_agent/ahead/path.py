@@ -99,9 +99,9 @@ def to_plane(
     in the same shape. Within a kilometre of the car the error is below a centimetre.
     """
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
-    return (np.asarray(longitude) - pose.longitude) * east, (
-        np.asarray(latitude) - pose.latitude
-    ) * METRES_PER_DEGREE
+    eastward = np.asarray(longitude) - pose.longitude
+    eastward -= 360.0 * np.floor(eastward / 360.0 + 0.5)  # at the antimeridian
+    return eastward * east, (np.asarray(latitude) - pose.latitude) * METRES_PER_DEGREE
 
 
 def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:

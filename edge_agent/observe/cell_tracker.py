@@ -158,7 +158,9 @@ def _update_course(track: CellTrack, latitude: float, longitude: float) -> None:
     course changes only if the vehicle has moved far enough since the last update.
     """
     north = (latitude - track.course_latitude) * METRES_PER_DEGREE
-    east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
+    eastward = longitude - track.course_longitude
+    eastward -= 360.0 * np.floor(eastward / 360.0 + 0.5)  # at the antimeridian
+    east = eastward * METRES_PER_DEGREE * np.cos(np.radians(latitude))
     distance = np.hypot(north, east)
     if distance >= COURSE_BASE_M:
         track.course = np.arctan2(north, east)

@@ -29,12 +29,18 @@ from edge_agent.ahead.local_map import (
     LocalMap,
     belief_of,
 )
-from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degrees
+from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degrees, to_plane
 from edge_agent.ahead.request_log import FURTHER_M, RequestLog
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
 from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, make_local_map
+
+
+def test_place_across_the_antimeridian_is_near() -> None:
+    east, north = to_plane(np.array([0.0]), np.array([-179.999]), Pose(0.0, 179.999, 0.0, 10.0, 0))
+    assert east[0] == pytest.approx(222.6, abs=1.0)
+    assert north[0] == 0.0
 
 
 def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:

@@ -106,6 +106,15 @@ def test_without_yaw_the_course_over_ground_gives_the_sector() -> None:
     assert (located.cell[5:] != NOWHERE).all()
 
 
+def test_course_across_the_antimeridian_keeps_its_sector() -> None:
+    east, north, _ = straight(60)
+    block = ground(east, north, np.full_like(east, np.nan))
+    longitude = block.signals[..., -2] - block.signals[30, 0, -2] + 180.0
+    block.signals[..., -2] = np.where(longitude >= 180.0, longitude - 360.0, longitude)
+    _, located = locate_vehicles(new_tracks(1), block.t, block.signals)
+    assert set(located.sector[located.cell != NOWHERE]) == {0}
+
+
 def test_impossible_positions_are_no_fixes() -> None:
     block = ground(*straight(10))
     block.signals[..., -3] = 1e9
