@@ -101,6 +101,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     roads = roads.append_column("piece", pa.array((middle // PIECE_M).astype(np.int64)))
     places = roads.select(["cell", "sector", "link", "direction", "piece"])
     found = engine.answer(expression(t, ibis.memtable(places)))
+    if not found.num_rows:
+        options.report(f"no measured friction lies on a road of {options.roads}: its coordinates?")
     span = engine.answer(t.aggregate(begin=t.time.min(), end=t.time.max())).to_pylist()[0]
     seen = engine.answer(t.filter(has_value(t)).select("cell", "sector").distinct())
     return _link_rows(found, roads, seen, (span["begin"], span["end"]), options)

@@ -9,6 +9,7 @@ link ends and the next begins belongs to both links, because its observations ca
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -104,6 +105,7 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     link = marks.link[joined.mark]
     middle = marks.run[joined.mark]
     length = lengths[link]
+    begin, total = _link_begins(network.links, lengths)
     texts = {
         name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
         for name, field in (
@@ -116,9 +118,9 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     numbers = {
         "cell": joined.cell,
         "sector": joined.sector.astype(np.int8),
-        "from_m": np.maximum(middle - side / 2.0, 0.0),
-        "to_m": np.minimum(middle + side / 2.0, length),
-        "length_m": length,
+        "from_m": begin[link] + np.maximum(middle - side / 2.0, 0.0),
+        "to_m": begin[link] + np.minimum(middle + side / 2.0, length),
+        "length_m": total[link],
         "distance_m": joined.distance,
         "shared": joined.second,
     }
@@ -129,6 +131,20 @@ def join_roads(network: RoadNetwork) -> pa.Table:
     return found.replace_schema_metadata(
         {f"roads.{key}": value for key, value in network.source.items()}
     )
+
+
+def _link_begins(
+    links: Sequence[DirectedLink], lengths: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return, for each link with its length in `lengths` (n,) [m], the position of its begin and
+    the total length. Lines with the same id and direction are parts of one link, one after another.
+    """
+    total: dict[tuple[str, str], float] = {}
+    begin = np.zeros(len(links))
+    for k, link in enumerate(links):
+        begin[k] = total.get((link.id, link.direction), 0.0)
+        total[link.id, link.direction] = begin[k] + lengths[k]
+    return begin, np.array([total[link.id, link.direction] for link in links])
 
 
 def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: float) -> _Joined:

@@ -169,9 +169,18 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
                 f"{path.name} has coordinates that are not degrees",
                 "give the file its CRS",
             )
-        called, kind, oneway = (str(about.get(column) or "") for column in (name, "kind", "oneway"))
-        links += _driven_directions(str(about[identity]), called, kind, oneway, points)
+        if not (own := _text_of(about[identity])):
+            problem = f"a line of {path.name} has no {identity!r}"
+            fix = "give each line an id, or name another column with --id"
+            raise InputError("id", problem, fix)
+        called, kind, oneway = (_text_of(about.get(column)) for column in (name, "kind", "oneway"))
+        links += _driven_directions(own, called, kind, oneway, points)
     return links
+
+
+def _text_of(value: object) -> str:
+    """Return the value of a column as text; "" for None and NaN."""
+    return "" if value is None or value != value else str(value)
 
 
 def _driven_directions(

@@ -145,6 +145,17 @@ def test_what_is_missing_is_said(asked: Ask, links: Path, lacks: str) -> None:
     assert error.value.field == lacks.removesuffix("_s")
 
 
+def test_roads_elsewhere_are_reported(asked: Ask, links: Path, tmp_path: Path) -> None:
+    roads = pq.read_table(links)
+    cells = pa.array(np.arange(roads.num_rows, dtype=np.int64))
+    elsewhere = tmp_path / "elsewhere.parquet"
+    pq.write_table(roads.set_column(0, roads.schema.field("cell"), cells), elsewhere)
+    assert roads.column_names[0] == "cell"
+    found = asked("contract", roads=elsewhere, level=LEVEL, within_s=3600.0)
+    assert not found.num_rows
+    assert b"no measured friction lies on a road of" in found.schema.metadata[b"said"]
+
+
 def test_the_command_asks_it_of_an_archive(
     archive: Path, links: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,13 @@ def on(frame: pd.DataFrame, x: float, y: float, sector: int) -> list[tuple[str, 
     return list(zip(rows.link, rows.direction, strict=True))
 
 
+def cells_near(y: float) -> list[int]:
+    """Return the cells within 20 m north and south of the line y [m] from x = 0 to 200 m."""
+    return [
+        int(grid.cell_of(*place(x, y + off))) for x in range(0, 201, 5) for off in range(-20, 21, 5)
+    ]
+
+
 def frame_of(*roads: list[DirectedLink]) -> pd.DataFrame:
     found: pd.DataFrame = join_roads(
         RoadNetwork([link for own in roads for link in own], {"extract": "test"})
@@ -100,6 +107,16 @@ def test_the_cells_of_a_link_cover_its_length() -> None:
     assert own.from_m.min() == 0.0
     assert own.to_m.max() == pytest.approx(np.hypot(331, 47), rel=2e-3)
     assert (own.from_m.to_numpy()[1:] <= own.to_m.cummax().to_numpy()[:-1] + 1e-6).all(), "no gap"
+
+
+def test_lines_with_one_id_are_parts_of_one_link() -> None:
+    frame = frame_of(
+        road("a", (0, 0), (200, 0), both=False), road("a", (0, 300), (100, 300), both=False)
+    )
+    assert frame.length_m.to_numpy() == pytest.approx(300.0, rel=1e-3)
+    first, second = (frame[frame.cell.isin(cells_near(y))] for y in (0, 300))
+    assert first.to_m.max() <= second.from_m.min() + 1.0
+    assert second.to_m.max() == pytest.approx(300.0, rel=1e-3)
 
 
 def test_it_is_right_at_any_latitude() -> None:

@@ -103,6 +103,20 @@ def test_what_is_no_network_is_an_error_that_names_it(
     assert error.value.field == field
 
 
+@pytest.mark.parametrize("missing", [None, np.nan])
+def test_line_without_an_id_is_refused_and_a_missing_name_is_empty(
+    tmp_path: Path, missing: float | None
+) -> None:
+    lines = [LineString([(11.97, 57.70), (11.98, 57.70)])] * 2
+    frame = geopandas.GeoDataFrame({"id": [1, 2], "name": missing}, geometry=lines, crs=4326)
+    path = tmp_path / "roads.parquet"
+    frame.to_parquet(path)
+    assert {link.name for link in read_network(path).links} == {""}
+    frame.assign(id=[1.0, missing]).to_parquet(path)
+    with pytest.raises(InputError, match=r"id: a line of roads.parquet has no 'id'"):
+        read_network(path)
+
+
 def test_a_truncated_extract_is_no_whole_one(tmp_path: Path) -> None:
     path = extract(tmp_path / "town.osm")
     path.write_bytes(path.read_bytes()[:-200])
