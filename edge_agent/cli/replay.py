@@ -181,6 +181,8 @@ def _replay_one(
         publisher = open_publisher([name], config, estimator, drive=drive)
         same = f" with --start {_start_text(start_ns)}" if _is_start_now(args.start, log) else ""
         code = _publish_drive(publisher, progress, start_ns, f"repeat the command{same}")
+        if not drive.drafts:
+            notes.append(_explain_no_record(config))
         if same:
             notes.append(f"note: repeated{same}, this drive counts once; otherwise it is another")
     else:
@@ -190,6 +192,15 @@ def _replay_one(
     if code == 0 and plausibility.problems():
         return IMPLAUSIBLE
     return code
+
+
+def _explain_no_record(config: AgentConfig) -> str:
+    """Return the note that a drive has no record to publish, with the probable reason."""
+    reason = "the car completed no visit of a cell"
+    if config.trip_end_m or config.trip_end_s:
+        ends = f"trip_end_m {config.trip_end_m:g}, trip_end_s {config.trip_end_s:g}"
+        reason = f"the ends of a trip are not published ({ends})"
+    return f"note: nothing was published: {reason}"
 
 
 def _require_position(path: Path, log: SignalLog) -> None:

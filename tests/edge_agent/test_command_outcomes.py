@@ -212,6 +212,18 @@ def test_records_lost_by_a_full_outbox_are_reported(
     assert f"{counts['dropped']} records are lost, because" in seen.err
 
 
+def test_drive_within_its_unpublished_ends_is_reported(tmp_path: Path, capsys: Output) -> None:
+    config = tmp_path / "agent.json"
+    config.write_text(json.dumps({"spool": str(tmp_path / "spool.sqlite"), "trip_end_s": 60.0}))
+    words = [*write_drive(tmp_path / "d.parquet"), "--out", str(tmp_path / "e.parquet")]
+    words += ["--config", str(config), "--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}"]
+    assert main([*words, "--publish", "--trust", "--name", "car-one"]) == 0
+    assert (
+        "note: nothing was published: the ends of a trip are not published (trip_end_m 0, "
+        "trip_end_s 60)"
+    ) in capsys.readouterr().err
+
+
 def test_replay_tells_what_it_leaves_in_the_outbox_and_how_to_go_on(
     tmp_path: Path, capsys: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
