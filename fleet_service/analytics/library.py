@@ -10,16 +10,27 @@ import pyarrow as pa
 from fleet_service.analytics import output
 from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
-from fleet_service.analytics.past_map import map_at
+from fleet_service.analytics.past_map import map_at, require_past
 from fleet_service.analytics.questions import question_of
 from fleet_service.archive.export.extract import Box, Extract
 from fleet_service.archive.format.layout import require_archive
+from schemas import query
 from schemas.config import moment
+from schemas.errors import InputError
 
 
-def _make_extract(since: str | None, until: str | None, bbox: Box | None) -> Extract:
-    begin = 0 if since is None else moment(since, "since")
-    return Extract(begin, time.time_ns() if until is None else moment(until, "until"), bbox)
+def _make_extract(period: tuple[str | None, str | None], bbox: Box | None) -> Extract:
+    if isinstance(period, str) or len(period) != 2:
+        raise InputError(
+            "period", f"{period!r} is not a pair", "give (begin, end), each may be None"
+        )
+    since, until = period
+    begin = 0 if since is None else moment(str(since), "period")
+    end = time.time_ns() if until is None else moment(str(until), "period")
+    if begin >= end:
+        raise InputError("period", f"{until or 'now'} is not after {since}", "give a later end")
+    box = {} if bbox is None else {"bbox": ",".join(map(str, bbox))}
+    return Extract(begin, end, query.parse(box).bbox)
 
 
 def ask_archive(
@@ -43,7 +54,7 @@ def ask_archive(
     require_archive(root)
     predefined_question = question_of(question)
     return predefined_question.ask(
-        QueryEngine(engine, root, _make_extract(*period, bbox)),
+        QueryEngine(engine, root, _make_extract(period, bbox)),
         options or Options(report=lambda _: None),
     )
 
@@ -53,10 +64,15 @@ def map_of_archive(
 ) -> pa.Table:
     """Return the map at the time `at` (default: now), replayed from the archive, as a GeoParquet
     table.
+
+    Raises:
+        InputError: there is no such archive, or the time lies in the future.
     """
     root = Path(archive)
     require_archive(root)
-    return map_at(root, _make_extract(None, at, bbox))
+    part = _make_extract((None, at), bbox)
+    require_past(part.until, "at")
+    return map_at(root, part)
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,18 @@ from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import past_fusion
 from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
+from schemas.errors import InputError
 from schemas.thresholds import US_STEP
 
 LATENESS_S = 120.0  # [s] default of ServiceConfig.lateness_s
+
+
+def require_past(at: int, field: str) -> None:
+    """Raise an InputError if the time `at` [ns] of a map lies in the future. The error calls the
+    option `field`.
+    """
+    if at > time.time_ns():
+        raise InputError(field, "lies in the future", "leave it out for the present map")
 
 
 def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:

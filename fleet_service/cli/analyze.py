@@ -15,7 +15,6 @@ from fleet_service.cli.common import (
     compact_first,
     describe_covered_box,
     duration_s,
-    require_past,
     time_span,
 )
 from schemas import mugrid
@@ -99,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     question = _checked_question(arguments)
     progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
-    from fleet_service.analytics import engines, output
+    from fleet_service.analytics import engines, output, past_map
     from fleet_service.archive.export.extract import Extract
     from schemas import query
 
@@ -117,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     part = Extract(*time_span(arguments), bbox)
     at = None if arguments.at is None else moment(arguments.at, "at")
     if question.name == "replay":
-        require_past(*((part.until, "to") if at is None else (at, "at")))
+        past_map.require_past(*((part.until, "to") if at is None else (at, "at")))
     if not arguments.as_it_lies:
         compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)

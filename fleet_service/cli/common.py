@@ -170,14 +170,6 @@ def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
     return since, until
 
 
-def require_past(at: int, field: str) -> None:
-    """Raise an InputError if the time `at` [ns] of a map lies in the future. The error calls the
-    option `field`.
-    """
-    if at > time.time_ns():
-        raise InputError(field, "lies in the future", "leave it out for the present map")
-
-
 class ArchiveReport(NamedTuple):
     """Report of a command: one line of text for people, and the same values for programs."""
 

@@ -21,7 +21,6 @@ from fleet_service.cli.common import (
     add_part,
     add_supplier,
     on_archive,
-    require_past,
     supplier_of,
     time_span,
 )
@@ -206,11 +205,10 @@ def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = extract.Extract(*time_span(arguments), bbox)
     as_of = ""
-    if arguments.what == "map":
-        require_past(part.until, "to")
     if arguments.what == "map" and not arguments.snapshot:
-        from fleet_service.analytics.past_map import map_at
+        from fleet_service.analytics.past_map import map_at, require_past
 
+        require_past(part.until, "to")
         progress_messages.set_status("replaying the archive")
         table = map_at(arguments.archive, part)
         as_of = _format_time(part.until)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import re
 import struct
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,12 +19,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_service.analytics import library
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import geo
 from fleet_service.cli import main
 from schemas import tables
+from schemas.errors import InputError
 from tests.fleet_service.examples import CELL
 from tests.structure import ROOT
 
@@ -212,6 +214,31 @@ def test_replay_refuses_a_future_map_and_a_time_with_a_step(
 ) -> None:
     assert analyze(archive, "replay", *options) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("field", "options"),
+    [
+        ("bbox", {"bbox": (12.1, 57.8, 11.9, 57.6)}),
+        ("bbox", {"bbox": (11.9, 57.6, 12.1)}),
+        ("period", {"period": "2026-01-27"}),
+        ("period", {"period": ("2026-01-28", "2026-01-27")}),
+    ],
+)
+def test_library_names_a_wrong_box_or_period(
+    archive: Path, field: str, options: dict[str, Any]
+) -> None:
+    with pytest.raises(InputError) as error:
+        library.ask_archive(archive, "grip", **options)
+    assert error.value.field == field
+
+
+def test_library_takes_datetimes_and_refuses_a_future_map(archive: Path) -> None:
+    begin = datetime(2026, 1, 28, tzinfo=UTC)
+    found = library.ask_archive(archive, "grip", period=(begin, None))  # type: ignore[arg-type]
+    assert set(found["day"].to_pylist()) == {begin.date()}
+    with pytest.raises(InputError, match="at: lies in the future"):
+        library.map_of_archive(archive, at="2200-01-01")
 
 
 @pytest.mark.parametrize("step", ["-5", "0.0001", "nan", "inf"])
