@@ -135,9 +135,9 @@ def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register
 
     root = arguments.archive.resolve()
-    place = Place(
-        arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri()
-    )
+    # Readers of Iceberg do not decode percent signs, so that `root.as_uri()` would name no file.
+    at = arguments.at or f"file://{root}"
+    place = Place(arguments.catalog, arguments.namespace or NAMESPACE, at)
     done = register(root, place)
     line = (
         f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in "

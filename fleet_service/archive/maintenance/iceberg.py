@@ -162,9 +162,8 @@ def _open_catalog(place: Place) -> Catalog:
     catalog_properties = {"type": "sql", "uri": place.catalog}
     # The metadata of the tables are stored next to the catalogue's file.
     if place.catalog.startswith("sqlite:///"):
-        catalog_properties["warehouse"] = (
-            Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
-        )
+        warehouse = Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("")
+        catalog_properties["warehouse"] = f"file://{warehouse}"
     # Other programs find the tables under this catalogue name.
     return load_catalog("gripmap", **catalog_properties)
 

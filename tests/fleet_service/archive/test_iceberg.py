@@ -42,6 +42,18 @@ def uri(root: Path) -> str:
     return f"sqlite:///{root.parent}/tables.db"
 
 
+def test_archive_and_catalogue_in_folders_with_spaces(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "Straßen 1" / "archive"
+    root.parent.mkdir()
+    fill(root, 1, 100)
+    compact(root)
+    assert export_tables(root, capsys)["added"] > 0
+    assert export_tables(root, capsys)["added"] == 0
+    assert rows_different(root, uri(root)) == 0
+
+
 @pytest.mark.campaign
 def test_compacted_files_are_registered_once_and_the_log_never(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
