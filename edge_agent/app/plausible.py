@@ -26,6 +26,7 @@ SLACK: Final = 0.05
 # [s] window over which the grip in use is averaged: the time in which a tyre builds up its force.
 SMOOTHED_S: Final = 0.2
 MOST_RESETS_PER_S: Final = 0.2  # [1/s] maximum rate of filter resets
+MOST_RESETS_PER_SAMPLE: Final = 0.1  # the same, if times are in a wrong unit
 
 
 def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
@@ -100,7 +101,8 @@ class Plausibility:
         found = {
             "speed differs much from that of the wheels": self.median_speed_error > FURTHEST_SPEED,
             "the upper bound lies below the grip in use": self.violations / n > MOST_VIOLATION,
-            "the filter was reset repeatedly": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
+            "the filter was reset repeatedly": self.resets
+            > 1 + min(MOST_RESETS_PER_S * self.seconds, MOST_RESETS_PER_SAMPLE * n),
         }
         return [words for words, bad in found.items() if bad]
 

@@ -47,6 +47,8 @@ from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
 
 JUMPS = 0.01  # share of a wheel's readings that may differ strongly from the other wheels
+CONSTANT_S = 10.0  # [s] no wheel turns at exactly the same speed, or stands, for that long
+CHANGES = 0.2  # share of its largest value by which the speed of another wheel must change
 SLOWEST_HZ = 5.0
 FASTEST_HZ = 2000.0
 
@@ -71,6 +73,7 @@ def diagnose(
         diagnosis.findings.append(Finding("omega", "lift", words))
         return diagnosis
     signals = signals.copy()
+    _find_constant_wheels(t, signals, diagnosis)
     _find_jumps(signals, diagnosis)
     drive = _undo_exchanges(t, signals, vehicle, ground, diagnosis)
     diagnosis.locked = find_locked_axles(drive)
@@ -188,6 +191,24 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
         diagnosis.findings.append(Finding("t", "rate", words))
         return t, True
     return t, False
+
+
+def _find_constant_wheels(t: FloatArray, signals: FloatArray, diagnosis: Diagnosis) -> None:
+    """Add a finding to the diagnosis for each wheel speed that never changes in a drive in which
+    the speed of another wheel does, and set its readings to NaN. A bus sends a constant code for a
+    sensor that has failed.
+    """
+    wheels = signals[:, S.OMEGA : S.OMEGA + 4]
+    known = [wheel[np.isfinite(wheel)] for wheel in wheels.T]
+    if t[-1] - t[0] < CONSTANT_S or not any(
+        len(one) and np.ptp(one) > CHANGES * np.abs(one).max() for one in known
+    ):
+        return
+    for i, wheel in enumerate(WHEELS):
+        if len(known[i]) and np.ptp(known[i]) == 0.0:
+            words = f"is always {known[i][0]:g} while other wheels change: sensor or wiring?"
+            diagnosis.findings.append(Finding(f"omega_{wheel}", "constant", words))
+            wheels[:, i] = np.nan
 
 
 def _find_jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:

@@ -76,8 +76,8 @@ def is_foreign(rest: FloatArray, other_speed: FloatArray, off: BoolArray, fast: 
     moves = np.abs(other_speed) > 0.3 * fast
     return bool(
         moves.sum() > FOREIGN_ROWS
-        and np.mean(off[moves & agree]) > 0.6
         and agree[moves].mean() > 0.6
+        and np.mean(off[moves & agree]) > 0.6
     )
 
 

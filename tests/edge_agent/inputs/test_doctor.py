@@ -189,6 +189,15 @@ def test_speed_over_ground_in_another_unit_is_a_fault(rough: Recorded) -> None:
     assert [(one.channel, one.kind) for one in said.findings] == [("gnss_speed", "scale")]
 
 
+def test_wheels_that_send_a_constant_code_are_a_fault(rough: Recorded) -> None:
+    signals = rough.signals.copy()
+    signals[:, S.OMEGA] = -1.0
+    signals[:, S.OMEGA + 1] = 65535.0
+    said = diagnose(rough.t, signals, rough.vehicle)
+    found = {(one.channel, one.kind) for one in said.findings}
+    assert found == {("omega_fl", "constant"), ("omega_fr", "constant")}
+
+
 def test_time_stamps_in_whole_seconds_are_a_fault(rough: Recorded) -> None:
     said = diagnose(np.floor(rough.t), rough.signals, rough.vehicle)
     assert [(one.channel, one.kind) for one in said.findings] == [("t", "repeats")]
