@@ -66,8 +66,9 @@ def align_clocks(
                     f"{recording.name}: its date is {-zone * ZONE_S / 3600.0:g} h from the "
                     "others', probably because of another time zone"
                 )
-            if zone and recording.start_ns == receiver_ns:
-                # The date of a position receiver is correct, so the other date is shifted.
+            has_zone = recording.has_zone and not main.has_zone
+            if zone and (has_zone or recording.start_ns == receiver_ns):
+                # The date with a zone, or of a position receiver, is correct.
                 start_ns = main.start_ns - round(zone * ZONE_S * NS)
     return Alignment(offsets, start_ns, notes)
 

@@ -36,6 +36,7 @@ class Recording:
         start_ns: time [ns UTC] of t = 0; None if the source has no date.
         rows: True if all signals have the same times, like the columns of a table.
         notes: remarks of the reader.
+        has_zone: True if its date certainly is UTC or has a time zone.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Recording:
     start_ns: int | None = None
     rows: bool = False
     notes: list[str] = field(default_factory=list)
+    has_zone: bool = False
 
 
 @contextmanager

@@ -141,4 +141,4 @@ def read_gnss(path: Path) -> Recording:
         if broken
         else []
     )
-    return Recording(path.name, signals, start, notes=notes)
+    return Recording(path.name, signals, start, notes=notes, has_zone=True)

@@ -99,8 +99,10 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
     unit = time_unit or _unit_in(title) or None
     t, start_ns = _parse_seconds(table[title], column, unit)
     _check_order(column, t)
-    notes += [f"{path.name}: {doubt}" for doubt in _time_doubts(column, table[title].type, t, unit)]
-    recording = Recording(path.name, {}, start_ns, rows=True, notes=notes)
+    time_type = table[title].type
+    notes += [f"{path.name}: {doubt}" for doubt in _time_doubts(column, time_type, t, unit)]
+    has_zone = pa.types.is_timestamp(time_type) and time_type.tz is not None
+    recording = Recording(path.name, {}, start_ns, rows=True, notes=notes, has_zone=has_zone)
     left = []
     for name, title in titles.items():
         if name == column:
@@ -109,6 +111,9 @@ def _read_recording(path: Path, kind: str, time: str | None, time_unit: str | No
             recording.signals[name] = Series(t, numbers[title], _unit_in(title))
         elif not pa.types.is_null(table[title].type):
             left.append(f"{name} ({_first_text(table[title])!r})")
+    if not recording.signals:
+        problem = f"{path} has no column of numbers except the time: {', '.join(left[:MOST_NAMES])}"
+        raise InputError("source", problem, "write numbers with a decimal point, without units")
     if left:
         notes.append(f"{path.name}: left out, not only numbers: {', '.join(left[:MOST_NAMES])}")
     return recording
@@ -153,12 +158,16 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
 
 
 def _convert_decimal_commas(table: pa.Table) -> pa.Table:
-    """Convert the text columns of a table that contain only numbers with decimal commas."""
+    """Convert the text columns of a table that contain only numbers, or only times, with decimal
+    commas.
+    """
     for index, name in enumerate(table.column_names):
-        if pa.types.is_string(table[name].type):
-            text = pc.replace_substring(table[name], ",", ".")
+        if not pa.types.is_string(table[name].type):
+            continue
+        text = pc.replace_substring(table[name], ",", ".")
+        for kind in (pa.timestamp("ns", "UTC"), pa.timestamp("ns"), pa.float64()):
             with suppress(pa.ArrowInvalid):
-                table = table.set_column(index, name, pc.cast(text, pa.float64()))
+                table = table.set_column(index, name, pc.cast(text, kind))
     return table
 
 

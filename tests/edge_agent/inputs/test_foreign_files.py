@@ -189,6 +189,7 @@ def test_a_time_column_has_its_stated_unit_or_that_of_a_date(
     ("text", "message"),
     [
         ("time [lap],ax\n0,1.0\n1,2.0\n", "'lap', which is not a unit of time.*time_unit"),
+        ('t,lat\n0,"57,7"\n', "has no column of numbers except the time: lat .'57,7'.; write"),
         ("t,ax\n,1.0\n0.01,2.0\n", "t: is missing at row 0"),
         ("t,ax\ninf,1.0\n0.01,2.0\n", "t: is missing at row 0"),
         ("t,ax\n0.0,1.0\n,2.0\n", "t: is missing at row 1"),
@@ -211,6 +212,15 @@ def test_a_profile_states_the_unit_and_a_date_needs_none(tmp_path: Path) -> None
     dated = read_table(write(tmp_path / "b.csv", text))
     assert dated.signals["ax"].t[1] == pytest.approx(0.01)
     assert dated.start_ns == 1_714_557_600_000_000_000
+
+
+@pytest.mark.parametrize("zone", ["", "Z"])
+def test_times_with_a_decimal_comma_are_read(tmp_path: Path, zone: str) -> None:
+    text = f"time;ax\n2024-05-01T10:00:00,00{zone};1,5\n2024-05-01T10:00:00,01{zone};2,5\n"
+    found = read_table(write(tmp_path / "a.csv", text))
+    assert found.signals["ax"].t.tolist() == [0.0, 0.01]
+    assert found.signals["ax"].values.tolist() == [1.5, 2.5]
+    assert found.start_ns == 1_714_557_600_000_000_000
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,23 @@ def test_date_of_a_receiver_fits_a_log_that_counts_from_start_up(tmp_path: Path)
     assert merged.start_ns == pytest.approx(START_NS, abs=1e6)
 
 
+def test_date_with_a_zone_corrects_one_without(tmp_path: Path) -> None:
+    rows = [f"2026-11-29 12:00:0{k % 6}.{k // 6:02d},0.1,30,30,30,30" for k in range(600)]
+    own = tmp_path / "local.csv"
+    own.write_text("\n".join(["t,ax,omega_fl,omega_fr,omega_rl,omega_rr", *sorted(rows)]))
+    places = tmp_path / "places.csv"
+    fixes = [f"2026-11-29T10:00:0{k}Z,48.0,11.0" for k in range(6)]
+    places.write_text("\n".join(["time,latitude,longitude", *fixes]))
+    profile = PROFILE.model_copy(
+        update={
+            "channels": PROFILE.channels
+            | {name: Channel(signal=name) for name in ("latitude", "longitude")}
+        }
+    )
+    recordings = [read_source(path, None, None) for path in (own, places)]
+    assert merge_recordings(recordings, profile).start_ns == START_NS
+
+
 def test_fixes_before_an_earlier_time_are_counted(tmp_path: Path) -> None:
     path = write_nmea(tmp_path / "a.nmea", ["291129", *["291126"] * 5])
     recording = read_source(path, None, None)
