@@ -18,6 +18,7 @@ import time
 from collections import deque
 from collections.abc import Collection
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -46,6 +47,7 @@ MOST_BYTES: Final = 4096  # largest size of a report; with a prior as text it ha
 # [ns] How far a report's time may be ahead: a day for forecasts. Beyond, the sender's clock is
 # wrong.
 AHEAD_NS: Final = 86_400 * NS
+FIRST_NS: Final = 946_684_800 * NS  # 2000-01-01; an earlier time of a report is not in ns
 _DIGITS: Final = 20  # digits of the time [ns] in a file's name
 # Number of attempts to read the files while others join them. After these, there is another
 # problem.
@@ -291,11 +293,7 @@ def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
         region = row["region"]
         at = row["time"]
         region = grid.from_quadkey(region) if isinstance(region, str) else int(region)
-        when = (
-            int(at)
-            if isinstance(at, int)
-            else int(np.datetime64(at.replace(tzinfo=None), "ns").astype(np.int64))
-        )
+        when = at if isinstance(at, int) else _to_utc_ns(at)
         values = {
             name: np.nan if row.get(name) is None else float(row[name]) for name in weather.RANGES
         }
@@ -310,4 +308,13 @@ def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
             "region", "is not a z10 region", "use its quadint or quadkey"
         )
         raise InputError(f"weather row {number}, {refusal.field}", refusal.problem, refusal.fix)
+    if when < FIRST_NS:
+        fix = "give a timestamp, or ns since 1970"
+        raise InputError(f"weather row {number}, time", "lies before 2000", fix)
     return region, Report(when, prior=prior, **values)
+
+
+def _to_utc_ns(time: datetime) -> int:
+    """Return a time in ns since 1970; without a zone it is UTC."""
+    utc = time if time.tzinfo is None else time.astimezone(UTC)
+    return int(np.datetime64(utc.replace(tzinfo=None), "ns").astype(np.int64))

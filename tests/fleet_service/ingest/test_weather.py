@@ -96,6 +96,10 @@ def file(path: Path, **columns: object) -> Path:
             {"region": [-1], "time": [1], "precipitation": [1.0]},
             "row 0, region: is not a z10 region",
         ),
+        (
+            {"region": ["1202300230"], "time": [1_796_000_000], "precipitation": [1.0]},
+            "row 0, time: lies before 2000; give a timestamp, or ns",
+        ),
         ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: region, time"),
     ],
 )
@@ -106,6 +110,13 @@ def test_a_wrong_weather_file_is_refused_with_row_and_column(
         read_file(file(tmp_path / "w.parquet", **columns))
     with pytest.raises(InputError, match="cannot read"):
         read_file(tmp_path / "none.parquet")
+
+
+def test_zone_of_a_time_in_a_weather_file_is_heeded(tmp_path: Path) -> None:
+    noon_utc = pa.array([1_796_040_000], pa.timestamp("s", "Europe/Stockholm"))
+    columns = {"region": ["1202300230"], "time": noon_utc, "precipitation": [1.0]}
+    [(_, report)] = read_file(file(tmp_path / "w.parquet", **columns))
+    assert report.time == 1_796_040_000 * 10**9
 
 
 def drive(engine: Engine, begin: int, seq: int) -> None:
