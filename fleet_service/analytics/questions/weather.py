@@ -5,7 +5,7 @@ weather station measured in the same hour.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import ibis
 import numpy as np
@@ -20,14 +20,20 @@ from schemas.errors import InputError
 from schemas.thresholds import SLIPPERY_MU
 
 NEEDED: Final = ("station", "time", "latitude", "longitude", "temperature")
+RANGES: Final = {
+    "latitude": (-90.0, 90.0),
+    "longitude": (-180.0, 180.0),
+    "temperature": (-90.0, 60.0),
+}
+FARTHEST_DEG: Final = 0.9  # a station more than 100 km away does not show the local temperature
 BAND: Final = 2.0  # [°C] width of the temperature band of one row
 _HOUR_S: Final = 3600
 _BITS: Final = 22  # bits by which the number of a cell is longer than that of a region: 2·(21 - 10)
 
 
 def nearest_readings(t: Table, path: Path) -> Table:
-    """Return observations with a column `temperature` [°C]: the reading of the nearest station in
-    the same hour.
+    """Return observations with a column `temperature` [°C]: the reading of the nearest station,
+    within 100 km, in the same hour.
 
     Raises:
         InputError: the table of stations cannot be used.
@@ -61,12 +67,12 @@ def _join_stations(t: Table, stations: Table, readings: Table) -> Table:
     t = t.mutate(region=t.cell >> _BITS, hour=(t.time / _HOUR_S).floor().cast("int64"))
     regions = t.group_by("region").aggregate(lat=t.latitude.mean(), lon=t.longitude.mean())
     pairs = regions.cross_join(stations)
-    metres = ((pairs.lat - pairs.latitude) ** 2) + (
+    square = ((pairs.lat - pairs.latitude) ** 2) + (
         (pairs.lon - pairs.longitude) * (pairs.lat * np.pi / 180).cos()
     ) ** 2
-    pairs = pairs.mutate(metres=metres)
+    pairs = pairs.mutate(square=square).filter(square < FARTHEST_DEG**2)
     pairs = pairs.mutate(
-        rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station])
+        rank=ibis.row_number().over(group_by="region", order_by=[pairs.square, pairs.station])
     )
     nearest = pairs.filter(pairs["rank"] == 0).select("region", "station")
     t = t.inner_join(nearest, "region")
@@ -89,9 +95,12 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             f"give a CSV or Parquet file with {', '.join(NEEDED)}",
         )
     stations, readings = read_stations(options.stations)
-    return engine.answer(
+    found = engine.answer(
         expression(engine.observations(), ibis.memtable(stations), ibis.memtable(readings))
     )
+    if not found.num_rows:
+        options.report("no station within 100 km has a reading in the hour of an observation")
+    return found
 
 
 def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
@@ -112,7 +121,7 @@ def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
             "stations", f"{path.name} has no {missing[0]}", f"give columns {', '.join(NEEDED)}"
         )
     try:
-        time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
+        time = table["time"].cast(pa.timestamp("s"), safe=False).cast(pa.int64())
         numbers = {name: table[name].cast(pa.float64()) for name in NEEDED[2:]}
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         problem = f"{path.name} has an invalid value ({str(error).splitlines()[0][:100]})"
@@ -121,15 +130,22 @@ def read_stations(path: Path) -> tuple[pa.Table, pa.Table]:
             "unknown values empty"
         )
         raise InputError("stations", problem, fix) from error
-    for name, column in numbers.items():
-        table = table.set_column(table.schema.get_field_index(name), name, column)
-    table = table.filter(pc.is_valid(table["temperature"]))
-    table = table.append_column("hour", pc.divide(time, _HOUR_S)).set_column(
-        table.schema.get_field_index("station"), "station", table["station"].cast(pa.string())
-    )
+    _check_ranges(path.name, numbers)
+    table = pa.table({"station": table["station"].cast(pa.string()), **numbers})
+    table = table.append_column("hour", pc.divide(time, _HOUR_S))
+    table = table.filter(pc.and_(pc.is_valid(table["temperature"]), pc.is_valid(time)))
     stations = table.group_by("station").aggregate([("latitude", "mean"), ("longitude", "mean")])
     readings = table.group_by(["station", "hour"]).aggregate([("temperature", "mean")])
     return (
         stations.rename_columns(["station", "latitude", "longitude"]),
         readings.rename_columns(["station", "hour", "temperature"]),
     )
+
+
+def _check_ranges(name: str, numbers: dict[str, pa.ChunkedArray[Any]]) -> None:
+    """Raise an InputError if a position or temperature in the file `name` is impossible."""
+    for column, (least, most) in RANGES.items():
+        for value in (pc.min(numbers[column]).as_py(), pc.max(numbers[column]).as_py()):
+            if value is not None and not least <= value <= most:
+                problem = f"{name} has the {column} {value:g}, outside {least:g} to {most:g}"
+                raise InputError("stations", problem, "give degrees, and degrees Celsius")

@@ -296,6 +296,31 @@ def test_what_a_question_lacks_is_said(
         asked(name, **options)
 
 
+READING = "a,2026-01-27T06:30:00.5Z,57.7,11.99,-2\n"
+
+
+def test_station_without_temperature_or_far_away_is_left_out(asked: Ask, tmp_path: Path) -> None:
+    path = tmp_path / "stations.csv"
+    head = "station,time,latitude,longitude,temperature\n"
+    path.write_text(f"{head}{READING}a,2026-01-27T07:30:00Z,57.7,11.99,\n")
+    assert asked("weather", stations=path)["temperature"].to_pylist() == [-2.0]
+    path.write_text(head + READING.replace("57.7,11.99", "11.99,57.7"))
+    assert not asked("weather", stations=path).num_rows
+
+
+@pytest.mark.parametrize(
+    ("given", "wrong"), [("57.7,", "577,"), (",-2\n", ",271\n"), ("11.99", "1199")]
+)
+def test_station_with_an_impossible_value_is_refused(
+    asked: Ask, tmp_path: Path, given: str, wrong: str
+) -> None:
+    path = tmp_path / "stations.csv"
+    row = READING.replace(given, wrong)
+    path.write_text(f"station,time,latitude,longitude,temperature\n{row}")
+    with pytest.raises(InputError, match="stations: stations.csv has the .* outside"):
+        asked("weather", stations=path)
+
+
 def test_a_part_without_rows_is_said(asked: Ask) -> None:
     with pytest.raises(InputError, match="^archive: no compacted observations"):
         asked("grip", part=Extract(0, 10**9))
