@@ -83,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         from fleet_service.page import server
         from fleet_service.page.basemap import base_map
+        from fleet_service.page.overlay import read_overlay
         from fleet_service.page.roads import read_roads
     except ImportError as error:
         fix = install_command("page")
@@ -96,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
             )
     if arguments.archive is not None:
         _check_archive(arguments.archive)
+    if arguments.overlay is not None and read_overlay(arguments.overlay) is None:
+        print(f"waiting for the overlay {arguments.overlay}: there is no such file yet", flush=True)
     settings = server.PageSettings(
         connection=connection,
         host=arguments.host,

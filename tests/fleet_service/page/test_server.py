@@ -393,6 +393,15 @@ def test_files_of_the_map_that_are_missing_are_refused(
         assert "none" in capsys.readouterr().err
 
 
+def test_overlay_without_its_columns_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "overlay.parquet"
+    pq.write_table(pa.table({"cell": [7], "mu": [0.2]}), path)
+    assert main(["page", "--connect", "tcp/127.0.0.1:1", "--overlay", str(path)]) == 2
+    assert "error: overlay: overlay.parquet lacks the columns" in capsys.readouterr().err
+
+
 def test_metrics_that_are_no_address_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["page", "--connect", "tcp/127.0.0.1:1", "--metrics", "foo"]) == 2
     assert capsys.readouterr().err.startswith("error: metrics: 'foo' is not an address; ")
