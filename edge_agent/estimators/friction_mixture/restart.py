@@ -10,7 +10,7 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.common.arrays import clear_vector
 from edge_agent.estimators.common.excitation import begin_excitation
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
-from edge_agent.estimators.common.readings import read_plausible, rolling_speed
+from edge_agent.estimators.common.readings import INPUTS, read_plausible, rolling_speed
 from edge_agent.estimators.friction_mixture.block.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.block.wheel_readings import refuse_jumps
 from edge_agent.estimators.friction_mixture.node.rolling_motion import SMALLEST_STD
@@ -50,6 +50,8 @@ def start_vehicle(
     read_plausible(sample, now)
     refuse_jumps(memory.row, now)
     last.time = block.time = time
+    for channel in range(INPUTS):
+        last.reading[channel], last.reading_time[channel] = now[channel], time
     last.position_time = last.inertial_time = -math.inf
     last.read_ax = last.read_ay = math.nan
     rate = now[S.YAW_RATE]
@@ -57,6 +59,7 @@ def start_vehicle(
     last.yaw_rate_var = UNKNOWN_YAW_VAR if math.isnan(rate) else YAW_STD**2
     for wheel in range(4):
         block.start_omega[wheel] = last.omega[wheel] = now[S.OMEGA + wheel]
+        block.start_omega_time[wheel] = time
         angle = now[S.DELTA + wheel]
         last.delta[wheel] = last.delta_before[wheel] = 0.0 if math.isnan(angle) else angle
     speed = rolling_speed(memory.row, now)

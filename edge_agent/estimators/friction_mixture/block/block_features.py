@@ -83,7 +83,9 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.steer_sin[wheel] = math.sin(last.delta[wheel])
         _turn_wheel(row, features, wheel)
         features.rolling[wheel] = row[Parameter.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
-        change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
+        # A wheel that is read less often than once per block has changed over a longer time.
+        elapsed = last.reading_time[S.OMEGA + wheel] - block.start_omega_time[wheel]
+        change = (last.omega[wheel] - block.start_omega[wheel]) / max(elapsed, features.duration)
         features.spin[wheel] = 0.0 if math.isnan(change) else change
     features.steering = 0.5 * (last.delta[0] + last.delta[1])
     features.change, features.steer_rate = ax, _steer_rate(memory, features.duration)
@@ -368,9 +370,12 @@ def wheel_speed_jump(
     usual = memory.usual_rolling
     expected = usual[wheel] + features.change * features.duration
     share = 1.0 - math.exp(-features.duration / constants.physical.abrupt_time)
-    usual[wheel] = now if math.isnan(expected) else expected + share * (now - expected)
-    jump = abs(now - expected)
-    return 0.0 if math.isnan(jump) else jump
+    jump = now - expected
+    if math.isnan(jump):
+        usual[wheel] = now if math.isnan(expected) else expected
+        return 0.0
+    usual[wheel] = expected + share * jump
+    return float(abs(jump))
 
 
 @compiled

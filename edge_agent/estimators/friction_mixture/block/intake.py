@@ -1,9 +1,10 @@
 """Intake of a sample: it rejects impossible readings, filters the yaw rate, and adds the sample to
 the sums of the block (the samples within 0.05 s).
 
-Missing accelerations are replaced: a_x by zero and a_y by r*v_x (yaw rate times speed). In both
-cases the velocity gets the process noise of a random walk. A missing yaw rate is replaced by that
-from the speed difference of the rear wheels, and missing steering by its last value. All other
+A missing inertial reading or steering angle is replaced by the last one for a short time, because
+signals are often read less often than the log has rows. Later, accelerations are replaced: a_x by
+zero and a_y by r*v_x (yaw rate times speed). In both cases the velocity gets the process noise of a
+random walk. The yaw rate is then computed from the speed difference of the rear wheels. All other
 missing readings are left out of the sums.
 """
 
@@ -32,6 +33,7 @@ from edge_agent.estimators.friction_mixture.state.gap import (
     bridge_gap,
 )
 from edge_agent.estimators.friction_mixture.state.memory import (
+    LastInputs,
     MixtureMemory,
     PlanarVector,
     VelocityGain,
@@ -43,6 +45,8 @@ from schemas.signals import S
 # [m/s^2] largest change between two readings of an accelerometer. A real jump is accepted at its
 # second reading.
 JUMP_M_S2 = 3.0
+# [s] time for which a missing reading counts as unchanged: one period of a signal of 5 Hz
+HELD_S = 0.2
 EARLY_S = 1e-6  # [s] tolerance of the block length for rounding of the sample times
 YAW_WALK = 3.0  # [rad/s/s^.5] random walk of the yaw rate: yaw acceleration of a lively car
 REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and slip difference
@@ -63,6 +67,7 @@ def take_sample(
     # The block decides about NO_STEERING, because a single missing angle is replaced.
     health = read_plausible(sample, now) & ~flags.NO_STEERING
     health |= refuse_jumps(memory.row, now)
+    hold_readings(last, time)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)
     if dt > GAP_S:
@@ -75,12 +80,27 @@ def take_sample(
     ay = _drop_outlier(now[S.AY], last.ay, last.read_ay)
     last.read_ax = now[S.AX]
     last.read_ay = now[S.AY]
+    last.reading[S.AX] = ax  # an outlier is not held
+    last.reading[S.AY] = ay
     if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
         health |= flags.OUTLIER
     _integrate_motion(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
     _add_sample(memory, ax, ay)
     last.time = time
     return health, time - memory.block.time >= design.constants.chosen.block_time - EARLY_S
+
+
+@compiled
+def hold_readings(last: LastInputs, time: float) -> None:
+    """Note the readings `last.now` of the sample at `time` [s]. Replace a missing inertial reading
+    or steering angle by the last one if it is at most HELD_S old: rows of a log are often more
+    frequent than some of its signals.
+    """
+    for channel in range(INPUTS):
+        if not math.isnan(last.now[channel]):
+            last.reading[channel], last.reading_time[channel] = last.now[channel], time
+        elif channel < S.OMEGA and time - last.reading_time[channel] <= HELD_S:
+            last.now[channel] = last.reading[channel]
 
 
 @compiled
@@ -101,6 +121,7 @@ def begin_block(memory: MixtureMemory) -> None:
         block.counts[channel] = 0
     for wheel in range(4):
         block.start_omega[wheel], last.delta_before[wheel] = last.omega[wheel], last.delta[wheel]
+        block.start_omega_time[wheel] = last.reading_time[S.OMEGA + wheel]
 
 
 @compiled

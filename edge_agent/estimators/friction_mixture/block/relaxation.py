@@ -56,9 +56,10 @@ def relax_slips(
             (slip_y, memory.built_across, features.late_across),
         ):
             if math.isnan(slip):  # an unknown slip is not delayed
-                built[wheel] = late[wheel] = 0.0
+                built[wheel] = math.nan
+                late[wheel] = 0.0
                 continue
-            before = built[wheel] - slip
+            before = 0.0 if math.isnan(built[wheel]) else built[wheel] - slip
             after = before * math.exp(-rolled)
             built[wheel] = slip + after
             late[wheel] = delayed * (before - after)

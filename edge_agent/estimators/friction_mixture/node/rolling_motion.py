@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
+from edge_agent.estimators.common.readings import GAP_S
 from edge_agent.estimators.friction_mixture.block.block_features import ROUNDING, at_centre, mean_or
 from edge_agent.estimators.friction_mixture.block.drive_split import free_axle
 from edge_agent.estimators.friction_mixture.block.wheel_readings import STEP_LEAST
@@ -51,7 +52,8 @@ LONGEST_SLIDE_S = 10.0
 @compiled
 def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
     """Update memory.rolling, the motion that follows if the wheels roll, with the wheel speeds of
-    the block (the samples within 0.05 s).
+    the block (the samples within 0.05 s). A block without them changes nothing if they were read
+    within the last GAP_S.
     """
     rolling = memory.rolling
     row = memory.row
@@ -60,17 +62,20 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     least = math.inf
     most = -math.inf
     total = 0.0
-    seen = 0
+    seen = recent = 0
     step = 0.0
     fastest = 0.0
     free = free_axle(row, memory.drive_odds, features.change)
     needed = 3 if free < 0 else 2
     for wheel in range(4):
         speed = features.rolling[wheel]
+        counts = free < 0 or wheel // 2 == free
+        if counts and time - memory.last.reading_time[S.OMEGA + wheel] < GAP_S:
+            recent = recent + 1
         if math.isnan(speed):
             continue
         fastest = max(fastest, abs(speed))
-        if free >= 0 and wheel // 2 != free:
+        if not counts:
             continue
         ahead = at_centre(row, features, wheel)
         least = min(least, ahead)
@@ -78,6 +83,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         total = total + ahead
         seen = seen + 1
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
+    if seen < needed <= recent:
+        return
     still = seen >= needed and fastest < STEP_LEAST * row[Parameter.RADIUS]
     _update_standstill(memory, constants, features, still)
     held = fastest < LOCKED_SHARE * features.speed and abs(features.change) > SLIDES_M_S2

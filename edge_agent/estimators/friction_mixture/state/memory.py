@@ -58,6 +58,7 @@ class BlockSums:
     missing_y: float  # [m^2/s^3] variance of v_y per second if a_y or yaw rate is missing
     start_yaw_rate: float  # [rad/s] yaw rate at the beginning
     start_omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds at the beginning
+    start_omega_time: Annotated[FloatArray, 4]  # [s] time at which each of them was read
 
 
 class LastInputs:
@@ -68,6 +69,8 @@ class LastInputs:
     time: float  # [s] time of the last sample
     position_time: float  # [s] time of the last position
     now: Annotated[FloatArray, INPUTS]  # readings of the last sample, NaN where missing
+    reading: Annotated[FloatArray, INPUTS]  # last valid reading of each channel
+    reading_time: Annotated[FloatArray, INPUTS]  # [s] time of that reading
     inertial_time: float  # [s] time of the last sample with both accelerations
     ax: float  # [m/s^2] last value used
     ay: float
