@@ -17,6 +17,7 @@ GRAVITY             acceleration of gravity [m/s²], rounded; standard is 9.8066
 EARTH_RADIUS_M      radius of the Web Mercator sphere [m]: semi-major axis of WGS 84
 METRES_PER_DEGREE   length of a degree of latitude on this sphere [m/°], rounded:
                     π/180 · EARTH_RADIUS_M
+SLOWEST_HZ          smallest rate of readings of a signal that suffices for friction [1/s]
 REACTION_S          reaction time of a warned driver [s] (Green, Transportation Human Factors 2,
                     2000: 1.2 to 1.5 s)
 NS                  nanoseconds per second
@@ -41,6 +42,7 @@ Z_95: Final = NormalDist().inv_cdf(0.95)
 GRAVITY: Final = 9.81
 EARTH_RADIUS_M: Final = 6_378_137.0
 METRES_PER_DEGREE: Final = 111_320.0
+SLOWEST_HZ: Final = 5.0
 REACTION_S: Final = 1.5
 NS: Final = 1_000_000_000
 UNKNOWN: Final = -1

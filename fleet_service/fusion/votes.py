@@ -519,8 +519,7 @@ def _limited_weight(
 
 @refcount_free_inlined
 def _age_likelihood(scratch: Bins, weather: Weather, key: int, begin: int, end: int) -> None:
-    """Age the likelihood in `scratch`, which is about the road at the time `begin` [ns], to the
-    time `end` of the belief: the road may have changed between them.
+    """Age the likelihood in `scratch` from the time `begin` of its visit to `end` [ns].
 
     The model of a changing road is a Markov chain: a diffusion with reflecting ends, and sudden
     changes to any friction. The chain is reversible, so a likelihood ages like a belief.

@@ -44,12 +44,12 @@ from edge_agent.inputs.doctor.slip import (
 from edge_agent.inputs.log_columns import GROUND
 from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
+from schemas.thresholds import SLOWEST_HZ
 from schemas.vehicle import Vehicle
 
 JUMPS = 0.01  # share of a wheel's readings that may differ strongly from the other wheels
 CONSTANT_S = 10.0  # [s] no wheel turns at exactly the same speed, or stands, for that long
 CHANGES = 0.2  # share of its largest value by which the speed of another wheel must change
-SLOWEST_HZ = 5.0
 FASTEST_HZ = 2000.0
 
 

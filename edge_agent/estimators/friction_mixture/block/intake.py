@@ -41,12 +41,11 @@ from edge_agent.estimators.friction_mixture.state.memory import (
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
+from schemas.thresholds import SLOWEST_HZ
 
 # [m/s^2] largest change between two readings of an accelerometer. A real jump is accepted at its
 # second reading.
 JUMP_M_S2 = 3.0
-# [s] time for which a missing reading counts as unchanged: one period of a signal of 5 Hz
-HELD_S = 0.2
 EARLY_S = 1e-6  # [s] tolerance of the block length for rounding of the sample times
 YAW_WALK = 3.0  # [rad/s/s^.5] random walk of the yaw rate: yaw acceleration of a lively car
 REAR_STD = 0.03  # [rad/s] error of the yaw rate from the rear wheels: noise and slip difference
@@ -93,13 +92,13 @@ def take_sample(
 @compiled
 def hold_readings(last: LastInputs, time: float) -> None:
     """Note the readings `last.now` of the sample at `time` [s]. Replace a missing inertial reading
-    or steering angle by the last one if it is at most HELD_S old: rows of a log are often more
-    frequent than some of its signals.
+    or steering angle by the last one if it is at most one period of SLOWEST_HZ old: rows of a log
+    are often more frequent than some of its signals.
     """
     for channel in range(INPUTS):
         if not math.isnan(last.now[channel]):
             last.reading[channel], last.reading_time[channel] = last.now[channel], time
-        elif channel < S.OMEGA and time - last.reading_time[channel] <= HELD_S:
+        elif channel < S.OMEGA and time - last.reading_time[channel] <= 1.0 / SLOWEST_HZ:
             last.now[channel] = last.reading[channel]
 
 
