@@ -118,7 +118,6 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
         memory.health |= flags.CONTRADICTION
     conclude_friction(memory, design, scratch)
     begin_block(memory)
-    memory.block.missing_x = memory.block.missing_y = 0.0
 
 
 @compiled
@@ -132,9 +131,9 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
     duration = scratch.features.duration
     process = scratch.process
     keep = scratch.keep
-    process[NodeState.VX] = (constants.physical.drift**2 + block.missing_x) * duration
+    process[NodeState.VX] = constants.physical.drift**2 * duration + block.missing_x
     unsure = constants.chosen.distrust_drift * memory.trust.distrust
-    process[NodeState.VY] = (constants.physical.drift**2 + unsure**2 + block.missing_y) * duration
+    process[NodeState.VY] = (constants.physical.drift**2 + unsure**2) * duration + block.missing_y
     forgets = memory.trust.distrust / constants.chosen.distrust_forget
     speed = scratch.features.speed
     turning = abs(scratch.features.yaw_rate)

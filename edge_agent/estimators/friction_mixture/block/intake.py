@@ -24,7 +24,11 @@ from edge_agent.estimators.common.readings import (
 )
 from edge_agent.estimators.friction_mixture.block.grip_guard import note_grip
 from edge_agent.estimators.friction_mixture.block.wheel_readings import note_step, refuse_jumps
-from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.state.constants import (
+    Constants,
+    DesignConstants,
+    NodeState,
+)
 from edge_agent.estimators.friction_mixture.state.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.state.gap import (
     LOST_WALK,
@@ -66,7 +70,7 @@ def take_sample(
     # The block decides about NO_STEERING, because a single missing angle is replaced.
     health = read_plausible(sample, now) & ~flags.NO_STEERING
     health |= refuse_jumps(memory.row, now)
-    hold_readings(last, time)
+    hold_readings(last, time, design.constants.chosen)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)
     if dt > GAP_S:
@@ -90,16 +94,24 @@ def take_sample(
 
 
 @compiled
-def hold_readings(last: LastInputs, time: float) -> None:
+def hold_readings(last: LastInputs, time: float, chosen: DesignConstants) -> None:
     """Note the readings `last.now` of the sample at `time` [s]. Replace a missing inertial reading
-    or steering angle by the last one if it is at most one period of SLOWEST_HZ old: rows of a log
-    are often more frequent than some of its signals.
+    or steering angle by the last one, because rows of a log are often more frequent than some of
+    its signals.
+
+    A reading is replaced for a block, or for the signal's longest interval between readings in the
+    last seconds (time constant `window`), and at most for a period of SLOWEST_HZ.
     """
     for channel in range(INPUTS):
+        age = time - last.reading_time[channel]
+        interval = last.reading_interval[channel]
         if not math.isnan(last.now[channel]):
+            last.reading_interval[channel] = max(age, interval * math.exp(-age / chosen.window))
             last.reading[channel], last.reading_time[channel] = last.now[channel], time
-        elif channel < S.OMEGA and time - last.reading_time[channel] <= 1.0 / SLOWEST_HZ:
-            last.now[channel] = last.reading[channel]
+        elif channel < S.OMEGA:
+            longest = min(max(interval, chosen.block_time), 1.0 / SLOWEST_HZ)
+            if age <= longest + EARLY_S:
+                last.now[channel] = last.reading[channel]
 
 
 @compiled
@@ -112,6 +124,7 @@ def begin_block(memory: MixtureMemory) -> None:
     block.time = last.time
     block.samples = 0
     block.angle = block.cos_sum = block.sin_sum = 0.0
+    block.missing_x = block.missing_y = 0.0
     _clear_gain(block.gain)
     _clear_gain(block.gain_sum)
     block.start_yaw_rate = last.yaw_rate
@@ -186,9 +199,9 @@ def _integrate_motion(
     leak_y = ay
     if math.isnan(ax):
         ax = 0.0
-        block.missing_x = LOST_WALK**2
+        block.missing_x += LOST_WALK**2 * dt
     if math.isnan(ay) or not turning:
-        block.missing_y = LOST_WALK**2
+        block.missing_y += LOST_WALK**2 * dt
     if math.isnan(ay):
         ay = rate * memory.overall_mean[NodeState.VX]
         leak_y = 0.0

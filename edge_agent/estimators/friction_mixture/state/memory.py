@@ -54,8 +54,8 @@ class BlockSums:
     gain_sum: VelocityGain  # sum of `gain` over the samples
     sums: Annotated[FloatArray, INPUTS]  # sum of each channel's valid samples
     counts: Annotated[IntArray, INPUTS]  # number of each channel's valid samples
-    missing_x: float  # [m^2/s^3] variance of v_x per second if a_x is missing
-    missing_y: float  # [m^2/s^3] variance of v_y per second if a_y or yaw rate is missing
+    missing_x: float  # [m^2/s^2] variance of v_x from the time in which a_x is missing
+    missing_y: float  # [m^2/s^2] variance of v_y, the same for a_y and the yaw rate
     start_yaw_rate: float  # [rad/s] yaw rate at the beginning
     start_omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds at the beginning
     start_omega_time: Annotated[FloatArray, 4]  # [s] time at which each of them was read
@@ -71,6 +71,8 @@ class LastInputs:
     now: Annotated[FloatArray, INPUTS]  # readings of the last sample, NaN where missing
     reading: Annotated[FloatArray, INPUTS]  # last valid reading of each channel
     reading_time: Annotated[FloatArray, INPUTS]  # [s] time of that reading
+    # [s] longest time between two readings of a channel in the last second
+    reading_interval: Annotated[FloatArray, INPUTS]
     inertial_time: float  # [s] time of the last sample with both accelerations
     ax: float  # [m/s^2] last value used
     ay: float
