@@ -294,8 +294,8 @@ def _find_late(time: IntArray, checkpoint: int | None) -> tuple[BoolArray, IntAr
 
 def _make_arrivals(observations: Observations, vehicle: IntArray, late_by: IntArray) -> Arrivals:
     """Return the columns of n observations that the windows store; `late_by` (n,) is their delay
-    [ns]. Weights are 0, and reports of an
-    intervention (`limited`) are not marked as heeded or claimed yet.
+    [ns]. Weights are 0, and reports of an intervention (`limited`) are not marked as heeded or
+    claimed yet.
     """
     n = len(observations.time)
     return Arrivals(

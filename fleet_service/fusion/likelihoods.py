@@ -68,7 +68,8 @@ def make_evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArra
             for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
         )
         value = used >= EXCITED_SHARE * mu  # False where either is NaN
-        slides = find_slides(columns, with_likelihood)
+        limited = find_limited(columns, columns["mu_utilised"])
+        slides = find_slides(columns, with_likelihood, limited)
         log_likelihood = np.where(
             value[:, None],
             interval_likelihood(mu, lower, upper),
@@ -172,8 +173,12 @@ def at_least(used: FloatArray) -> FloatArray:
     is the grip used and σ_u its standard deviation. They are flat if u is NaN.
     """
     known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), constants.UTILISED_MOST)[:, None]
-    std = np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
-    return log_distribution((mugrid.CENTRES - known_use) / std)
+    return log_distribution((mugrid.CENTRES - known_use) / std_of_used(np.maximum(known_use, 0.0)))
+
+
+def std_of_used(used: NDArray[Any]) -> NDArray[Any]:
+    """Return the standard deviation [1] of the grip used."""
+    return np.asarray(np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used))
 
 
 def interval_likelihood(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
@@ -192,17 +197,21 @@ def sliding_likelihood(used: FloatArray) -> FloatArray:
     grip used u (n,). In simulated slides on ice, u was .67 to .92 of μ. So the 90 % interval is
     from u to u/EXCITED_SHARE, and the median is u/SHARED_SHARE; the error of u is added.
     """
-    error = Z_95 * np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
-    lower, upper = used - error, used / EXCITED_SHARE + error
+    error = Z_95 * std_of_used(used)
+    lower = used - error
+    upper = used / EXCITED_SHARE + error
     return interval_likelihood(used / constants.SHARED_SHARE, lower, upper)
 
 
-def find_slides(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> BoolArray:
+def find_slides(
+    columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray, limited: BoolArray
+) -> BoolArray:
     """Return a mask of visits (n,) whose slide is evidence of slippery road: a slip controller
-    intervened at little grip (`find_limited`), and the sender gave neither a likelihood nor a
-    value. Otherwise the likelihood or value already contains the slide, which must not count twice.
+    intervened at little grip (`limited`, see `find_limited`), and the sender gave neither a
+    likelihood nor a value. Otherwise the likelihood or value already contains the slide, which must
+    not count twice.
     """
-    slides = find_limited(columns, columns["mu_utilised"]) & ~with_likelihood
+    slides = limited & ~with_likelihood
     if slides.any():
         slides &= ~(columns["mu_utilised"] >= EXCITED_SHARE * columns["mu"])
     return slides
@@ -220,8 +229,7 @@ def find_limited(columns: Mapping[str, NDArray[Any]], used: NDArray[Any]) -> Boo
     for name in FLAGS:
         if name in columns:
             active |= columns[name] == 1
-    most = used + np.hypot(constants.UTILISED_STD, constants.UTILISED_RELATIVE * used)
-    return np.asarray(active & (most < SLIPPERY_MU))
+    return np.asarray(active & (used + std_of_used(used) < SLIPPERY_MU))
 
 
 def _side_std(to_bound: FloatArray) -> FloatArray:

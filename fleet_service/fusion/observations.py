@@ -93,7 +93,7 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"]
     )
     # A sliding vehicle used all of the grip, so the error of the tyre curve does not apply.
-    used = np.where(find_slides(columns, columns["with_likelihood"]), SLIPPERY_MU, used)
+    used = np.where(find_slides(columns, columns["with_likelihood"], limited), SLIPPERY_MU, used)
     other, share = other_cells(
         columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
     )

@@ -254,9 +254,7 @@ def update_cell(
     weather: Weather,
     scratch: Bins,
 ) -> None:
-    """Update the state of a cell with the effect of one entry (an observation), whose likelihood
-    the caller has written to `scratch` (work memory).
-    """
+    """Update a cell by one entry (an observation), whose likelihood is in `scratch`."""
     row, sources = place
     cells = rows.cells
     time = entries[entry].time - entries[entry].late * LATE_NS
@@ -265,7 +263,8 @@ def update_cell(
     is_outdated = time < cells[row].time
     p = scratch[ScratchRow.BELIEF]
     unpack_belief(rows.belief, row, p)
-    change, prior = 0.0, 0
+    change = 0.0
+    prior = 0
     if is_outdated:
         _age_likelihood(scratch, weather, cells[row].key, time, cells[row].time)
     else:

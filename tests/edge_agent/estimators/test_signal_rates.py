@@ -52,7 +52,8 @@ def test_slow_signals_leave_estimates_right(mu: float, manoeuvre: str, group: st
             thin(signals, group, rate=10)
         t = log["t"].to_numpy()[:, None]
         estimates = bank_of("aco-fckf", [known]).advance(t, signals[:, None])
-        lower, upper = estimates.mu_lower[FIRST:, 0], estimates.mu_upper[FIRST:, 0]
+        lower = estimates.mu_lower[FIRST:, 0]
+        upper = estimates.mu_upper[FIRST:, 0]
         assert np.mean(lower > mu + 0.05) < 0.02
         assert np.mean(upper < mu - 0.05) < 0.06
         assert np.mean(upper < 0.45) > 0.7 if mu == ICE else np.all(upper > 0.45)

@@ -32,17 +32,23 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
     """
     slowest = second = math.inf
     for wheel in range(4):
-        omega = now[S.OMEGA + wheel]
-        if omega < slowest:
-            slowest, second = omega, slowest
-        elif omega < second:
-            second = omega
+        slowest, second = two_smallest(slowest, second, now[S.OMEGA + wheel])
     health = 0
     for wheel in range(4):
         if row[Parameter.RADIUS] * (now[S.OMEGA + wheel] - second) > SPINS_M_S:
             now[S.OMEGA + wheel] = math.nan
             health = flags.OUTLIER | flags.NO_WHEEL_SPEED
     return health
+
+
+@compiled
+def two_smallest(smallest: float, second: float, value: float) -> tuple[float, float]:
+    """Return the smallest and the second smallest of three numbers, of which `smallest` ≤ `second`;
+    a `value` that is NaN does not count.
+    """
+    if value < smallest:
+        return value, smallest
+    return smallest, value if value < second else second
 
 
 @compiled

@@ -14,6 +14,7 @@ import math
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S as SLOWEST_SLIP_M_S
 from edge_agent.estimators.friction_mixture.block.block_features import at_centre
+from edge_agent.estimators.friction_mixture.block.wheel_readings import two_smallest
 from edge_agent.estimators.friction_mixture.state.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S
 from edge_agent.estimators.friction_mixture.state.memory import MixtureMemory
@@ -71,11 +72,9 @@ def learn_vibration(memory: MixtureMemory, constants: Constants, features: Block
     for wheel in range(4):
         omega = features.rolling[wheel] / memory.row[Parameter.RADIUS]
         bend = abs(omega - 2.0 * earlier[0, wheel] + earlier[1, wheel])
-        earlier[1, wheel], earlier[0, wheel] = earlier[0, wheel], omega
-        if bend < smallest:
-            smallest, second = bend, smallest
-        elif bend < second:
-            second = bend
+        earlier[1, wheel] = earlier[0, wheel]
+        earlier[0, wheel] = omega
+        smallest, second = two_smallest(smallest, second, bend)
     if second < math.inf and features.speed > SLOW_M_S:
         share = 1.0 - math.exp(-features.duration / constants.chosen.window)
         share *= 1.0 - sliding_degree(memory)
