@@ -92,7 +92,7 @@ CASES: Final = {
     "wheel-speed-stuck": Case(
         fault_on("stuck", "omega_fl"),
         Health.OK,
-        "not reported; the other wheels outvote a wheel that seems to slide",
+        "reported by the default estimator, which leaves the wheel out; others do not notice",
     ),
     "spikes-beyond-belief": Case(
         fault_on("spike", "omega_fl", size=900.0) + fault_on("spike", "ay", size=60.0),

@@ -22,6 +22,7 @@ from edge_agent.estimators.common.readings import (
     position_time,
     read_plausible,
 )
+from edge_agent.estimators.friction_mixture.block.failed_sensors import leave_out_failed
 from edge_agent.estimators.friction_mixture.block.grip_guard import note_grip
 from edge_agent.estimators.friction_mixture.block.wheel_readings import note_step, refuse_jumps
 from edge_agent.estimators.friction_mixture.state.constants import (
@@ -69,7 +70,7 @@ def take_sample(
     now = last.now
     # The block decides about NO_STEERING, because a single missing angle is replaced.
     health = read_plausible(sample, now) & ~flags.NO_STEERING
-    health |= refuse_jumps(memory.row, now)
+    health |= refuse_jumps(memory.row, now) | leave_out_failed(memory.row, last, time)
     hold_readings(last, time, design.constants.chosen)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)

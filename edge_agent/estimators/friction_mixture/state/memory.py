@@ -61,6 +61,22 @@ class BlockSums:
     start_omega_time: Annotated[FloatArray, 4]  # [s] time at which each of them was read
 
 
+class WheelSensors:
+    """Record of the wheel speed readings of the last seconds, from which failed sensors are
+    recognised.
+    """
+
+    reading: Annotated[FloatArray, 4]  # [rad/s] last reading
+    time: Annotated[FloatArray, 4]  # [s] time of the last reading
+    changed: Annotated[FloatArray, 4]  # [s] time at which the reading last changed
+    # [s] longest time between two changes in the last second
+    interval: Annotated[FloatArray, 4]
+    # [rad/s] readings of the other wheels when the reading of a wheel last changed
+    others: Annotated[FloatArray, 4, 4]
+    # 1 if the wheel has turned since the start, or since it stopped too suddenly
+    turned: Annotated[IntArray, 4]
+
+
 class LastInputs:
     """Record of the latest value of each input signal, which the filter needs at the next
     sample.
@@ -83,6 +99,7 @@ class LastInputs:
     omega: Annotated[FloatArray, 4]  # [rad/s] wheel speeds
     omega_held: Annotated[IntArray, 4]  # number of readings since a wheel speed changed
     omega_step: Annotated[FloatArray, 4]  # [rad/s] resolution of a wheel speed signal
+    wheel_sensors: WheelSensors
     delta: Annotated[FloatArray, 4]  # [rad] steering angles
     delta_before: Annotated[FloatArray, 4]  # [rad] steering angles in the previous block
     rear_steering: bool  # True once a rear steering angle has been read
