@@ -1,13 +1,15 @@
 """End-to-end evaluation: simulated vehicles with the real estimator drive, their observations are
 fused, and the map is compared with the true road.
 
-A command in `deploy` drives the vehicles, because the service must not import the agent. This
-module reads the files that the command writes.
+A command of the agent's laboratory (`edge_agent.lab.end_to_end`) drives the vehicles. It runs in a
+process of its own, because the service must not import the agent. This module reads the files that
+the command writes.
 """
 
 from __future__ import annotations
 
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -68,21 +70,16 @@ WAYS: Final = tuple(
 
 def drive_command(vehicles: int, seconds: float, world: World) -> Drive:
     """Return a function that simulates a drive in `world` with the command `python -m
-    deploy.end_to_end`, which writes its files to the folder given to the function.
+    edge_agent.lab.end_to_end`, which writes its files to the folder given to the function.
     """
-    import sys
 
     def run_drive(folder: Path) -> None:
         options = ["--out", str(folder), "--vehicles", str(vehicles), "--duration", str(seconds)]
-        options += [
-            "--scenario",
-            world.scenario,
-            "--rough",
-            str(world.rough),
-            "--seed",
-            str(world.seed),
-        ]
-        done = subprocess.run([sys.executable, "-m", "deploy.end_to_end", *options], check=False)
+        options += ["--scenario", world.scenario, "--rough", str(world.rough)]
+        options += ["--seed", str(world.seed)]
+        done = subprocess.run(
+            [sys.executable, "-m", "edge_agent.lab.end_to_end", *options], check=False
+        )
         if done.returncode:
             raise InputError(
                 "end-to-end",

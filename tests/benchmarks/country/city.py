@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from deploy.end_to_end import RATE_HZ, write_drive
+from edge_agent.lab.end_to_end import RATE_HZ, write_drive
 from edge_agent.lab.simulation import SimulatedFleet
 from fleet_service.lab.end_to_end import World, measure
 from schemas.runtime.figures import Figure

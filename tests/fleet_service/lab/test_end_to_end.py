@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from deploy.end_to_end import main
+from edge_agent.lab.end_to_end import main
 from fleet_service.fusion import Fusion
 from fleet_service.lab import end_to_end
 from schemas import grid
