@@ -88,13 +88,7 @@ def update_consistency(
         design.rules, memory.actual[0] / max(memory.theoretical[0], TINY) - 1.0
     )
     if trust.distrust > 0.0:
-        trust.left -= duration
-        if trust.left <= 0.0:
-            trust.distrust = 0.0
-            trust.odd = 0.0
-            trust.ratio = 0.0
-            memory.actual[1] = memory.theoretical[1] = 0.0
-            memory.factor[1] = 1.0
+        _await_next_trial(memory, duration)
         return
     keep = math.exp(-duration / FORGIVEN_S)
     fading = math.exp(-duration / constants.chosen.window)
@@ -107,12 +101,28 @@ def update_consistency(
     if health & flags.RESET:
         trust.odd += share * CALLED_BACK * constants.chosen.odd_least
     if trust.odd >= constants.chosen.odd_least:
-        trust.patience = min(
-            max(RELAPSE * trust.patience, constants.chosen.patience), LONGEST_PATIENCE
-        )
+        patience = max(RELAPSE * trust.patience, constants.chosen.patience)
+        trust.patience = min(patience, LONGEST_PATIENCE)
         trust.left = trust.patience
         trust.distrust = 1.0
         trust.odd = constants.chosen.odd_least
+
+
+@compiled
+def _await_next_trial(memory: MixtureMemory, duration: float) -> None:
+    """Count down the time during which the filter does not use evidence on friction, by a block of
+    `duration` [s]. At its end, trust the model again, without the evidence of before.
+    """
+    trust = memory.trust
+    trust.left -= duration
+    if trust.left > 0.0:
+        return
+    trust.distrust = 0.0
+    trust.odd = 0.0
+    trust.ratio = 0.0
+    memory.actual[1] = 0.0
+    memory.theoretical[1] = 0.0
+    memory.factor[1] = 1.0
 
 
 @compiled

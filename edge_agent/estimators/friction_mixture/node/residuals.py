@@ -265,9 +265,7 @@ def correct_forces(
     balance this yaw moment. So do the forces of a locked rear axle, whose wheels pull forwards on
     one side and backwards on the other.
     """
-    leak = lanes_at(node.point, NodeState.LEAK_Y)
     shape = lanes_at(node.point, NodeState.SHAPE)
-    bias_y = lanes_at(node.point, NodeState.BIAS_Y)
     turning = _share_forces(row, features, node, out)
     held = (
         0.5 * features.locked_pull * (lanes_at(node.slip.ratio, 2) + lanes_at(node.slip.ratio, 3))
@@ -276,19 +274,11 @@ def correct_forces(
         turning -= held * locked_axle_force(row, features.loads)
     for axle in range(2):
         locked_square = held * held if axle == 1 else 0.0 * held
-        left = 2 * axle
-        right = 2 * axle + 1
-        side = (
-            features.side[axle]
-            + leak * features.side_leak[axle]
-            - bias_y * features.side_unit[axle]
-        )
-        load = (features.loads[left] + features.loads[right]) * features.steer_cos[left]
-        side += (-turning if axle == 0 else turning) * (1.0 / load)
+        side = _correct_side(features, node, axle, -turning if axle == 0 else turning)
         known = is_measured(features, 4 + axle)
         across = side if known else 0.0
         mean_along = 0.0
-        for wheel in range(left, right + 1):
+        for wheel in range(2 * axle, 2 * axle + 2):
             along = lanes_at(out.force, wheel)
             mean_along += features.load_share[wheel] * along
             force = along - shape * lanes_at(node.shape_force, wheel)
@@ -308,6 +298,21 @@ def correct_forces(
             other_square = mean_along * mean_along + locked_square
             found = _slip_at_force(curve, mu, per_mu, force, other_square)
             put_lanes(out.slip_at_force, 4 + axle, found)
+
+
+@inlined
+def _correct_side(features: BlockFeatures, node: NodeWorkspace, axle: int, balance: float) -> float:
+    """Return the lateral force over load [1] of an axle, corrected for gravity in a_y when the body
+    rolls, for the offset of a_y, and for `balance` [N], the lateral force that the axle exerts to
+    balance the yaw moment of unequal forces left and right.
+    """
+    leak = lanes_at(node.point, NodeState.LEAK_Y)
+    bias_y = lanes_at(node.point, NodeState.BIAS_Y)
+    left = 2 * axle
+    load = (features.loads[left] + features.loads[left + 1]) * features.steer_cos[left]
+    side = features.side[axle] + leak * features.side_leak[axle] - bias_y * features.side_unit[axle]
+    corrected: float = side + balance * (1.0 / load)
+    return corrected
 
 
 @inlined
