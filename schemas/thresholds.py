@@ -9,6 +9,9 @@ UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] 
 SLIPPERY_MU         a road is slippery if its μ is below this: packed snow has .2–.35, wet asphalt
                     .5–.8 (Pacejka 2012, ch. 1)
 CALLED_SHARE        a road is reported as slippery if P(μ < SLIPPERY_MU) is above this
+CHANGE_S            mean time between sudden changes of a road (ice, snow, gritting), after which
+                    older reports mean nothing [s]. With three hours, a single measurement fades
+                    within a day.
 SURFACES            kinds of road by their range of μ: above the first number, up to the second;
                     intervals are evaluated for each kind separately
 Z_95                95 % quantile of the standard normal distribution: half the width of a 90 %
@@ -37,6 +40,7 @@ VALUE_NATS: Final = 1.0
 UTILISED_WINDOW_S: Final = 1.0
 SLIPPERY_MU: Final = 0.4
 CALLED_SHARE: Final = 0.9
+CHANGE_S: Final = 10_800.0
 SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
 Z_95: Final = NormalDist().inv_cdf(0.95)
 GRAVITY: Final = 9.81

@@ -16,14 +16,11 @@ import numpy as np
 
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
-from schemas.thresholds import NS, SLIPPERY_MU
+from schemas.thresholds import CHANGE_S, NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 UNKNOWN, BOUND, MEASURED, BORROWED = range(4)
 BASES: Final = ("unknown", "bound", "measured", "borrowed")
-# [s] mean time between changes of the road, as in the fleet's map. After a change, nothing is known
-# about the friction.
-CHANGE_S: Final = 10800.0
 # [s] time after which a cell that was not received again counts as unknown. By then, the road has
 # changed with a probability of 28 %.
 HELD_S: Final = 3600.0

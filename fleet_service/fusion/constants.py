@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from schemas import mugrid
+from schemas import mugrid, thresholds
 from schemas.thresholds import NS, SURFACES, VALUE_NATS
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS  # [μ] width of a friction bin
@@ -80,9 +80,8 @@ SAME_SURFACE: Final = 0.9
 
 # Standard deviation of μ after one hour of slow change (drying, polishing), a random walk.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
-# [s] Mean time between sudden changes (ice, snow, gritting) after which older reports mean nothing.
-# With three hours, a single measurement fades within a day.
-CHANGE_S: Final = 10800.0
+# [s] Mean time between sudden changes of a road; the vehicles' copy of the map fades with it too.
+CHANGE_S: Final = thresholds.CHANGE_S
 
 # --- From a report to a likelihood ---
 

@@ -23,7 +23,6 @@ from edge_agent.ahead.horizon import (
 from edge_agent.ahead.local_map import (
     ALERT_HELD_S,
     BORROWED,
-    CHANGE_S,
     HELD_S,
     OTHER_WAY,
     LocalMap,
@@ -33,7 +32,7 @@ from edge_agent.ahead.path import NONE, GivenRoute, Pose, straight_path, to_degr
 from edge_agent.ahead.request_log import FURTHER_M, RequestLog
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
-from schemas.thresholds import GRAVITY, NS
+from schemas.thresholds import CHANGE_S, GRAVITY, NS
 from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, make_local_map
 
 
