@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ RATE_HZ: Final = 50.0
 SMOOTH_S: Final = 0.5
 JOINED_S: Final = 1.5  # [s] no interpolation between readings that are further apart
 FIX_S: Final = 1.0  # [s] interval between the two positions that give a speed and a course
+TOO_FEW_FIXES: Final = 5  # number of fixes of a drive that give no speed over ground
 LONGEST_S: Final = 1800.0  # [s] only this first part of a drive is examined; more adds little
 # A wheel slips if it differs by more than this share from the other wheel on its side.
 UNLIKE: Final = 0.1
@@ -214,8 +215,10 @@ def over_ground(
 ) -> tuple[FloatArray, FloatArray]:
     """Return speed over ground [m/s] and course [rad] at the even time steps (n,). Both are
     computed from the positions FIX_S / 2 before and FIX_S / 2 after each time. `latitude` and
-    `longitude` [deg] are the recorded fixes (T,).
+    `longitude` [deg] are the recorded fixes (T,). With TOO_FEW_FIXES or fewer, both are NaN.
     """
+    if np.isfinite(latitude).sum() <= TOO_FEW_FIXES:
+        return np.full(len(even.at), np.nan), np.full(len(even.at), np.nan)
     north = even.interpolate_channel(np.radians(latitude) * EARTH_RADIUS_M)
     east = even.interpolate_channel(np.radians(longitude) * EARTH_RADIUS_M) * np.cos(
         np.radians(np.nanmean(latitude))
@@ -244,57 +247,71 @@ def prepare_drive(
             accurate than the speed computed from positions.
     """
     even = EvenTimes(t)
-    at = even.at
-    wheels = (
-        np.stack([even.interpolate_channel(signals[:, S.OMEGA + i]) for i in range(4)], axis=1)
-        * vehicle.wheel_radius
-    )
-    middle = wheel_median(wheels)
-    raw = wheels
-    wheels = np.where(
-        np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels
-    )
-    rims = np.stack([smooth_twice(wheels[:, i]) for i in range(4)], axis=1)
-    v = smooth_twice(middle)
-    tracks = vehicle.track_front, vehicle.track_rear
-    axles = [(rims[:, 2 * k + 1] - rims[:, 2 * k]) / tracks[k] for k in range(2)]
-    r_wheels = np.where(np.isfinite(axles[1]), axles[1], axles[0])
+    rolling = _measure_rolling(even, signals, vehicle)
+    v = rolling.v
     fast = float(np.nanpercentile(np.abs(v), 95)) if np.isfinite(v).any() else 0.0
-    place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
-    located = np.isfinite(place[0]).sum() > 5
-    missing = np.full(len(at), np.nan)
-    v_positions, course = over_ground(even, *place) if located else (missing, missing)
+    v_positions, course = over_ground(even, signals[:, S.LATITUDE], signals[:, S.LONGITUDE])
     v_ground = v_positions
-    if ground is not None and np.isfinite(ground).sum() > 5:
+    if ground is not None and np.isfinite(ground).sum() > TOO_FEW_FIXES:
         v_ground = even.smooth_channel(ground)
-    yaw = signals[:, S.YAW]
-    yaw_at = (
-        even.interpolate_channel(np.unwrap(yaw))
-        if np.isfinite(yaw).all()
-        else _nearest_yaw(t, yaw, at)
-    )
     delta = signals[:, S.DELTA]
     return EvenDrive(
-        t=at,
+        t=even.at,
         ax=even.smooth_channel(signals[:, S.AX]),
         ay=even.smooth_channel(signals[:, S.AY]),
         r=even.smooth_channel(signals[:, S.YAW_RATE]),
         delta=even.smooth_channel(np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1])),
-        wheels=rims,
+        wheels=rolling.wheels,
         v=v,
-        r_wheels=r_wheels,
+        r_wheels=np.where(np.isfinite(rolling.yaw_rear), rolling.yaw_rear, rolling.yaw_front),
         v_ground=v_ground,
         v_positions=v_positions,
         course=course,
-        course_yaw=yaw_at,
-        moving=((np.abs(v) > CREEP * fast) & ~is_slipping(raw, fast)).astype(float),
+        course_yaw=_yaw_at_even_times(even, signals[:, S.YAW]),
+        moving=((np.abs(v) > CREEP * fast) & ~is_slipping(rolling.raw, fast)).astype(float),
         grips=(~left_ground(v, v_ground, fast)).astype(float),
         fast=fast,
         wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
         torque=even.smooth_channel(signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1)),
-        yaw_front=axles[0],
-        yaw_rear=axles[1],
+        yaw_front=rolling.yaw_front,
+        yaw_rear=rolling.yaw_rear,
     )
+
+
+class _Rolling(NamedTuple):
+    """Motion of the wheels at the even time steps: rim speeds as recorded and smoothed without
+    outliers (n, 4) [m/s], speed of the car (n,) [m/s], yaw rates of the two axles (n,) [rad/s].
+    """
+
+    raw: FloatArray
+    wheels: FloatArray
+    v: FloatArray
+    yaw_front: FloatArray
+    yaw_rear: FloatArray
+
+
+def _measure_rolling(even: EvenTimes, signals: FloatArray, vehicle: Vehicle) -> _Rolling:
+    """Return the motion of the wheels, from the recorded signals (T, 18). A wheel speed far from
+    the median of the four wheels is left out, except in `raw`.
+    """
+    omega = [even.interpolate_channel(signals[:, S.OMEGA + i]) for i in range(4)]
+    raw = np.stack(omega, axis=1) * vehicle.wheel_radius
+    middle = wheel_median(raw)
+    is_outlier = np.abs(raw - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0
+    plausible = np.where(is_outlier, np.nan, raw)
+    wheels = np.stack([smooth_twice(plausible[:, i]) for i in range(4)], axis=1)
+    yaw_front = (wheels[:, 1] - wheels[:, 0]) / vehicle.track_front
+    yaw_rear = (wheels[:, 3] - wheels[:, 2]) / vehicle.track_rear
+    return _Rolling(raw, wheels, smooth_twice(middle), yaw_front, yaw_rear)
+
+
+def _yaw_at_even_times(even: EvenTimes, yaw: FloatArray) -> FloatArray:
+    """Return the yaw angle (n,) [rad] at the even time steps, from the readings `yaw` (T,) [rad].
+    Readings are interpolated if none is missing; else the nearest one counts.
+    """
+    if np.isfinite(yaw).all():
+        return even.interpolate_channel(np.unwrap(yaw))
+    return _nearest_yaw(even.t, yaw, even.at)
 
 
 def is_slipping(wheels: FloatArray, fast: float) -> BoolArray:

@@ -4,7 +4,7 @@ radius, and exchanged axles.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from edge_agent.inputs.doctor.diagnosis import Finding
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, median_of_others
 from edge_agent.inputs.doctor.identities import Fit, fit_robustly
 from edge_agent.inputs.doctor.slip import RADIUS_PARTS, is_steady, spread_of_parts
-from schemas.numeric import FloatArray
+from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import WHEELS
 from schemas.vehicle import Vehicle
 
@@ -127,60 +127,102 @@ def _compare_axles(drive: EvenDrive) -> list[Finding]:
     return []
 
 
+class _Offset(NamedTuple):
+    """Measured constant error of a channel: its value and standard deviation, and the largest usual
+    size, all in `unit`.
+    """
+
+    channel: str
+    value: float
+    error: float
+    largest: float
+    unit: str
+
+
 def find_offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     """Return findings (faults) about constant errors (offsets) of sensors. An offset is a fault if
-    it exceeds the largest usual offset by SURE standard deviations.
+    it exceeds the largest usual offset by SURE standard deviations. `found` are the fitted
+    identities by name (`identities`).
     """
-    moving = drive.moving > 0
-    lateral = found["lateral"]
-    axle = found["axle"]
-    steering = found["steering"]
-    # Items: channel, measured offset, its standard deviation, largest usual offset, unit.
-    listed: list[tuple[str, float, float, float, str]] = []
-    difference = (drive.ax - drive.v_dot)[moving]
-    if np.isfinite(difference).sum() > FEWEST_OFFSET_S * RATE_HZ:
-        driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
-        largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
-        listed.append(
-            ("ax", float(np.nanmedian(difference)), spread_of_parts(difference), largest, "m/s^2")
-        )
-    straight = moving & (np.abs(drive.v * drive.r) < 1.0)
+    straight = (drive.moving > 0) & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
         straight &= drive.follows_steering
+    measured = (
+        _measure_ax_offset(drive),
+        _measure_ay_offset(drive, straight),
+        _measure_yaw_rate_offset(drive, found, straight),
+        _measure_steering_offset(found["steering"]),
+    )
+    return [
+        Finding(
+            one.channel,
+            "offset",
+            f"{one.value:+.3g} {one.unit}; expected about 0",
+            offset=-one.value,
+        )
+        for one in measured
+        if one is not None
+        and np.isfinite(one.value)
+        and abs(one.value) > one.largest + SURE * one.error
+    ]
+
+
+def _measure_ax_offset(drive: EvenDrive) -> _Offset | None:
+    """Return the offset of a_x relative to the acceleration of the wheels; None if the car moves
+    for less than FEWEST_OFFSET_S.
+    """
+    difference = (drive.ax - drive.v_dot)[drive.moving > 0]
+    if np.isfinite(difference).sum() <= FEWEST_OFFSET_S * RATE_HZ:
+        return None
+    driven_m = float(np.nansum(np.abs(drive.v))) / RATE_HZ
+    largest = LARGEST_AX if driven_m < AVERAGED_M else LARGEST_AX_FAR
+    value = float(np.nanmedian(difference))
+    return _Offset("ax", value, spread_of_parts(difference), largest, "m/s^2")
+
+
+def _measure_ay_offset(drive: EvenDrive, straight: BoolArray) -> _Offset | None:
+    """Return the offset of a_y relative to speed times yaw rate, at the samples (n,) at which the
+    car drives `straight`; None if these are too few.
+    """
     difference = (drive.ay - drive.v * drive.r)[straight]
-    if np.isfinite(difference).sum() > FEWEST_OFFSET_S * RATE_HZ:
-        listed.append(
-            (
-                "ay",
-                float(np.nanmedian(difference)),
-                spread_of_parts(difference),
-                LARGEST_AY,
-                "m/s^2",
-            )
-        )
+    if np.isfinite(difference).sum() <= FEWEST_OFFSET_S * RATE_HZ:
+        return None
+    value = float(np.nanmedian(difference))
+    return _Offset("ay", value, spread_of_parts(difference), LARGEST_AY, "m/s^2")
+
+
+def _measure_yaw_rate_offset(
+    drive: EvenDrive, found: dict[str, Fit], straight: BoolArray
+) -> _Offset | None:
+    """Return the offset of the yaw rate: relative to that of the wheels, or else its median while
+    the car stands. Return None if the drive permits neither. See `find_offsets` for the arguments.
+    """
+    axle = found["axle"]
     if axle.is_known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
-        error = float(
-            np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving]))
-        )
+        spread = spread_of_parts((drive.r_wheels - drive.r)[drive.moving > 0])
+        error = float(np.hypot(axle.offset_error, spread))
         # If the car always turns the same way, an offset cannot be separated from a gain.
         if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:
             error = np.inf
-        listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
-    elif lateral.is_known and np.isfinite(drive.r).any():
+        return _Offset("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s")
+    if found["lateral"].is_known and np.isfinite(drive.r).any():
         still = (drive.moving == 0) & (np.abs(drive.v) < 0.05)
         if still.sum() > RATE_HZ:
-            listed.append(
-                ("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s")
-            )
-    if (
+            value = float(np.nanmedian(drive.r[still]))
+            return _Offset("yaw_rate", value, 0.0, LARGEST_RATE, "rad/s")
+    return None
+
+
+def _measure_steering_offset(steering: Fit) -> _Offset | None:
+    """Return the offset of the steering angle from its fitted identity; None if the fit is
+    unreliable.
+    """
+    is_reliable = (
         steering.is_known
         and abs(steering.correlation) > 0.9
         and 0.7 < steering.gain < 1.6
         and is_steady(steering)
-    ):
-        listed.append(("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad"))
-    return [
-        Finding(channel, "offset", f"{value:+.3g} {unit}; expected about 0", offset=-value)
-        for channel, value, error, largest, unit in listed
-        if np.isfinite(value) and abs(value) > largest + SURE * error
-    ]
+    )
+    if not is_reliable:
+        return None
+    return _Offset("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad")
