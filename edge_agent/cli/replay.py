@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
 from schemas.errors import InputError
@@ -42,7 +42,7 @@ OLD_NS = 29 * 86_400 * NS
 DRAIN_S = 30.0
 CHECK_S = 0.05  # [s] time between two checks for answers
 CLOSE_S = 1.0  # [s] time for the sender to end its present round
-PROGRESS_S = 1.0
+PROGRESS_S = 1.0  # [s] time between two progress lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,23 +141,15 @@ def _replay_one(
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.app.publishing import open_publisher
-    from edge_agent.cli.common import checked_name, require_valid_signals, warn_about_faults
+    from edge_agent.cli.common import require_valid_signals, warn_about_faults
     from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log
-    from edge_agent.observe.pipeline import Pipeline
-    from edge_agent.publish.batching import batch_drive
     from schemas.vehicle import load_vehicle
 
     path = args.log[0]
     vehicle_file = args.vehicle or vehicle_file_of(path)
     _check_output(args, vehicle_file)
     vehicle = load_vehicle(vehicle_file)
-    is_report = args.out.suffix in REPORTS
-    if is_report and args.publish:
-        raise InputError(
-            "publish", "cannot be combined with a report", "replay twice: once with .parquet"
-        )
     bank_of(estimator, [vehicle], memberships)  # raises for a wrong name before the log is read
     log = read_log(path)
     if args.publish:
@@ -170,28 +162,68 @@ def _replay_one(
     else:
         notes += warn_about_faults(diagnosis, path)
     code = 0
-    if is_report:
+    if args.out.suffix in REPORTS:
         names = [estimator, *_split_names(args.compare)]
         notes += _write_report(args, log, vehicle, names, plausibility)
-    elif args.publish:
-        name = checked_name(args.name or vehicle.name)
-        pipeline = Pipeline(bank_of(estimator, [vehicle], memberships), 1, config)
-        records, progress = _make_records(args.out, log, start_ns, pipeline, plausibility)
-        drive = batch_drive(records, name, estimator, config.batch_rows)
-        publisher = open_publisher([name], config, estimator, drive=drive)
-        same = f" with --start {_start_text(start_ns)}" if _is_start_now(args.start, log) else ""
-        code = _publish_drive(publisher, progress, start_ns, f"repeat the command{same}")
-        if not drive.drafts:
-            notes.append(_explain_no_record(config))
-        if same:
-            notes.append(f"note: repeated{same}, this drive counts once; otherwise it is another")
     else:
-        bank = bank_of(estimator, [vehicle], memberships)
-        _write_estimates(args.out, log, start_ns, bank, plausibility)
+        drive = _Drive(log, vehicle.name, start_ns, bank_of(estimator, [vehicle], memberships))
+        if args.publish:
+            code, further_notes = _replay_and_publish(args, config, estimator, drive, plausibility)
+            notes += further_notes
+        else:
+            _write_estimates(args.out, drive, plausibility)
     print("\n".join([*notes, plausibility.summary_line()]), file=sys.stderr)
     if code == 0 and plausibility.problems():
         return IMPLAUSIBLE
     return code
+
+
+class _Drive(NamedTuple):
+    """Recorded drive of one vehicle, with the estimator bank of this vehicle.
+
+    Attributes:
+        log: signals of the drive.
+        vehicle_name: name in the vehicle file.
+        start_ns: time of t = 0 [ns UTC].
+        bank: estimator bank that has not seen the drive yet.
+    """
+
+    log: SignalLog
+    vehicle_name: str
+    start_ns: int
+    bank: EstimatorBank
+
+
+def _replay_and_publish(
+    args: argparse.Namespace,
+    config: AgentConfig,
+    estimator: str,
+    drive: _Drive,
+    plausibility: Plausibility,
+) -> tuple[int, list[str]]:
+    """Write the estimates of a drive and publish its records. Return the exit code and notes for
+    the user. Add the estimates to `plausibility`.
+    """
+    from edge_agent.app.publishing import open_publisher
+    from edge_agent.cli.common import checked_name
+    from edge_agent.observe.pipeline import Pipeline
+    from edge_agent.publish.batching import batch_drive
+
+    name = checked_name(args.name or drive.vehicle_name)
+    pipeline = Pipeline(drive.bank, 1, config)
+    records, progress = _make_records(args.out, drive, pipeline, plausibility)
+    batches = batch_drive(records, name, estimator, config.batch_rows)
+    publisher = open_publisher([name], config, estimator, drive=batches)
+    start = ""
+    if _is_start_now(args.start, drive.log):
+        start = f" with --start {_start_text(drive.start_ns)}"
+    code = _publish_drive(publisher, progress, drive.start_ns, f"repeat the command{start}")
+    notes = []
+    if not batches.drafts:
+        notes.append(_explain_no_record(config))
+    if start:
+        notes.append(f"note: repeated{start}, this drive counts once; otherwise it is another")
+    return code, notes
 
 
 def _explain_no_record(config: AgentConfig) -> str:
@@ -225,6 +257,10 @@ def _check_output(args: argparse.Namespace, vehicle_file: Path) -> None:
             "compare",
             f"works only with a report, not with {args.out.name}",
             f"write {', '.join(REPORTS)}",
+        )
+    if args.publish and args.out.suffix in REPORTS:
+        raise InputError(
+            "publish", "cannot be combined with a report", "replay twice: once with .parquet"
         )
     require_log(args.log[0])
     commandline.refuse_input_path("out", args.out, [args.log[0], vehicle_file])
@@ -323,34 +359,30 @@ def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     return 2 if bad else code
 
 
-def _write_estimates(
-    out: Path, log: SignalLog, start_ns: int, bank: EstimatorBank, plausibility: Plausibility
-) -> None:
-    """Estimate a log that begins at `start_ns` [ns UTC]. Write the estimates to the file `out`, and
-    add them to `plausibility`.
-    """
+def _write_estimates(out: Path, drive: _Drive, plausibility: Plausibility) -> None:
+    """Estimate a drive. Write the estimates to the file `out`, and add them to `plausibility`."""
     from edge_agent.app.estimates_file import EstimatesFile
 
     with EstimatesFile(out) as file:
-        for block in log.blocks(start_ns):
-            estimates = bank.advance(block.t, block.signals)
+        for block in drive.log.blocks(drive.start_ns):
+            estimates = drive.bank.advance(block.t, block.signals)
             plausibility.add(block.t, block.signals, estimates)
             file.write(block.t, estimates)
 
 
 def _make_records(
-    out: Path, log: SignalLog, start_ns: int, pipeline: Pipeline, plausibility: Plausibility
+    out: Path, drive: _Drive, pipeline: Pipeline, plausibility: Plausibility
 ) -> tuple[list[RecordBlock], Progress]:
-    """Do the same as `_write_estimates`, and return the resulting records with the progress that
-    the publisher reports.
+    """Do the same as `_write_estimates` with the drive's bank in `pipeline`. Return the resulting
+    records with the progress that the publisher reports.
     """
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.live_loop import Progress
 
-    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
+    progress = Progress(signals_s=float(drive.log.t[-1] - drive.log.t[0]))
     found: list[RecordBlock] = []
     with EstimatesFile(out) as file:
-        for block in log.blocks(start_ns):
+        for block in drive.log.blocks(drive.start_ns):
             estimates, *records = pipeline.step(block)
             plausibility.add(block.t, block.signals, estimates)
             file.write(block.t, estimates)
