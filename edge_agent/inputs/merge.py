@@ -26,12 +26,13 @@ from schemas.numeric import FloatArray
 from schemas.signals import CONTEXT, FLAGS
 from schemas.thresholds import NS
 
+# Channels of a position receiver, which have a reading only at some rows.
 SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
 COURSE_SPEED: Final = 3.0  # [m/s] below this speed, the course of a receiver is noise
-RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
+RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)  # [Hz] possible rates of the rows
 # Readings are not interpolated if they are further apart than the larger of these two limits.
-GAP_PERIODS = 3.0  # [periods of the signal]
-GAP_S = 0.1  # [s]
+GAP_PERIODS: Final = 3.0  # [periods of the signal]
+GAP_S: Final = 0.1  # [s]
 
 
 @dataclass
@@ -89,13 +90,8 @@ def merge_recordings(
         one, jitter = make_channel(name, channel, recording, radius, ratio)
         series[name] = Series(one.t + alignment.offsets[place] - channel.delay_s, one.values)
         notes += _unit_notes(name, channel, recording)
-        origins[name] = {
-            "source": recording.name,
-            "signals": channel.signals,
-            **_describe_rates(one),
-            "jitter_s": jitter,
-        }
-    _still_courses(series)
+        origins[name] = _describe_origin(recording, channel, one, jitter)
+    _drop_slow_courses(series)
     context = {name: series.pop(name) for name in CONTEXT if name in series}
     if not series:
         raise InputError(
@@ -143,14 +139,24 @@ def _context_columns(
     return columns
 
 
-def _describe_rates(series: Series) -> dict[str, object]:
+def _describe_origin(
+    recording: Recording, channel: Channel, series: Series, jitter_s: float
+) -> dict[str, object]:
+    """Return the properties of a channel for `Merged.origins`. `series` has its readings."""
     steps = np.diff(series.t)
-    period = float(np.median(steps)) if len(steps) else 0.0
+    period_s = float(np.median(steps)) if len(steps) else 0.0
     missing = float(np.mean(~np.isfinite(series.values)))
-    return {"readings": len(series.t), "period_s": round(period, 6), "missing": round(missing, 4)}
+    return {
+        "source": recording.name,
+        "signals": channel.signals,
+        "readings": len(series.t),
+        "period_s": round(period_s, 6),
+        "missing": round(missing, 4),
+        "jitter_s": jitter_s,
+    }
 
 
-def _still_courses(series: dict[str, Series]) -> None:
+def _drop_slow_courses(series: dict[str, Series]) -> None:
     """Set the course over ground of a position receiver to NaN (unknown) at walking speed, in
     place. `series` has the signals of the receiver by name.
     """
