@@ -161,7 +161,7 @@ def list_files(folder: Path) -> set[Path]:
 @pytest.mark.parametrize(
     "words", [["forget", "--period", "2024-10"], ["retention", "--raw-days", "31"]]
 )
-def test_what_destroys_can_be_tried_and_asks_on_a_terminal(
+def test_destructive_command_has_a_dry_run_and_asks_on_a_terminal(
     words: list[str], archive: Path, capsys: Capture
 ) -> None:
     command = [*words, "--archive", str(archive)]
@@ -218,7 +218,7 @@ def test_an_export_of_the_map_is_of_now_and_says_of_when(
     assert said["rows"] >= then.num_rows
 
 
-def test_what_waits_in_the_log_is_counted(archive: Path, capsys: Capture) -> None:
+def test_rows_in_the_log_are_compacted_and_counted(archive: Path, capsys: Capture) -> None:
     words = ["analyze", "grip", "--archive", str(archive), "--json"]
     assert fleet_service.cli.main([*words, "--as-it-lies"]) == 0
     without = capsys.readouterr()
@@ -306,7 +306,7 @@ def test_the_ending_of_a_file_decides_its_format(tmp_path: Path, capsys: Capture
     assert not (tmp_path / "e.xlsx").exists()
 
 
-def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path) -> None:
+def test_output_path_is_checked_before_any_computation(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="out: .* is a folder"):
         commandline.out_folder("out", tmp_path)
     with pytest.raises(InputError, match="out: a.xls has no known ending; use one of .csv"):

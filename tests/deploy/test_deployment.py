@@ -207,7 +207,7 @@ def test_no_unit_gives_up_or_invents_or_has_another_roles_user() -> None:
     assert len(users) == len(UNITS)
 
 
-def test_what_is_shipped_as_secure_keeps_persons_private() -> None:
+def test_shipped_secure_settings_protect_privacy() -> None:
     secure = DEPLOY / "secure"
     agent = load(secure / "agent.json", AgentConfig)
     service = load(secure / "service.json", ServiceConfig)
@@ -269,7 +269,7 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 
 
 @pytest.mark.campaign
-def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
+def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site) -> None:
     """Two routers, a service, the live page and an agent must work together, and a client must be
     able to read the map. They are started by the commands of the systemd units, with new
     certificates.

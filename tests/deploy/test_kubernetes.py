@@ -184,9 +184,7 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_what_the_pods_start_works_together_and_leaves_in_time(
-    overlay: str, tmp_path: Path
-) -> None:
+def test_processes_of_the_pods_work_together_and_end_in_time(overlay: str, tmp_path: Path) -> None:
     with kubernetes.open_cluster(overlay, tmp_path) as running:
         assert running.failed == []
         services = [pod for pod in running.pods if pod.component == "service"]

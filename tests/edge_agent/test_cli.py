@@ -318,7 +318,7 @@ def test_a_signalled_agent_flushes_hears_the_answer_and_leaves(
 
 
 @pytest.mark.campaign
-def test_what_a_killed_agent_had_stored_is_sent_by_the_next(
+def test_batches_stored_by_a_killed_agent_are_sent_by_the_next(
     tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
     service.answer = False

@@ -109,7 +109,7 @@ SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
-UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
+UNFIT = "test_log_that_fails_the_doctor_is_published_only_with_trust"
 LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
 LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
 PLANNER = "test_limits_for_a_planner_without_listening_are_a_mistake"
@@ -155,7 +155,7 @@ ELSEWHERE = {
         "--vehicle": FIX,
         "--out": FIX,
         "--fix": FIX,
-        "--json": "test_what_the_doctor_found_is_json_for_a_program",
+        "--json": "test_check_writes_findings_as_json",
     },
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {
@@ -172,7 +172,7 @@ ELSEWHERE = {
     },
     "fleet": {
         "--connect": CONNECT,
-        "--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not",
+        "--warned": "test_only_the_given_share_of_a_fleet_is_warned",
         "--winter": "test_a_share_of_winter_vehicles_beyond_one_is_refused",
     },
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},

@@ -199,7 +199,7 @@ def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "07:00", "1969-12-31", "2300-01-01", "1e9"])
-def test_what_is_no_time_is_refused_by_name(text: str) -> None:
+def test_invalid_time_is_refused_with_the_field(text: str) -> None:
     with pytest.raises(
         InputError,
         match="^from: .* is not a time; write it like|^from: .* lies before 1970 or after",

@@ -51,7 +51,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
 
 
 @pytest.mark.campaign
-def test_it_loads_nothing_but_the_contract_and_its_libraries(found: dict[str, Any]) -> None:
+def test_third_party_loads_only_the_contract_and_its_libraries(found: dict[str, Any]) -> None:
     assert not found["loaded"]
     assert found["blocked"] == [
         "numba",
@@ -87,7 +87,7 @@ def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(
     assert not found["errors"]
 
 
-def test_it_reads_the_tile_and_the_alert_that_its_reports_brought_about(
+def test_third_party_reads_tile_and_alert_caused_by_its_reports(
     found: dict[str, Any],
 ) -> None:
     assert {encoding for encoding, _ in found["tiles"]} == {"application/vnd.apache.arrow.stream"}

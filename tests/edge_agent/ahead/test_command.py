@@ -96,7 +96,7 @@ def test_a_route_without_listening_is_a_mistake(
 
 
 @pytest.mark.campaign
-def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
+def test_only_the_given_share_of_a_fleet_is_warned(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = time.time_ns()

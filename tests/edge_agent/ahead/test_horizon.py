@@ -100,7 +100,7 @@ def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: floa
     assert len(path.distance) in (299, 300)
 
 
-def test_who_crosses_a_route_or_turns_off_where_it_goes_on_has_left_it() -> None:
+def test_car_that_crosses_a_route_or_turns_off_has_left_it() -> None:
     latitude, longitude = line()
     further = HOME._replace(latitude=float(latitude[300]), longitude=float(longitude[300]))
     assert GivenRoute(*line()).ahead(further._replace(yaw=HOME.yaw + math.pi / 2), 500.0) is None
@@ -139,7 +139,7 @@ def test_a_bound_is_no_value_and_gives_no_advice() -> None:
     assert np.isnan(horizon.safe_speed).all()
 
 
-def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
+def test_belief_rebuilt_from_a_tile_has_its_quantiles() -> None:
     belief = belief_of(*(np.array([value]) for value in (0.31, 0.5, 0.8, 0.17)))
     assert belief.sum() == pytest.approx(1.0)
     bin_width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS

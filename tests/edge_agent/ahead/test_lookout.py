@@ -168,7 +168,7 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
         )
 
 
-def test_what_lies_ahead_is_put_on_the_vehicles_own_key(
+def test_warnings_are_published_on_the_vehicles_own_key(
     router: Router, town: MadeUpService
 ) -> None:
     town.standing = [alert(int(ICE[0]), time=NOW)]
@@ -235,7 +235,7 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(
         router.start()
 
 
-def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
+def test_cell_observed_yesterday_states_its_age(router: Router) -> None:
     with MadeUpService(router.settings, time.time_ns() - DAY) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:

@@ -64,7 +64,7 @@ def test_at_the_border_of_a_cell_that_the_map_knows_its_belief_is_expected() -> 
     assert mugrid.quantiles(out, 0.95)[0] > 0.8, "what no map can take away"
 
 
-def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
+def test_map_prior_fades_with_age_and_ignores_lower_bounds() -> None:
     road = keys_on(100.0)
     place = int(road[0])
     shares = []
@@ -109,7 +109,7 @@ def test_a_map_says_nothing_twice() -> None:
     assert min(widths[1:]) == pytest.approx(widths[1], abs=1e-9)
 
 
-def test_who_is_nowhere_knows_no_map() -> None:
+def test_vehicle_without_a_place_uses_no_map() -> None:
     prior = MapPrior(2)
     out = prior.step(np.array([NOWHERE, 7]), np.zeros((2, 32)), np.zeros((2, 32)), {1: sharp(0.2)})
     assert np.array_equal(out[0], mugrid.PRIOR)
@@ -117,7 +117,7 @@ def test_who_is_nowhere_knows_no_map() -> None:
     assert 0.0 < SHARE < MOST < 1.0
 
 
-def test_what_is_published_is_the_same_bit_for_bit_whatever_the_map_says() -> None:
+def test_map_prior_changes_no_published_record() -> None:
     fleet = SimulatedFleet("test", 2, 3, 100.0)
     published = []
     source = blocks(fleet, 100.0)

@@ -58,7 +58,7 @@ def test_gpx_and_geojson_give_the_same_way(tmp_path: Path, text: str) -> None:
         json.dumps({"type": "LineString", "coordinates": [[float("nan"), 57.7], [1, 57.8]]}),
     ],
 )
-def test_what_is_no_route_is_refused_with_the_field_and_the_fix(tmp_path: Path, text: str) -> None:
+def test_invalid_route_file_is_refused_with_the_field(tmp_path: Path, text: str) -> None:
     file = tmp_path / "route.gpx"
     file.write_text(text)
     with pytest.raises(InputError, match="route: "):

@@ -91,7 +91,7 @@ def test_on_an_unknown_road_the_warning_comes_as_early_as_that_may_need() -> Non
     assert raised.distance_m >= 14.0 * REACTION_S + 14.0**2 / (2 * UNKNOWN_LOWER * GRAVITY)
 
 
-def test_who_is_slow_is_warned_later() -> None:
+def test_slow_vehicle_is_warned_later() -> None:
     fast, slow = (Car(dry_but(icy()), speed).drive(290.0)[0].distance_m for speed in (20.0, 7.0))
     assert fast > slow + 30.0
 

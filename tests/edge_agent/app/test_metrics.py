@@ -50,7 +50,7 @@ def test_an_agent_shows_what_was_settled_and_what_waits(
     )
 
 
-def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
+def test_unsendable_records_are_dropped_and_counted_and_others_are_sent(
     tmp_path: Path, router: Router, service: Service
 ) -> None:
     publisher = publisher_of(settings(router, tmp_path))

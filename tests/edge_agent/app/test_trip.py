@@ -84,7 +84,9 @@ def test_a_fault_is_never_admitted_and_teaches_nothing(
 
 
 @pytest.mark.campaign
-def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path: Path) -> None:
+def test_calibration_learned_on_a_trip_applies_from_the_next_trip(
+    smooth: Recorded, tmp_path: Path
+) -> None:
     path = tmp_path / "car.json"
     bad = offset_columns([S.YAW_RATE], 0.012)(smooth)
     for count in range(1, 4):
@@ -156,7 +158,7 @@ def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> N
     trip.close()
 
 
-def test_what_is_known_lies_beside_the_outbox() -> None:
+def test_state_file_is_next_to_the_outbox() -> None:
     assert state_path_for(Path("/var/lib/gripmap/spool.sqlite"), "car-one") == Path(
         "/var/lib/gripmap/spool.car-one.json"
     )

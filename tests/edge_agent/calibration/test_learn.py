@@ -56,7 +56,7 @@ def parts(drive: Recorded, count: int) -> list[tuple[FloatArray, FloatArray]]:
     return [(drive.t[k * size :][:size], drive.signals[k * size :][:size]) for k in range(count)]
 
 
-def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded) -> None:
+def test_planted_errors_are_learned_within_their_standard_deviation(smooth: Recorded) -> None:
     before = learn_calibration(parts(smooth, 3), smooth.vehicle)
     after = learn_calibration(parts(spoil_drive(smooth), 3), smooth.vehicle)
     assert after.drives == 3
@@ -91,7 +91,7 @@ def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     assert correct_log(bad.t, bad.signals, bad.vehicle) is bad.signals
 
 
-def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorded) -> None:
+def test_uncertain_calibration_is_drawn_to_the_usual_value(smooth: Recorded) -> None:
     few, many = (
         weigh_estimates([{"steer_gain": 1.2}] * count, smooth.vehicle) for count in (1, 30)
     )
@@ -220,7 +220,7 @@ def test_two_drives_that_disagree_are_less_sure(smooth: Recorded) -> None:
     assert apart.yaw_rate[0] < 0.5 * alike.yaw_rate[0], "drawn to the usual value"
 
 
-def test_of_two_calibrations_the_surer_value_holds() -> None:
+def test_surer_value_of_two_calibrations_is_kept() -> None:
     one = Calibration(drives=3, ax=(0.3, 0.05), ay=(0.1, 0.2))
     other = Calibration(drives=9, ax=(0.2, 0.1), yaw_rate=(0.01, 0.001))
     both = surer_values(one, other)

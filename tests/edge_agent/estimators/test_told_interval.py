@@ -72,7 +72,7 @@ def weights_around(mu: float, width: float) -> FloatArray:
     return np.asarray(weight / weight.sum())
 
 
-def test_who_knows_nothing_tells_the_prior() -> None:
+def test_filter_without_evidence_reports_the_prior() -> None:
     lower, median, upper = find_told_interval(DESIGN.prior)
     expected = [prior_quantile(level) for level in (LOWER_END, 0.5, UPPER_END)]
     assert [lower, median, upper] == pytest.approx(expected, abs=0.01)

@@ -311,9 +311,7 @@ def test_check_does_not_overwrite_its_log(
     assert Path(log[0]).read_bytes() == before
 
 
-def test_what_the_doctor_found_is_json_for_a_program(
-    rough: Recorded, tmp_path: Path, capsys: Output
-) -> None:
+def test_check_writes_findings_as_json(rough: Recorded, tmp_path: Path, capsys: Output) -> None:
     for name, drive in (("good", rough), ("bad", PLANTED["a_y flipped"].spoil(rough))):
         log = write(tmp_path / f"{name}.parquet", drive)
         assert main(["check", *log, "--json"]) == (1 if name == "bad" else 0)
@@ -374,7 +372,7 @@ def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsy
     assert json.loads(said.out.splitlines()[-1])["observations_acknowledged"] > 50
 
 
-def test_what_has_not_passed_is_not_published_unless_it_is_trusted(
+def test_log_that_fails_the_doctor_is_published_only_with_trust(
     rough: Recorded, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
     bad = PLANTED["yaw rate in deg/s"].spoil(rough)

@@ -49,7 +49,7 @@ CAR = PRESETS["sedan"].vehicle
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", COUNTED)
-def test_what_a_peer_sends_comes_in_without_a_sample_lost(kind: str, tmp_path: Path) -> None:
+def test_no_sample_of_a_live_source_is_lost(kind: str, tmp_path: Path) -> None:
     assert count_lost(kind, tmp_path, 1.0) == (0, 100)
 
 

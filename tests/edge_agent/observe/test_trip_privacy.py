@@ -56,7 +56,7 @@ def test_both_ends_are_cut_by_the_larger_of_way_and_time(
     assert len(found) == len(set(found)) == max(found) - min(found) + 1
 
 
-def test_who_stands_still_has_not_left_home() -> None:
+def test_standing_vehicle_has_not_left_the_start_of_its_trip() -> None:
     ends = TripEnds(1, 50.0, 0.0)
     for k in range(1, 100):
         time = np.array([[k * NS]])

@@ -357,7 +357,7 @@ def test_full_outbox_drops_oldest_states_then_observations_and_counts(path: Path
     outbox.close()
 
 
-def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> None:
+def test_dropped_batches_do_not_return_after_a_restart(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, capacity_bytes=2_500)
     outbox.store([draft(size=1_000) for _ in range(4)], now=0.0)
     outbox.close()

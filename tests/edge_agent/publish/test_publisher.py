@@ -103,7 +103,7 @@ def test_columns_arrive_as_they_were_observed(
             assert np.array_equal(received, sent[chosen], equal_nan=sent.dtype.kind == "f"), column
 
 
-def test_what_the_service_does_not_answer_is_sent_again_until_it_does(
+def test_unanswered_batches_are_sent_again_until_answered(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False

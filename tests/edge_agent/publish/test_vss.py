@@ -64,15 +64,15 @@ def test_quantiles_are_percent_and_clipped() -> None:
 
 
 @pytest.mark.parametrize("used", [0.0, 0.35, math.nan])
-def test_what_was_hardly_used_has_no_most_probable_value(used: float) -> None:
+def test_hardly_used_grip_has_no_most_probable_value(used: float) -> None:
     assert names(road_friction(0.6, 0.11, 1.14, used)) == {"LowerBound": 11.0, "UpperBound": 100.0}
 
 
-def test_what_is_unknown_is_absent() -> None:
+def test_unknown_friction_is_absent() -> None:
     assert road_friction(math.nan, math.nan, math.nan, 0.5) == {}
 
 
-def test_it_is_told_at_its_rate() -> None:
+def test_friction_is_reported_at_the_given_rate() -> None:
     lines: list[str] = []
     output = RoadFrictionOutput(["car-one"], lines.append, 2.0)
     output.report_grip(None)
@@ -82,7 +82,7 @@ def test_it_is_told_at_its_rate() -> None:
     assert json.loads(lines[1])["time"] == "2027-01-15T08:00:00.500Z"
 
 
-def test_it_is_put_where_somebody_listens_as_it_is_printed(router: Router) -> None:
+def test_subscriber_receives_the_printed_vss_value(router: Router) -> None:
     lines: list[str] = []
     output = RoadFrictionOutput(["car-one"], lines.append, 10.0)
     heard: list[str] = []

@@ -67,7 +67,7 @@ def cells(values: list[float | None], lasting: list[bool] | None = None) -> Draw
     )
 
 
-def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> None:
+def test_unmeasured_cells_have_no_colour_of_the_scale(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(render("two", cells([0.9, None]), GRIP_SCALE))
     dry = ",".join(str(int(shade(0.9, *GRIP_RANGE)[k : k + 2], 16)) for k in (1, 3, 5))

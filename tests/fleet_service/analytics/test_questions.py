@@ -289,7 +289,7 @@ def test_a_day_of_replay_has_a_frame_per_step_within_the_box(asked: Ask) -> None
         ("weather", {"stations": Path("nowhere.csv")}, "stations: cannot read"),
     ],
 )
-def test_what_a_question_lacks_is_said(
+def test_missing_option_of_a_question_is_reported(
     asked: Ask, name: str, options: dict[str, object], problem: str
 ) -> None:
     with pytest.raises(InputError, match=f"^{problem}"):

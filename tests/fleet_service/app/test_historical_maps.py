@@ -68,7 +68,7 @@ def test_rows_are_counted_before_any_is_read(root: Path) -> None:
     assert rows_near(root, now, historical_maps.box_of(question(bbox="0,0,1,1")), 10**6) == 0
 
 
-def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
+def test_query_that_reads_too_much_is_refused_and_a_smaller_box_is_not(
     root: Path, asker: historical_maps.HistoricalMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(historical_maps, "MOST_ROWS", 399)

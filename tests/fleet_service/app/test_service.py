@@ -145,7 +145,7 @@ def now() -> int:
     return time.time_ns() - SECOND
 
 
-def test_what_is_acknowledged_lies_in_a_segment_and_on_the_map(
+def test_acknowledged_rows_are_in_a_segment_and_on_the_map(
     fleet: Fleet, service: Running, tmp_path: Path
 ) -> None:
     fleet.settle(*(batch(vehicle, 1, now(), [0.8, 0.82]) for vehicle in VEHICLES))
@@ -223,7 +223,7 @@ def test_a_batch_with_one_bad_row_is_rejected_with_row_and_reason(
         ),
     ],
 )
-def test_what_is_not_ours_is_counted_and_the_service_goes_on(
+def test_foreign_messages_are_counted_and_the_service_continues(
     fleet: Fleet, service: Running, name: str, payload: bytes, encoding: str, rule: str
 ) -> None:
     fleet.session.put(name, payload, encoding=encoding)
@@ -270,7 +270,7 @@ def standing(session: zenoh.Session) -> list[wire.Alert]:
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 
-def test_who_comes_late_asks_for_the_alerts_that_stand(fleet: Fleet) -> None:
+def test_late_client_can_query_active_alerts(fleet: Fleet) -> None:
     assert not standing(fleet.session)
     moments = seconds()
     fleet.settle(*(batch(f"sim-{k:03}", 1, next(moments), [0.2]) for k in range(3)))

@@ -164,7 +164,7 @@ def test_unsynced_names_are_synced_before_any_acknowledgement(
     assert sum(table.num_rows for table in reading.read_tables(tmp_path, Kind.OBSERVATION)) == 4
 
 
-def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_path: Path) -> None:
+def test_half_written_segment_is_removed_at_the_next_start(engine: Engine, tmp_path: Path) -> None:
     engine.close()
     draft = tmp_path / "inbox" / "shard-0-0000000001-00000001.parquet.tmp"
     draft.write_bytes(b"PAR1 half")

@@ -130,7 +130,7 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
 
 
 @pytest.mark.campaign
-def test_it_may_die_before_any_change_of_the_disk(
+def test_compaction_survives_death_before_any_change_of_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill(tmp_path / "0", 2, 16)
@@ -159,7 +159,7 @@ def test_it_may_die_before_any_change_of_the_disk(
     assert instant > 40
 
 
-def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
+def test_interrupted_compaction_counts_no_row_twice(tmp_path: Path) -> None:
     fill(tmp_path, 2, ROWS)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Path, "unlink", lambda *_: (_ for _ in ()).throw(DiedError))

@@ -82,7 +82,7 @@ def test_compacted_files_are_registered_once_and_the_log_never(
     )
 
 
-def test_what_retention_removes_leaves_the_tables_first(
+def test_retention_removes_rows_from_iceberg_tables_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "archive"

@@ -31,7 +31,7 @@ def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATIO
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 
-def test_what_is_added_while_a_segment_is_written_waits_for_the_next(
+def test_rows_added_while_a_segment_is_written_wait_for_the_next(
     log: SegmentLog[str], tmp_path: Path
 ) -> None:
     add(log, "first", 1)

@@ -338,7 +338,7 @@ def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(
 
 
 @pytest.mark.campaign
-def test_who_only_reads_passes_over_damage_and_renames_nothing(
+def test_reader_skips_damaged_files_and_renames_none(
     old: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:

@@ -173,7 +173,7 @@ def test_a_file_of_others_is_not_written_over(foreign: bytes) -> None:
 
 
 @pytest.mark.parametrize(("country", "name"), [("SE", "x"), ("sweden", "x"), ("se", " ")])
-def test_who_answers_for_it_must_be_named(country: str, name: str) -> None:
+def test_supplier_must_be_valid(country: str, name: str) -> None:
     with pytest.raises(InputError):
         Supplier(country, name)
 
@@ -211,7 +211,7 @@ def test_the_file_follows_the_alerts_of_a_service_and_outlives_it(
     assert out.read_bytes() == kept
 
 
-def test_who_only_rolled_is_in_no_publication(
+def test_vehicles_without_grip_demand_cause_no_publication(
     router: ZenohSettings,
     session: zenoh.Session,
     start: Callable[..., AbstractContextManager[Running]],

@@ -60,7 +60,7 @@ def running(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Network]
 
 
 @pytest.mark.campaign
-def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
+def test_access_list_has_no_breach(running: Network) -> None:
     with open_ground(running) as found:
         assert breaches(found) == set()
 

@@ -70,7 +70,7 @@ def test_running_it_again_changes_nothing(folder: Path) -> None:
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_what_comes_to_its_end_is_issued_anew(folder: Path) -> None:
+def test_expiring_certificates_are_issued_again(folder: Path) -> None:
     assert not at(folder, 334.0).enrol(make_enrolment()).made
     assert set(at(folder, 336.0).enrol(make_enrolment()).made) == EVERYONE
     assert certificate(folder, SERVICE).not_valid_after_utc == NOW + timedelta(days=336 + 365)
@@ -163,7 +163,7 @@ def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
 @pytest.mark.parametrize(
     "host", ["", "-a", "a-", "a..b", ".a", "a_b", "a" * 64, "a b", "a\n", ".".join(["ab"] * 100)]
 )
-def test_what_is_no_host_is_refused(host: str) -> None:
+def test_invalid_host_is_refused(host: str) -> None:
     with pytest.raises(ValueError, match="is neither a host name nor an address"):
         make_enrolment(routers={"r-1": {"hosts": [host]}})
 
@@ -204,7 +204,7 @@ def test_what_is_no_host_is_refused(host: str) -> None:
         ({"routers": {"r-1": {}}}, ["--ca", "switch"], "error: ca: there is no next authority; "),
     ],
 )
-def test_what_cannot_be_used_is_one_line_that_names_it(
+def test_invalid_enrolment_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fleet: object, options: list[str], said: str
 ) -> None:
     file = tmp_path / "fleet.json"
@@ -227,7 +227,7 @@ def test_the_command_says_what_it_did_and_what_is_to_be_done(
     ]
 
 
-def test_what_was_not_made_here_is_left_alone_and_no_key_is_deleted(
+def test_foreign_files_stay_and_no_private_key_is_deleted(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     other = tmp_path_factory.mktemp("other")

@@ -87,7 +87,7 @@ def test_late_reports_of_ice_raise_an_alert_at_the_time_of_the_visits() -> None:
         assert all(START + 2990 * 10**9 < alert.time <= START + 3060 * 10**9 for alert in raised)
 
 
-def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> None:
+def test_report_older_than_the_forgetting_time_is_not_fused() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([constants.CHANGE_S + 1000.0], [50], value([0.8]), cell=CELL + 9))
     updated = fusion.update(observations([100.0], [1], value([0.2])))

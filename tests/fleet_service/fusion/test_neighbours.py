@@ -138,7 +138,7 @@ def test_a_road_that_continues_straight_on_hears_no_cell_beside_it() -> None:
 
 
 @pytest.mark.parametrize("others", [dry(), UNTESTED, at_least([0.02] * 9), np.zeros((3, 32))])
-def test_who_found_no_slippery_road_tells_nothing(others: FloatArray) -> None:
+def test_neighbours_without_slippery_road_change_no_belief(others: FloatArray) -> None:
     alone = belief(road({0: UNTESTED}))
     among = belief(road({0: UNTESTED} | dict.fromkeys((-2, -1, 1, 2), others)))
     assert among == pytest.approx(alone, abs=2e-3)
@@ -214,7 +214,7 @@ def test_reading_leaves_a_cells_own_belief_as_it_is() -> None:
     assert fusion.slippery(np.array([0]))[0] == alone.slippery(np.array([0]))[0]
 
 
-def test_what_the_weather_says_of_a_region_is_not_told_again() -> None:
+def test_weather_prior_is_not_counted_again_from_neighbours() -> None:
     prior = np.where(mugrid.CENTRES < 0.4, 1.0, 0.1)
     one = np.ones(1, np.int64)
     nan = np.full(1, np.nan)

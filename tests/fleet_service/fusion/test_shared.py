@@ -33,7 +33,7 @@ def test_kernel_rows_are_probabilities_and_keep_the_prior(used: float, stated: f
 
 
 @given(_rising)
-def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.ndarray) -> None:
+def test_shared_bounds_never_lower_the_upper_end_of_a_rising_belief(p: np.ndarray) -> None:
     road = shared.base_kernel() @ p
     assert np.diff(road).min() >= -1e-12
     assert mugrid.quantiles(road / road.sum(), 0.95) >= mugrid.quantiles(mugrid.PRIOR, 0.95) - 1e-9
@@ -64,7 +64,7 @@ def test_certainty_grows_with_manoeuvres_not_with_equal_vehicles() -> None:
     assert width(0.2, same) > 1.2 * width(0.6, same)
 
 
-def test_who_does_not_tell_what_it_did_did_the_same_as_all_others() -> None:
+def test_unknown_manoeuvre_counts_as_the_same_as_all_others() -> None:
     same = np.full(30, ManoeuvreKind.BRAKING)
     unknown = np.where(np.arange(30) % 2, NONE, ManoeuvreKind.BRAKING)
     assert width(0.6, unknown) == pytest.approx(width(0.6, same), abs=1e-3)

@@ -85,7 +85,7 @@ def test_enrolled_liars_still_lose_their_vote() -> None:
     assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
 
 
-def test_whoever_agreed_with_enough_known_vehicles_is_no_newcomer() -> None:
+def test_vehicle_that_agreed_with_enough_known_ones_is_established() -> None:
     """The record of a vehicle's meetings has few places. Meetings with the first few vehicles must
     not displace each other, or the vehicle stays a newcomer and supports no alert.
     """

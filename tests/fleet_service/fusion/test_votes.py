@@ -113,7 +113,7 @@ def test_a_vehicle_that_always_disagrees_loses_its_vote() -> None:
     assert 0.5 < fusion.trust(12345) < 0.9
 
 
-def test_what_nobody_confirms_fades_to_the_prior() -> None:
+def test_unconfirmed_belief_fades_to_the_prior() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.3))))
     widths = [

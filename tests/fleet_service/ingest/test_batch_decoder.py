@@ -82,7 +82,7 @@ def is_agreed(kind: Kind, payload: bytes) -> bool:
 
 
 @given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), draw_message(kind))))
-def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(
+def test_decoder_reads_messages_of_the_protobuf_module_exactly(
     case: tuple[Kind, Any],
 ) -> None:
     kind, message = case
@@ -142,7 +142,7 @@ def _encode_run(number: int, body: bytes) -> bytes:
         _encode_run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # a number of more than 32 bits
     ],
 )
-def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> None:
+def test_unusual_encodings_are_left_to_the_protobuf_module(more: bytes) -> None:
     payload = _make_example().SerializeToString()
     assert is_agreed(Kind.OBSERVATION, payload)
     assert not is_agreed(Kind.OBSERVATION, payload + more)

@@ -197,7 +197,7 @@ def test_service_counts_removes_and_rewrites_damaged_lines(tmp_path: Path) -> No
         assert engine.counts.witnesses_damaged == 0
 
 
-def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(
+def test_vehicle_numbers_are_durable_before_the_acknowledgement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = time.time_ns()

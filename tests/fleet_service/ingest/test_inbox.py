@@ -36,7 +36,7 @@ def of_bytes(size: int) -> Message:
     return Message(Kind.STATE, "", bytes(size), "")
 
 
-def test_what_waits_is_bounded_in_bytes_and_not_in_messages_only() -> None:
+def test_queue_is_limited_in_bytes() -> None:
     queue, counts = inbox(20_000)
     large = of_bytes(wire.MAX_BYTES)
     fits = QUEUE_BYTES // len(large.payload)
@@ -78,7 +78,7 @@ def test_a_message_above_the_largest_size_is_counted_and_not_copied() -> None:
     assert counts == ServiceCounts(refused=Counter(payload=1))
 
 
-def test_what_waits_is_bounded_in_messages_too_and_a_step_takes_so_many() -> None:
+def test_queue_and_step_are_limited_in_messages() -> None:
     queue, counts = inbox(3 * STEP_MESSAGES)
     for _ in range(4 * STEP_MESSAGES):
         queue.put(of_bytes(1))

@@ -84,7 +84,7 @@ def test_one_that_sends_too_much_takes_nothing_from_the_others() -> None:
     assert found.allows("obs/1202/310/232/quiet", 300)
 
 
-def test_who_is_not_enrolled_is_not_looked_at() -> None:
+def test_vehicle_that_is_not_enrolled_is_refused() -> None:
     found, counts = buckets(Clock(), {"car-1"})
     assert found.allows("obs/1202/310/232/car-1", 300)
     assert not any(found.allows(f"obs/1202/310/232/{name}", 300) for name in ("car-2", "**", ""))

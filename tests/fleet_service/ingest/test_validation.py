@@ -138,7 +138,7 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
         ("yaw", [1.0, -1.0]),
     ],
 )
-def test_what_is_absent_or_just_beside_is_let_in(
+def test_absent_values_and_values_just_outside_are_admitted(
     desk: Desk, column: str, values: list[float]
 ) -> None:
     assert (

@@ -249,7 +249,7 @@ def test_a_running_service_takes_weather_over_its_key(
     publisher.undeclare()
 
 
-def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path: Path) -> None:
+def test_inbox_keeps_a_limited_number_of_reports_the_newest(tmp_path: Path) -> None:
     counts = ServiceCounts()
     inbox = WeatherInbox(tmp_path, "fleet", Fusion(120.0), counts)
     now = 10**18

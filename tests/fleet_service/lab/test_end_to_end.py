@@ -21,7 +21,7 @@ from tests.fleet_service.examples import CELL, START, observations, value
 
 
 @pytest.mark.campaign
-def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
+def test_observations_of_the_vehicles_are_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:
         world = ["--scenario", end_to_end.HILLS.scenario, "--rough", "0.5"]
         assert (

@@ -178,7 +178,7 @@ def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> N
     assert np.ptp(above, axis=1).max() <= agent.SLOPE_NATS
 
 
-def test_what_is_delivered_twice_is_admitted_once() -> None:
+def test_duplicate_delivery_is_admitted_once() -> None:
     rng = np.random.default_rng(3)
     visits = town.drive_fleet(rng, town.draw_town(rng, 5, 0.0), agent.Errors.draw(rng, 10), 5)
     _, which = draw_arrivals(rng, visits)

@@ -92,7 +92,7 @@ def test_attribution_of_a_base_map_is_on_the_page(router: ZenohSettings, tmp_pat
         assert seen.page.locator("#attribution").is_visible()
 
 
-def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
+def test_invalid_tile_file_is_refused_with_the_problem(tmp_path: Path) -> None:
     (tmp_path / "text.mbtiles").write_text("no table")
     names = {
         "missing.mbtiles": "does not exist",

@@ -88,7 +88,7 @@ def test_the_less_is_known_the_fewer_colours() -> None:
     assert {colour_of(mu, 0.05, 1.1) for mu in mus} == {LITTLE}
 
 
-def test_what_is_slippery_at_its_upper_end_keeps_its_colour() -> None:
+def test_cell_with_a_slippery_upper_end_keeps_its_colour() -> None:
     assert colour_of(0.15, 0.05, 0.39) == FOUR[0]
     assert colour_of(0.3, 0.05, 0.39) == FOUR[1]
 

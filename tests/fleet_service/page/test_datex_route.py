@@ -77,7 +77,7 @@ def put(session: zenoh.Session, cells: list[int], *, raised: bool, at: int = STA
         session.put(keys.alert_key(TILE), wire.encode_alert(told))
 
 
-def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
+def test_pulled_publication_follows_alerts_and_continues_after_restart(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     out = tmp_path / "situations.xml"

@@ -254,7 +254,7 @@ def _place(part: str) -> str:
     return json.dumps([cell >> 14, cell & 0x3FFF])
 
 
-def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(
+def test_page_receives_changes_and_shows_an_alert_with_its_reason(
     page: RunningPage, drive: Drive
 ) -> None:
     with open_map(page) as seen:

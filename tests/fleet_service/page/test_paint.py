@@ -151,7 +151,7 @@ def test_before_any_service_spoke_the_world_is_hatched_and_not_empty(bare: str) 
         assert not seen.page.locator("#play").is_visible(), "there is no past to play"
 
 
-def test_what_one_direction_found_is_not_said_of_the_other(page: RunningPage, drive: Drive) -> None:
+def test_alert_of_one_direction_is_not_shown_for_the_other(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_map(page) as seen:
         near(seen, cell_of("ice"))

@@ -108,7 +108,7 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
     assert (far["mu"][0], far["upper"][0], far["slippery"][0]) == (24, 40, 254)
 
 
-def test_what_changed_laid_over_what_was_is_what_is(table: pa.Table) -> None:
+def test_changed_records_applied_to_the_old_ones_give_the_new_ones(table: pa.Table) -> None:
     before = records.of_table(table)[:700]
     after = records.of_table(table)[300:].copy()
     after["mu"][::7] = 11

@@ -162,7 +162,7 @@ def test_the_words_are_given_in_a_language_that_there_is(bare: str) -> None:
     assert "Accept-Language" in headers["vary"]
 
 
-def test_who_connects_is_told_what_stands_and_then_what_changes(
+def test_client_receives_the_present_state_and_then_changes(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice")

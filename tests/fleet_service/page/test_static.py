@@ -79,7 +79,7 @@ def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> No
         "export { a };\n",
     ],
 )
-def test_what_cannot_be_joined_is_said(text: str) -> None:
+def test_modules_that_cannot_be_bundled_raise(text: str) -> None:
     with pytest.raises(ValueError, match="cannot be joined"):
         bundle_modules({"main": text}, "main")
     with pytest.raises(CycleError):

@@ -74,7 +74,7 @@ def test_the_base_map_names_its_makers_without_markup(tmp_path: Path) -> None:
     assert base_map(str(tmp_path / "map.pmtiles"), "me").attribution == "me"
 
 
-def test_what_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_no_vector_pmtiles_is_refused(tmp_path: Path) -> None:
     (tmp_path / "no.pmtiles").write_bytes(b"no" * 100)
     for path in (
         tmp_path / "no.pmtiles",

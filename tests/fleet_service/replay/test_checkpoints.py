@@ -207,7 +207,7 @@ def test_state_is_equal_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) 
             shutil.rmtree(checkpoints.list_checkpoints(tmp_path)[0])
 
 
-def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
+def test_rows_in_a_checkpoint_are_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)

@@ -22,7 +22,7 @@ from tests.standbys import restore_archive
 
 
 @pytest.mark.campaign
-def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(
+def test_late_uploads_of_a_former_lease_holder_overwrite_nothing(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
     month = "2026-11"

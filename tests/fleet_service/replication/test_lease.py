@@ -117,7 +117,7 @@ def assert_whole(fleet: Fleet, sent: list[Batch], folder: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
+def test_one_of_two_standbys_takes_over_and_the_other_waits(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path
 ) -> None:
     fleet = Fleet(session)
@@ -200,7 +200,7 @@ def acknowledges(one: Machine) -> bool:
 
 
 @pytest.mark.campaign
-def test_what_a_frozen_service_had_under_way_counts_for_nothing(
+def test_unfinished_work_of_a_frozen_service_has_no_effect(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
     one = Machine(tmp_path / "one", bucket)

@@ -74,7 +74,7 @@ def fill_log(root: Path, copy: BucketReplica | None, seeds: range = range(3)) ->
     return log
 
 
-def test_what_is_settled_is_in_the_bucket_byte_for_byte(
+def test_settled_files_are_in_the_bucket_byte_for_byte(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -224,7 +224,7 @@ def test_an_empty_disk_has_all_of_it_again(
     assert last_copy_url(new) == bucket.url
 
 
-def test_what_was_cut_off_is_made_good_at_the_next_start(
+def test_interrupted_upload_and_damage_are_repaired_at_the_next_start(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"

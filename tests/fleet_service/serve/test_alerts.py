@@ -195,7 +195,7 @@ def test_an_alert_ends_with_two_more_sources_of_grip_than_of_ice(icy: int, neede
     ("beside", "grip_used", "alerted"),
     [(0.2, False, [True, True]), (0.85, False, [False, False]), (0.2, True, [False, False])],
 )
-def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
+def test_one_source_of_ice_in_each_of_two_near_cells_suffices(
     beside: float, grip_used: bool, alerted: list[bool], slope: int
 ) -> None:
     fusion = Fusion(120.0)
@@ -215,7 +215,7 @@ def test_one_source_of_ice_in_each_of_two_cells_of_a_stretch_is_enough(
     ("sector", "mu", "alerted"),
     [(2, 0.2, [True, True]), (1, 0.2, [False, False]), (2, 0.85, [False, False])],
 )
-def test_one_source_of_ice_in_each_direction_of_a_road_is_enough(
+def test_one_source_of_ice_in_each_direction_of_a_road_suffices(
     sector: int, mu: float, alerted: list[bool]
 ) -> None:
     fusion = Fusion(120.0)

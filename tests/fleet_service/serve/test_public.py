@@ -156,7 +156,7 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
     assert (coarsen_cells(seen).vehicles == seen.vehicles).all()
 
 
-def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
+def test_vehicle_alone_at_night_stays_hidden_where_many_passed_by_day(start: Start) -> None:
     """A vehicle that passes alone at night must not be visible in answers, routes, stored maps
     (snapshots) and tiles, although many passed by day. Only vehicles of the last hours may make a
     cell public.

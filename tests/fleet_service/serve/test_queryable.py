@@ -113,7 +113,7 @@ def nothing(
     [AnswerSize(LIGHT + 1, 1), AnswerSize(1, LIGHT // TILE_COST + 1)],
     ids=["cells", "tiles"],
 )
-def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(
+def test_small_query_does_not_wait_for_a_large_one(
     session: zenoh.Session, much: AnswerSize
 ) -> None:
     """The service must answer a query for little data while it still answers a query for much data.

@@ -96,7 +96,7 @@ def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(
     assert made.read_tiles([TILE + 2], NOW)[0] is not young
 
 
-def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:
+def test_tile_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1).read_tiles([TILE], NOW)[0]
     before = np.array(made.columns["vehicles"])
     visit(state, 2)

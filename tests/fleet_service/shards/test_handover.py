@@ -143,7 +143,7 @@ def test_a_region_stays_where_nobody_stands_by_for_it(
 
 
 @pytest.mark.campaign
-def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(
+def test_lease_released_for_one_service_is_reserved_for_it_for_a_while(
     bucket: BucketServer,
 ) -> None:
     store = ObjectBucket(bucket.url, bucket.store, 5.0)

@@ -226,7 +226,7 @@ def test_region_is_announced_only_while_queries_are_answered(
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_who_comes_while_it_is_asked_may_not_have_been_asked(
+def test_service_that_appears_during_a_query_may_have_missed_it(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
@@ -249,7 +249,7 @@ def test_who_comes_while_it_is_asked_may_not_have_been_asked(
         coming.__exit__(None, None, None)
 
 
-def test_who_is_found_after_it_was_asked_is_asked_again(
+def test_service_found_after_an_empty_answer_is_queried_again(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The client's first query returns nothing, because the test replaces its replies with an empty
@@ -344,7 +344,7 @@ def zenoh_session(router: ZenohSettings) -> Iterator[zenoh.Session]:
         yield opened
 
 
-def test_what_nobody_serves_is_said_in_as_few_regions_as_there_are() -> None:
+def test_unserved_area_is_named_with_the_fewest_regions() -> None:
     box = query.parse({"bbox": f"{WEST + 0.01},{SOUTH + 0.01},{EAST + 0.02},{NORTH - 0.01}"})
     first = NAMES[1].split("/")
     assert regions.unserved_expressions(box, ["*/*/*"]) == []

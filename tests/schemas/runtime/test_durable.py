@@ -41,7 +41,7 @@ def test_a_file_has_its_name_when_it_is_whole_and_synced(
 
 
 @pytest.mark.parametrize("error", [OSError(28, "full"), KeyboardInterrupt(), ValueError()])
-def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseException) -> None:
+def test_failed_write_leaves_the_file_unchanged(tmp_path: Path, error: BaseException) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"old")
 

@@ -44,7 +44,7 @@ def test_progress_is_shown_while_the_drawing_library_still_loads(
         progress_messages.enable_messages(quiet=True)
 
 
-def test_nobody_is_told_anything_who_asked_for_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quiet_run_prints_no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.0)

@@ -44,7 +44,7 @@ def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_what_would_have_to_be_unpacked_is_refused_before_it_is(
+def test_compressed_tile_is_refused_before_it_is_decompressed(
     compression: Literal["zstd", "lz4"],
 ) -> None:
     bomb = encode_stream(make_table(tile.MAX_ROWS), compression)

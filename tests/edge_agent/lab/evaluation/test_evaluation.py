@@ -110,7 +110,7 @@ def test_the_bars_are_those_that_were_asked_for() -> None:
     assert {bar.name: (bar.bar, bar.better) for bar in BARS} == ASKED
 
 
-def test_what_was_not_measured_is_told_as_missing_except_when_quick() -> None:
+def test_missing_measurements_are_reported_except_in_a_quick_run() -> None:
     assert {figure.name for figure in figures(Results(), quick=False)} == set(ASKED)
     assert not any(figure.holds for figure in figures(Results(), quick=False))
     assert figures(Results(), quick=True) == []

@@ -79,7 +79,7 @@ def test_contradiction_is_counted_by_surface_and_by_whether_grip_is_used(
     assert found["contradiction_share.dry.calm"] == found["contradiction_share.snow.excited"] == 0.0
 
 
-def test_who_says_ice_of_every_road_is_right_on_ice_alone(
+def test_estimator_that_always_reports_ice_is_right_only_on_ice(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
     found = figures(driven, saying(driven[0], 0.05, 0.2))
@@ -182,6 +182,6 @@ def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
     assert 0.2 < frictions.mean() / expected.mean() < 2.0
 
 
-def test_nobody_tunes_on_the_seeds_of_the_figures() -> None:
+def test_tuning_seeds_differ_from_those_of_the_figures() -> None:
     for drives in (objectives.TRAIN, objectives.HELD_OUT, study.TRAIN, study.HELD_OUT):
         assert all(drive.seed < FIGURES for drive in drives)

@@ -60,7 +60,7 @@ def test_between_two_measurements_nobody_knows() -> None:
     assert most == (far + 9 - 11) * SLOT_S
 
 
-def test_what_is_not_sure_is_neither_below_nor_kept() -> None:
+def test_uncertain_slots_are_neither_breached_nor_kept() -> None:
     by_mean, least, most, _ = measure_contract((10, 0.8), (11, 0.3), (12, 0.8), std=0.1)
     assert (by_mean, least, most) == (SLOT_S, 0, SLOT_S)
     assert measure_contract((10, 0.4), (11, 0.4), std=0.2)[1:3] == (0, 2 * SLOT_S)
@@ -137,7 +137,7 @@ def test_one_vehicle_s_ten_passes_are_one_witness() -> None:
 
 
 @pytest.mark.parametrize("lacks", ["roads", "level", "within_s"])
-def test_what_is_missing_is_said(asked: Ask, links: Path, lacks: str) -> None:
+def test_missing_option_of_a_contract_is_reported(asked: Ask, links: Path, lacks: str) -> None:
     options = {"roads": links, "level": LEVEL, "within_s": 3600.0}
     del options[lacks]
     with pytest.raises(InputError) as error:

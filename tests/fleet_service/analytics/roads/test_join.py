@@ -119,7 +119,7 @@ def test_lines_with_one_id_are_parts_of_one_link() -> None:
     assert second.to_m.max() == pytest.approx(300.0, rel=1e-3)
 
 
-def test_it_is_right_at_any_latitude() -> None:
+def test_road_join_is_right_at_any_latitude() -> None:
     def at(latitude: float) -> list[DirectedLink]:
         east = METRES_PER_DEGREE * np.cos(np.radians(latitude))
         lines: Any = (np.full(2, latitude), np.array([10.0, 10.0 + 400 / east]))

@@ -94,7 +94,7 @@ def test_lines_with_ids_come_from_any_file_in_any_coordinates(tmp_path: Path, en
         ("a.txt", b"", "extract"),
     ],
 )
-def test_what_is_no_network_is_an_error_that_names_it(
+def test_invalid_road_network_is_an_error_that_names_the_field(
     name: str, content: bytes, field: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(content)

@@ -281,7 +281,7 @@ def test_an_event_keeps_its_number_over_restarts_until_it_is_cancelled(tmp_path:
     assert begun.validity_s * NS == VALID_NS
 
 
-def test_what_the_interchange_has_not_accepted_is_sent_after_a_restart(tmp_path: Path) -> None:
+def test_message_that_the_interchange_has_not_accepted_is_sent_again(tmp_path: Path) -> None:
     run = Run(tmp_path / "cits.json", settles=False)
     run.step(stretch("a"))
     run.now += NS
