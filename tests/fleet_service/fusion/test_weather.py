@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fleet_service.fusion import Fusion
-from fleet_service.fusion import weather as w
+from fleet_service.fusion import Fusion, weather
 from schemas import grid, mugrid
 from tests.fleet_service.examples import (
     CELL,
@@ -30,7 +29,9 @@ FREEZING = (np.nan, -1.0, 0.5)
 STEADY = (15.0, np.nan, 0.0)
 
 
-def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGION) -> w.Reports:
+def reports(
+    *rows: tuple[float, tuple[float, float, float]], region: int = REGION
+) -> weather.Reports:
     """Return a table of weather reports.
 
     Args: rows: (hours after START, (air temperature [°C], road temperature [°C], precipitation
@@ -38,7 +39,7 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
     """
     air, road, water = np.array([row[1] for row in rows]).T
     time = np.array([START + int(row[0] * HOUR) for row in rows])
-    return w.Reports(
+    return weather.Reports(
         np.full(len(rows), region),
         time,
         air,
@@ -48,33 +49,41 @@ def reports(*rows: tuple[float, tuple[float, float, float]], region: int = REGIO
     )
 
 
-def compute_road_time(weather: w.Weather, begin: float, end: float) -> tuple[float, float]:
+def compute_road_time(conditions: weather.Weather, begin: float, end: float) -> tuple[float, float]:
     """Return two road times [h] between `begin` and `end` [h after START]. A road time is the
     elapsed time multiplied by a rate that depends on the weather. The first road time uses the rate
     of slow drift of friction, the second the rate of sudden changes.
     """
-    drift, change, _ = w.road_time(weather, KEY, START + int(begin * HOUR), START + int(end * HOUR))
+    drift, change, _ = weather.road_time(
+        conditions, KEY, START + int(begin * HOUR), START + int(end * HOUR)
+    )
     return drift / 3600.0, change / 3600.0
 
 
 def test_without_a_word_about_a_region_its_roads_age_by_the_clock() -> None:
-    for weather in (
-        w.weather_of(w.no_reports()),
-        w.weather_of(reports((0.0, RAIN), region=REGION + 1)),
+    for conditions in (
+        weather.weather_of(weather.no_reports()),
+        weather.weather_of(reports((0.0, RAIN), region=REGION + 1)),
     ):
-        assert compute_road_time(weather, -5.0, 7.0) == pytest.approx((12.0, 12.0))
+        assert compute_road_time(conditions, -5.0, 7.0) == pytest.approx((12.0, 12.0))
 
 
 def test_road_time_integrates_the_weather_until_a_report_expires() -> None:
-    weather = w.weather_of(reports((0.0, RAIN), (1.0, FREEZING), (2.0, STEADY)))
-    assert compute_road_time(weather, -1.0, 0.0) == pytest.approx((1.0, 1.0))
-    assert compute_road_time(weather, 0.0, 1.0) == pytest.approx((w.WET_DRIFT, w.WET_CHANGE))
-    assert compute_road_time(weather, 1.0, 2.0) == pytest.approx((w.WET_DRIFT, w.FREEZING_CHANGE))
-    assert compute_road_time(weather, 2.0, 5.0) == pytest.approx((3.0, 3.0 * w.STEADY_CHANGE))
-    assert compute_road_time(weather, 5.0, 9.0) == pytest.approx((4.0, 4.0))
-    whole = [compute_road_time(weather, -1.0, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
+    conditions = weather.weather_of(reports((0.0, RAIN), (1.0, FREEZING), (2.0, STEADY)))
+    assert compute_road_time(conditions, -1.0, 0.0) == pytest.approx((1.0, 1.0))
+    assert compute_road_time(conditions, 0.0, 1.0) == pytest.approx(
+        (weather.WET_DRIFT, weather.WET_CHANGE)
+    )
+    assert compute_road_time(conditions, 1.0, 2.0) == pytest.approx(
+        (weather.WET_DRIFT, weather.FREEZING_CHANGE)
+    )
+    assert compute_road_time(conditions, 2.0, 5.0) == pytest.approx(
+        (3.0, 3.0 * weather.STEADY_CHANGE)
+    )
+    assert compute_road_time(conditions, 5.0, 9.0) == pytest.approx((4.0, 4.0))
+    whole = [compute_road_time(conditions, -1.0, t)[1] for t in (0.5, 1.5, 2.5, 9.0)]
     parts = [
-        compute_road_time(weather, -1.0, 0.3)[1] + compute_road_time(weather, 0.3, t)[1]
+        compute_road_time(conditions, -1.0, 0.3)[1] + compute_road_time(conditions, 0.3, t)[1]
         for t in (0.5, 1.5, 2.5, 9.0)
     ]
     assert whole == pytest.approx(parts)
@@ -82,18 +91,22 @@ def test_road_time_integrates_the_weather_until_a_report_expires() -> None:
 
 def test_unknown_values_change_nothing() -> None:
     nothing = (np.nan, np.nan, np.nan)
-    assert w.report_rates(reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))).tolist() == [
+    assert weather.report_rates(
+        reports((0.0, nothing), (0.0, (20.0, np.nan, np.nan)))
+    ).tolist() == [
         [1.0, 1.0],
         [1.0, 1.0],
     ]
     # The road may be colder than the air, so 1 °C counts as a change to frost.
-    assert w.report_rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == w.FREEZING_CHANGE
+    assert (
+        weather.report_rates(reports((0.0, (1.0, np.nan, np.nan))))[0, 1] == weather.FREEZING_CHANGE
+    )
 
 
-def after_an_hour(weather: w.Reports | None) -> np.ndarray:
+def after_an_hour(conditions: weather.Reports | None) -> np.ndarray:
     fusion = Fusion(120.0)
-    if weather is not None:
-        fusion.update_weather(weather)
+    if conditions is not None:
+        fusion.update_weather(conditions)
     fusion.update(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.8))))
     return belief(fusion, now=START + HOUR)
 
