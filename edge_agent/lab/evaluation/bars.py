@@ -112,7 +112,6 @@ def width_ratio(results: Results) -> float:
 M_S = "m/s"
 RAD_S = "rad/s"
 SHARE = "1"
-TURN_DRIVES: Final = ("circle", "corners", "ramp")
 # Targets of drives on two circles and at street corners: road, measure, target. The measure
 # slippery is the share of the time for which the road is reported as slippery.
 TURNS: Final[tuple[tuple[str, str, float, Literal["less", "more"]], ...]] = (

@@ -373,16 +373,6 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
         assert "its grip is unknown" in seen.page.locator("#route-worst").inner_text()
 
 
-_FITTED: Final = """(() => {
-  const { map: { view }, state: { now } } = gripmap, extent = now.extent;
-  const held = [...now.known].every(tile => now.tiles.has(tile));
-  if (!extent || !held) return false;
-  const wide = (extent.east - extent.west) * view.scale / view.width;
-  const high = (extent.south - extent.north) * view.scale / view.height;
-  return Math.max(wide, high) > .5 && Math.max(wide, high) < 1;
-})()"""
-
-
 @pytest.mark.campaign
 def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
