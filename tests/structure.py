@@ -3,8 +3,8 @@
     python -m tests.structure [CHECKOUT]          print the table: figure, value, bar, ceiling
     python -m tests.structure --places [FIGURE]   print the code places that a figure counts
 
-A room is a module or sub-package of a package's folder. An arrow means that one room imports
-another. A bar is the target of a figure; its ceiling is the present limit, which may only fall.
+A part of a package is a module or sub-package in its folder. A bar is the target of a figure; its
+ceiling is the present limit, which may only fall.
 `tests/test_structure.py` compares each figure with its ceiling.
 """
 
@@ -57,13 +57,13 @@ def list_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, f"{module}.{name.name}") for name in node.names)
 
 
-def room_of(name: str) -> tuple[str, str]:
+def part_of(name: str) -> tuple[str, str]:
     """Return the first two parts of a dotted name: package and sub-package (or module)."""
-    package, room, *_ = [*name.split("."), "", ""]
-    return package, room
+    package, part, *_ = [*name.split("."), "", ""]
+    return package, part
 
 
-def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
+def list_part_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
     """Return the pairs (first, second) of sub-packages in which the first imports the second,
     within one package. Each pair has one example: file and line of the import.
     """
@@ -71,9 +71,9 @@ def list_room_imports(root: Path, package: str) -> dict[tuple[str, str], str]:
     for path in list_sources(root, package):
         parts = path.relative_to(root / package).with_suffix("").parts
         for line, name in list_imports(parse(path)):
-            other, room = room_of(name)
-            if other == package and room and parts[0] not in (room, "__init__"):
-                found.setdefault((parts[0], room), f"{path.relative_to(root)}:{line}")
+            other, part = part_of(name)
+            if other == package and part and parts[0] not in (part, "__init__"):
+                found.setdefault((parts[0], part), f"{path.relative_to(root)}:{line}")
     return found
 
 
@@ -129,7 +129,7 @@ def light_import(root: Path) -> tuple[float, int, list[str]]:
 
 FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
 Places = list[str]
-CONSTANT_ROOMS: Final = (
+CONSTANT_FOLDERS: Final = (
     "edge_agent/adaptation",
     "edge_agent/estimators/common",
     "edge_agent/estimators/friction_mixture",
@@ -147,7 +147,7 @@ def functions(root: Path, *packages: str) -> Iterator[tuple[str, FunctionNode]]:
                 yield f"{path.relative_to(root)}:{node.lineno} {node.name}", node
 
 
-def room_arrows(root: Path, folder: str) -> Places:
+def list_inner_imports(root: Path, folder: str) -> Places:
     """Return one text per pair (first, second) of sub-packages or modules of a folder in which the
     first imports the second.
     """
@@ -285,13 +285,13 @@ def many_locals(root: Path) -> Places:
 
 def named_constants(root: Path) -> Places:
     """Return the places of named numbers in the code that processes data between sensor and map
-    (the folders CONSTANT_ROOMS).
+    (the folders CONSTANT_FOLDERS).
 
     Counted are module constants (capital letters), and fields of classes called …Constants. Their
     value must be a number or an expression of numbers.
     """
     found = []
-    for path in list_sources(root, *CONSTANT_ROOMS):
+    for path in list_sources(root, *CONSTANT_FOLDERS):
         tree = parse(path)
         bodies = [("", tree.body)]
         bodies += [
@@ -415,13 +415,16 @@ class Figure(NamedTuple):
 
 FIGURES: Final = (
     Figure(
-        "arrows inside archive/", 10, 6, lambda root: room_arrows(root, "fleet_service/archive")
+        "imports between parts of archive/",
+        10,
+        6,
+        lambda root: list_inner_imports(root, "fleet_service/archive"),
     ),
     Figure(
-        "arrows inside friction_mixture/",
+        "imports between parts of friction_mixture/",
         22,
         21,
-        lambda root: room_arrows(root, "edge_agent/estimators/friction_mixture"),
+        lambda root: list_inner_imports(root, "edge_agent/estimators/friction_mixture"),
     ),
     Figure("import circles", 0, 0, import_circles),
     Figure("methods of the largest class", 15, 15, methods_of_largest_class),
@@ -452,8 +455,8 @@ def main(arguments: list[str]) -> None:
         print(f"{figure.name:<44}{value:>9g}{figure.bar:>9g}{figure.ceiling:>9g}{mark}")
     for package in PACKAGES[:3]:
         loose = len(loose_modules(root, package))
-        arrows = len(list_room_imports(root, package))
-        print(f"{package}: {loose} loose modules, {arrows} arrows between rooms")
+        imports = len(list_part_imports(root, package))
+        print(f"{package}: {loose} loose modules, {imports} imports between parts")
     print(f"class names used more than once: {len(ambiguous_classes(root))}")
     milliseconds, modules, heavy = light_import(root)
     print(

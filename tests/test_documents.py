@@ -24,7 +24,7 @@ from tests.usability import mistakes, readme
 HALVES = {"edge_agent": "edge-agent", "fleet_service": "fleet-service"}
 README_WORDS = 450
 FIRST_COMMAND_WITHIN = 120
-ROOM_LINES = 60
+README_LINES = 60
 COLUMNS = 100
 CONTRACT = "schemas/README.md"  # reference for other languages, not an overview of a folder
 
@@ -86,11 +86,11 @@ def test_every_command_of_every_page_is_understood() -> None:
 
 
 @pytest.mark.parametrize("half", HALVES)
-def test_every_room_is_in_the_readme_of_its_half(half: str) -> None:
+def test_readme_of_a_package_lists_every_sub_package(half: str) -> None:
     page = (ROOT / half / "README.md").read_text(encoding="utf-8")
-    rooms = [path.parent.name for path in (ROOT / half).glob("*/__init__.py")]
-    assert len(rooms) > 8
-    assert not [room for room in rooms if f"`{room}/" not in page]
+    folders = [path.parent.name for path in (ROOT / half).glob("*/__init__.py")]
+    assert len(folders) > 8
+    assert not [folder for folder in folders if f"`{folder}/" not in page]
 
 
 def test_modules_in_the_tables_of_a_readme_exist() -> None:
@@ -194,16 +194,16 @@ def test_root_readme_is_short_and_soon_has_a_command() -> None:
     assert " ".join(words).split(" make demo")[0].count(" ") < FIRST_COMMAND_WITHIN
 
 
-def test_room_readmes_have_at_most_sixty_lines() -> None:
+def test_readmes_of_sub_packages_have_at_most_sixty_lines() -> None:
     for page in list_pages():
         name = str(page.relative_to(ROOT))
         if page.name == "README.md" and name not in (CONTRACT, "README.md"):
             lines = len(page.read_text(encoding="utf-8").splitlines())
-            assert lines <= ROOM_LINES, f"{name}: {lines} lines"
+            assert lines <= README_LINES, f"{name}: {lines} lines"
 
 
 def test_prose_of_pages_keeps_to_the_line_length_of_the_code() -> None:
-    """Tables and code may be wider. Otherwise ROOM_LINES would not limit the length of a page."""
+    """Tables and code may be wider. Otherwise README_LINES would not limit the length of a page."""
     for page in list_pages():
         if page.name in NOT_OURS:
             continue

@@ -26,7 +26,7 @@ MAY_IMPORT = {
 }
 
 # Other folders of its package that each folder may import: only in the direction of the data.
-ROOMS: dict[str, dict[str, set[str]]] = {
+PART_IMPORTS: dict[str, dict[str, set[str]]] = {
     "edge_agent": {
         "inputs": set(),
         "calibration": {"inputs"},
@@ -99,7 +99,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         },
     },
 }
-MOST_ARROWS = {"edge_agent": 29, "fleet_service": 37}
+MOST_IMPORTS = {"edge_agent": 29, "fleet_service": 37}
 # Evaluated code does not import the evaluating code in this folder; commands start both.
 JUDGED_BY = "lab"
 
@@ -273,45 +273,49 @@ def test_figure_of_structure_stays_under_its_ceiling(figure: structure.Figure) -
 
 
 def test_figures_count_planted_faults(tmp_path: Path) -> None:
-    room = tmp_path / "schemas"
-    room.mkdir()
-    (room / "a.py").write_text(
+    package = tmp_path / "schemas"
+    package.mkdir()
+    (package / "a.py").write_text(
         "from schemas import b\n\ndef many(a, b, c, d, e, f, g):\n    x, y = a, b\n    return x\n"
     )
-    (room / "b.py").write_text("def later():\n    from schemas import a\n    return a\n")
+    (package / "b.py").write_text("def later():\n    from schemas import a\n    return a\n")
     assert structure.import_circles(tmp_path) == ["schemas.a <-> schemas.b"]
     assert structure.functions_with_many_parameters(tmp_path) == ["schemas/a.py:3 many (7)"]
     assert structure.packed_assignments(tmp_path) == ["schemas/a.py:4"]
     structure.parse.cache_clear()
-    (room / "b.py").write_text("def later():\n    return 1\n")
+    (package / "b.py").write_text("def later():\n    return 1\n")
     assert not structure.import_circles(tmp_path)
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_rooms_import_along_the_way_of_the_data(package: str) -> None:
-    found = structure.list_room_imports(ROOT, package)
-    assert {room for arrow in found for room in arrow} <= set(ROOMS[package]), (
-        "a room that the table does not know"
+@pytest.mark.parametrize("package", PART_IMPORTS)
+def test_parts_import_each_other_only_in_the_direction_of_the_data(package: str) -> None:
+    found = structure.list_part_imports(ROOT, package)
+    assert {part for pair in found for part in pair} <= set(PART_IMPORTS[package]), (
+        "a part that is not in the table"
     )
     astray = [
-        f"{a} -> {b}: {place}" for (a, b), place in found.items() if b not in ROOMS[package][a]
+        f"{a} -> {b}: {place}"
+        for (a, b), place in found.items()
+        if b not in PART_IMPORTS[package][a]
     ]
     assert not astray, "\n".join(astray)
-    assert len(found) <= MOST_ARROWS[package]
+    assert len(found) <= MOST_IMPORTS[package]
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_the_table_of_rooms_has_no_circle_and_keeps_the_judge_apart(package: str) -> None:
-    rooms = ROOMS[package]
-    while rooms:
-        ends = {room for room, others in rooms.items() if not others & rooms.keys()}
-        assert ends, f"a circle among {', '.join(rooms)}"
-        rooms = {room: others for room, others in rooms.items() if room not in ends}
-    assert [room for room, others in ROOMS[package].items() if JUDGED_BY in others] == ["cli"]
+@pytest.mark.parametrize("package", PART_IMPORTS)
+def test_table_of_parts_has_no_circle_and_only_commands_import_the_lab(package: str) -> None:
+    parts = PART_IMPORTS[package]
+    while parts:
+        ends = {part for part, others in parts.items() if not others & parts.keys()}
+        assert ends, f"a circle among {', '.join(parts)}"
+        parts = {part: others for part, others in parts.items() if part not in ends}
+    assert [part for part, others in PART_IMPORTS[package].items() if JUDGED_BY in others] == [
+        "cli"
+    ]
 
 
-@pytest.mark.parametrize("package", ROOMS)
-def test_rooms_stand_at_the_top_of_a_package_and_no_loose_modules(package: str) -> None:
+@pytest.mark.parametrize("package", PART_IMPORTS)
+def test_package_has_at_most_three_modules_outside_its_sub_packages(package: str) -> None:
     assert len(structure.loose_modules(ROOT, package)) <= 3
 
 
@@ -321,12 +325,12 @@ def test_contract_imports_no_compiler_session_or_science_library() -> None:
     assert not heavy
 
 
-def test_no_function_takes_more_than_a_reader_holds_in_mind() -> None:
+def test_no_function_has_too_many_positional_parameters() -> None:
     found = structure.too_wide(ROOT)
     assert not found, f"more than {MOST_PARAMETERS} positional parameters:\n" + "\n".join(found)
 
 
-def test_a_name_of_a_class_stands_for_one_thing() -> None:
+def test_class_names_are_unique() -> None:
     found = structure.ambiguous_classes(ROOT)
     assert not found, "\n".join(f"{name}: {', '.join(places)}" for name, places in found.items())
 
@@ -348,7 +352,7 @@ def shared_numbers(text: str) -> Iterator[tuple[int, str]]:
             yield line, found[0]
 
 
-def test_a_number_that_rooms_share_stands_once() -> None:
+def test_number_shared_by_packages_is_defined_once() -> None:
     found = [
         f"{place_of(path, line)} {number}"
         for path in all_sources(*PACKAGES)
@@ -361,7 +365,7 @@ def test_a_number_that_rooms_share_stands_once() -> None:
 @pytest.mark.parametrize(
     "line", ["G = 9.81", "ns = t * 1e9", "half = 1.645 * std", "EXCITED = 0.6", "d * 111_195.0"]
 )
-def test_a_shared_number_is_seen(line: str) -> None:
+def test_shared_number_is_found(line: str) -> None:
     assert list(shared_numbers(line))
     assert not list(shared_numbers("x = 19.815 + 0.6  # 1.645"))
 
@@ -425,7 +429,7 @@ def test_pure_core_imports_only_pure_core_and_plain_contract(folder: str) -> Non
         "import numpy as np\nnp.random.default_rng()",
     ],
 )
-def test_an_impure_line_is_seen(text: str) -> None:
+def test_impure_line_is_found(text: str) -> None:
     assert find_impurities(ast.parse(text))
 
 
@@ -435,13 +439,13 @@ def test_a_generator_as_an_argument_is_pure() -> None:
     )
 
 
-def test_an_import_across_packages_is_seen() -> None:
+def test_forbidden_import_across_packages_is_found() -> None:
     assert find_crossings(ast.parse("def f():\n    import fleet_service.app.service"), "edge_agent")
     assert find_crossings(ast.parse("from edge_agent import agent"), "schemas")
     assert not find_crossings(ast.parse("from schemas import grid"), "edge_agent")
 
 
-def test_no_file_is_longer_than_it_can_be_read() -> None:
+def test_no_file_exceeds_the_length_limit() -> None:
     lengths = {
         path: path.read_text(encoding="utf-8").count("\n")
         for path in all_sources(*PACKAGES, "tests")
@@ -472,7 +476,7 @@ def test_everything_public_has_a_docstring(package: str) -> None:
     assert not found, "\n".join(found)
 
 
-def test_a_missing_docstring_is_seen_and_a_private_one_is_not_missed() -> None:
+def test_missing_docstring_is_found_only_for_public_names() -> None:
     tree = ast.parse(
         '"""M."""\nclass A:\n    """A."""\n    def f(self): ...\n'
         "    def _g(self): ...\ndef _h(): ..."
