@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known_questions, question_of
@@ -21,6 +21,9 @@ from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
 # Questions to which an option applies. For others it is refused, because it would have no effect.
@@ -98,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     question = _checked_question(arguments)
     progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
-    from fleet_service.analytics import engines, output, past_map
+    from fleet_service.analytics import engines, past_map
     from fleet_service.archive.export.extract import Extract
     from schemas import query
 
@@ -106,31 +109,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "engine", f"{arguments.engine!r} is unknown", f"use one of {', '.join(engines.ENGINES)}"
         )
-    roads = None
-    if arguments.roads is not None and question.name != "contract":
-        from fleet_service.analytics.roads.join import read_roads
-
-        # read early, so that a wrong file is reported before the computation
-        roads = read_roads(arguments.roads)
+    # Read before the computation, so that a wrong file is reported at once.
+    roads = None if question.name == "contract" else _read_roads(arguments.roads)
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*time_span(arguments), bbox)
-    at = None if arguments.at is None else moment(arguments.at, "at")
+    options = _options_of(arguments)
     if question.name == "replay":
-        past_map.require_past(*((part.until, "to") if at is None else (at, "at")))
+        past_end = (part.until, "to") if options.at is None else (options.at, "at")
+        past_map.require_past(*past_end)
     if not arguments.as_it_lies:
         compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
-    vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
-    options = Options(
-        at=at,
-        stations=arguments.stations,
-        least_vehicles=vehicles,
-        step_s=arguments.step,
-        roads=arguments.roads,
-        level=arguments.level,
-        within_s=_within_seconds(arguments.within),
-        report=_print_progress,
-    )
     _print_progress(
         f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} "
         "observations"
@@ -142,15 +131,47 @@ def run(arguments: argparse.Namespace) -> int:
         from fleet_service.analytics.roads.join import add_road_names
 
         found = add_road_names(found, roads)
+    _output_answer(found, question, arguments)
+    return 0
+
+
+def _read_roads(path: Path | None) -> pa.Table | None:
+    """Return the table of a file written by `fleet-service roads`, or None without a file."""
+    if path is None:
+        return None
+    from fleet_service.analytics.roads.join import read_roads
+
+    return read_roads(path)
+
+
+def _options_of(arguments: argparse.Namespace) -> Options:
+    """Return the options of the question; a default where the user gave none."""
+    vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
+    return Options(
+        at=None if arguments.at is None else moment(arguments.at, "at"),
+        stations=arguments.stations,
+        least_vehicles=vehicles,
+        step_s=arguments.step,
+        roads=arguments.roads,
+        level=arguments.level,
+        within_s=_within_seconds(arguments.within),
+        report=_print_progress,
+    )
+
+
+def _output_answer(found: pa.Table, question: Question, arguments: argparse.Namespace) -> None:
+    """Print the answer as text or JSON, and write it to the output file if there is one."""
+    from fleet_service.analytics import output
+
+    is_written = arguments.out is not None
     print(
         output.format_json_lines(found, question)
         if arguments.json
-        else output.format_text(found, question, is_written=arguments.out is not None)
+        else output.format_text(found, question, is_written=is_written)
     )
-    if arguments.out is not None:
+    if is_written:
         output.write(found, question, arguments.out)
         _print_progress(f"written: {arguments.out}")
-    return 0
 
 
 def _report_covered_box(arguments: argparse.Namespace, bbox: tuple[float, ...]) -> None:
