@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -186,90 +187,98 @@ busiest = their_plugin:busiest
 """
 
 
-@pytest.mark.campaign
-def test_estimator_source_and_question_of_another_distribution_are_found(tmp_path: Path) -> None:
-    from tests.fleet_service.archive.kept import DATA
+class PluginSite(NamedTuple):
+    """Folder with an installed plug-in distribution (`PLUGIN`, `POINTS`) and a recorded drive."""
 
+    folder: Path
+    log: Path
+
+    def run_code(self, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run Python code in a process that finds the plug-in and this repository."""
+        search_path = os.pathsep.join([str(self.folder), str(ROOT)])
+        return subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONPATH": search_path},
+        )
+
+    def run_command(self, package: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run the command line of a package: `edge_agent` or `fleet_service`."""
+        code = f"import sys, gripmap; sys.exit(gripmap.{package}_main())"
+        return self.run_code(code, *arguments)
+
+    def replay(self, estimator: str) -> subprocess.CompletedProcess[str]:
+        """Estimate the recorded drive; the estimates are written to `estimates`."""
+        options = ["--estimator", estimator, "--out", str(self.estimates)]
+        return self.run_command("edge_agent", "replay", str(self.log), *options)
+
+    @property
+    def estimates(self) -> Path:
+        """Return the path of the estimates."""
+        return self.folder / "estimates.parquet"
+
+
+@pytest.fixture
+def plugin_site(tmp_path: Path) -> PluginSite:
     about = tmp_path / "their_plugin-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-plugin\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(POINTS)
     (tmp_path / "their_plugin.py").write_text(PLUGIN)
-    log = tmp_path / "x.parquet"
-    drive = [
-        "simulate",
-        "slalom",
-        "--duration",
-        "2",
-        "--out",
-        str(log),
-        "--vehicle-out",
-        str(log.with_suffix(".json")),
-    ]
-    assert main(drive) == 0
+    log = tmp_path / "drive.parquet"
+    files = ["--out", str(log), "--vehicle-out", str(log.with_suffix(".json"))]
+    assert main(["simulate", "slalom", "--duration", "2", *files]) == 0
+    return PluginSite(tmp_path, log)
 
-    def run_command(*words: str) -> subprocess.CompletedProcess[str]:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-        line = f"import sys, gripmap; sys.exit(gripmap.{words[0]}_main())"
-        return subprocess.run(
-            [sys.executable, "-c", line, *words[1:]],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-        )
 
-    done = run_command(
-        "edge_agent",
-        "replay",
-        str(log),
-        "--estimator",
-        "at-least",
-        "--out",
-        str(tmp_path / "e.parquet"),
-    )
+@pytest.mark.campaign
+def test_estimator_of_another_distribution_is_found(plugin_site: PluginSite) -> None:
+    done = plugin_site.replay("at-least")
     assert done.returncode in (0, 3), done.stderr
-    assert pq.read_table(tmp_path / "e.parquet")["mu_lower"].to_numpy().max() > 0.11
-    done = run_command(
-        "edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet")
-    )
-    assert "at-least" in done.stderr
-    said = []
+    assert pq.read_table(plugin_site.estimates)["mu_lower"].to_numpy().max() > 0.11
+    assert "at-least" in plugin_site.replay("no").stderr
+
+
+@pytest.mark.campaign
+def test_tyre_curve_of_another_distribution_changes_the_estimates(plugin_site: PluginSite) -> None:
+    tables = []
     for estimator in ("ckf", "ckf@brush"):
-        out = tmp_path / "e.parquet"
-        done = run_command(
-            "edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(out)
-        )
+        done = plugin_site.replay(estimator)
         assert done.returncode in (0, 3), done.stderr
-        said.append(pq.read_table(out))
-    assert not said[0].equals(said[1])
-    for estimator, problem in (
+        tables.append(pq.read_table(plugin_site.estimates))
+    assert not tables[0].equals(tables[1])
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(
+    ("estimator", "problem"),
+    [
         ("ckf@steep", "tyre-curve: begins with slope 2"),
         ("ckf@no", "tyre-curve: 'no' is unknown"),
         ("sr-ukf@brush", "tyre-curve: sr-ukf uses its own"),
-    ):
-        done = run_command(
-            "edge_agent",
-            "replay",
-            str(log),
-            "--estimator",
-            estimator,
-            "--out",
-            str(tmp_path / "e.parquet"),
-        )
-        assert problem in done.stderr, done.stderr
-    archive = DATA / "v1.0" / "archive"
-    done = run_command(
-        "fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json"
-    )
+    ],
+)
+def test_unusable_tyre_curve_is_reported(
+    plugin_site: PluginSite, estimator: str, problem: str
+) -> None:
+    done = plugin_site.replay(estimator)
+    assert problem in done.stderr, done.stderr
+
+
+@pytest.mark.campaign
+def test_question_and_source_of_another_distribution_are_found(plugin_site: PluginSite) -> None:
+    from tests.fleet_service.archive.kept import DATA
+
+    archive = str(DATA / "v1.0" / "archive")
+    options = ["--archive", archive, "--as-it-lies", "--json"]
+    done = plugin_site.run_command("fleet_service", "analyze", "busiest", *options)
     assert json.loads(done.stdout)["rows"] > 0, done.stderr
-    words = "from schemas.runtime.plugins import SOURCES, load_entry_point; "
-    words += "print(len(list(load_entry_point(SOURCES, 'mine')('1'))))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment
-    )
-    assert int(done.stdout) >= 10
+    code = "from schemas.runtime.plugins import SOURCES, load_entry_point; "
+    code += "print(len(list(load_entry_point(SOURCES, 'mine')('1'))))"
+    done = plugin_site.run_code(code)
+    assert int(done.stdout) >= 10, done.stderr
 
 
 def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
