@@ -45,7 +45,7 @@ def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals
 
 
 @pytest.mark.campaign
-def test_agent_and_service_leave_a_frozen_router_behind_and_lose_nothing(there: Stage) -> None:
+def test_agent_and_service_leave_a_frozen_router_without_loss(there: Stage) -> None:
     (load,) = there.loads
     there.router.freeze()
     stored = len(read_journals(there.journals).stored)

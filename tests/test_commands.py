@@ -148,7 +148,7 @@ def test_a_folder_that_is_no_archive_is_left_as_it_is(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("README.md", "mine")]
 
 
-def test_a_page_of_somebody_else_in_an_archive_is_not_replaced(archive: Path) -> None:
+def test_foreign_page_in_an_archive_is_not_replaced(archive: Path) -> None:
     (archive / "README.md").write_text("mine")
     assert fleet_service.cli.main(["compact", "--archive", str(archive)]) == 0
     assert (archive / "README.md").read_text() == "mine"
@@ -194,9 +194,7 @@ def on_terminal(command: list[str], answer: str) -> str:
     return said.decode()
 
 
-def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(
-    archive: Path, capsys: Capture
-) -> None:
+def test_forget_reports_an_unknown_vehicle(archive: Path, capsys: Capture) -> None:
     words = ["forget", "--archive", str(archive), "--period", "2024-10", "--vehicle"]
     assert fleet_service.cli.main([*words, "sim-typo"]) == 0
     assert capsys.readouterr().out == "no rows of sim-typo in 2024-10: nothing removed\n"
@@ -204,7 +202,7 @@ def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(
     assert json.loads(capsys.readouterr().out)["rows"] > 0
 
 
-def test_an_export_of_the_map_is_of_now_and_says_of_when(
+def test_map_export_is_of_the_present_and_states_its_time(
     archive: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     words = ["export", "map", "--archive", str(archive), "--out", str(tmp_path / "map.parquet")]
@@ -344,7 +342,7 @@ def test_unwritable_estimates_are_refused_in_one_line(
     assert capsys.readouterr().err.splitlines()[-1].startswith("error: out: ")
 
 
-def test_every_module_of_a_command_says_what_it_is() -> None:
+def test_every_command_module_has_a_description() -> None:
     for line in LINES.values():
         for command in line.COMMANDS:
             text = importlib.import_module(command.module).__doc__

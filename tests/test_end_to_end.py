@@ -148,7 +148,7 @@ def slippery_cells(system: System) -> list[dict[str, object]]:
     ]
 
 
-def test_three_braking_cars_tell_ice_within_six_hundredths(system: System) -> None:
+def test_three_braking_cars_measure_ice_within_six_hundredths(system: System) -> None:
     excited = slippery_cells(system)
     assert excited
     assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.06
@@ -216,7 +216,7 @@ def list_archived(folder: Path) -> list[tuple[object, ...]]:
     ]
 
 
-def test_a_straight_drive_leaves_bounds_and_the_prior_s_upper_end(system: System) -> None:
+def test_straight_drive_keeps_the_upper_end_of_the_prior(system: System) -> None:
     system.publish_drive("anna", "straight", 0.8, 0)
     cells = system.query_cells()
     assert cells

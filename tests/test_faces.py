@@ -320,7 +320,7 @@ def test_broken_plug_in_is_named_and_breaks_no_other(
     assert question_of("grip") is QUESTIONS["grip"]
 
 
-def test_the_faces_are_of_packages_that_say_their_types() -> None:
+def test_public_packages_are_typed() -> None:
     for name in gripmap.FACES:
         folder = Path(str(importlib.import_module(name).__file__)).parent
         assert (folder / "py.typed").exists()

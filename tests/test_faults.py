@@ -41,13 +41,13 @@ def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> No
     assert len(owed) == len(set(owed))
 
 
-def test_every_campaign_owes_a_figure_of_what_it_did() -> None:
+def test_every_campaign_has_a_figure_of_its_extent() -> None:
     assert [
         one.name for one in CAMPAIGNS if not any(BARS[name].better == "more" for name in one.owes)
     ] == []
 
 
-def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
+def test_missing_figure_of_a_campaign_does_not_hold(tmp_path: Path) -> None:
     def run_forgetful(site: Site) -> list[Figure]:
         return [make_figure("faults.kill.doubled", 0)]
 

@@ -54,7 +54,7 @@ def test_every_estimator_is_made_by_its_name_alone() -> None:
     )
 
 
-def test_before_stands_left_of_after_and_their_difference_has_its_interval() -> None:
+def test_plot_shows_before_left_of_after_and_the_difference() -> None:
     both = {"cells": 3, "vehicles": 4, "values": 50}
     table = pa.Table.from_pylist(
         [
@@ -102,7 +102,7 @@ def test_a_person_s_report_by_hand_as_the_page_has_it_is_acknowledged(tmp_path: 
     assert not stream.rejected
 
 
-def test_replay_without_a_vehicle_file_says_how_to_get_one(
+def test_replay_without_a_vehicle_file_explains_how_to_get_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "drive.parquet"

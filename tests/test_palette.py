@@ -35,7 +35,7 @@ def test_the_difference_is_the_published_one() -> None:
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_ice_snow_wet_and_dry_are_told_apart(sight: str) -> None:
+def test_ice_snow_wet_and_dry_are_distinguished(sight: str) -> None:
     shades = [to_lab(shade(mu, *GRIP_RANGE), sight) for mu in SURFACES.values()]
     assert min(colour_difference(a, b) for a, b in combinations(shades, 2)) >= LEAST
 
@@ -60,7 +60,7 @@ def test_colour_scale_lightness_increases_monotonically() -> None:
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
+def test_lines_of_the_estimators_can_be_distinguished(sight: str) -> None:
     assert set(ESTIMATORS) == set(REGISTERED)
     for (first, a), (second, b) in combinations([*ESTIMATORS.items(), ("truth", TRUTH)], 2):
         assert colour_difference(to_lab(a.colour, sight), to_lab(b.colour, sight)) >= LEAST, (

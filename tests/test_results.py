@@ -85,7 +85,7 @@ def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
     assert "run `make demo` first" in results.keep_figures("demo", folder / "none.json")
 
 
-def test_an_older_run_replaces_nothing(folder: Path) -> None:
+def test_older_run_replaces_no_figure(folder: Path) -> None:
     left = folder / "left.json"
     figures.write(left, "demo", [1], [Figure("demo.a", 0.5, "", 0.9)])
     results.keep_figures("demo", left)
@@ -97,7 +97,7 @@ def test_an_older_run_replaces_nothing(folder: Path) -> None:
     assert results.read_kept("demo")["demo.a"]["value"] == 0.5
 
 
-def test_a_table_without_its_figures_says_so() -> None:
+def test_table_without_figures_states_that_they_are_missing() -> None:
     table = next(table for table in results.TABLES if table.campaign == "fleet")
     assert results._render_table(table, {}).startswith("Not complete: the kept run has no figure ")
 

@@ -245,7 +245,7 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
         ("demo.observations.duplicates", 1, False),
     ],
 )
-def test_a_demo_fails_by_what_breaks_a_promise(name: str, value: float, works: bool) -> None:
+def test_demo_fails_if_a_promise_is_broken(name: str, value: float, works: bool) -> None:
     among = Figure(name, value, "", 0)
     if name == compare.COVERAGE:
         among = Figure(name, value, "", (0.8, compare.WIDEST), "within")

@@ -56,7 +56,7 @@ def test_every_metric_has_a_meaning_and_a_row_in_the_reference(shown: Shown) -> 
     ]
 
 
-def test_the_handbook_says_what_to_do_about_every_rule() -> None:
+def test_handbook_has_an_action_for_every_alert_rule() -> None:
     handbook = (ROOT / "deploy" / "docs" / "how-to" / "operate.md").read_text()
     assert set(re.findall(r"`(GripMap\w+)`", handbook)) == {rule["alert"] for rule in RULES}
 

@@ -189,7 +189,7 @@ def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_no_unit_gives_up_or_invents_or_has_another_roles_user() -> None:
+def test_systemd_units_restart_without_limit_under_their_own_user() -> None:
     users = set()
     for unit in UNITS:
         plain = configparser.ConfigParser(strict=False, interpolation=None)
@@ -344,7 +344,7 @@ def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site
     assert said[-1]["service"] == "shard-0"
 
 
-def test_a_deployment_without_its_certificates_says_which_is_missing(site: Site) -> None:
+def test_deployment_without_certificates_names_the_missing_one(site: Site) -> None:
     config = load(site.root / "etc" / "agent.json", AgentConfig)
     with pytest.raises(
         ValueError, match=r"there is no file .*trust.pem; make it with `fleet-service certs`"

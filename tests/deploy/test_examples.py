@@ -48,7 +48,7 @@ def test_a_first_estimate_makes_a_frame_and_a_plot(tmp_path: Path, capsys: Outpu
     assert "<svg" in (tmp_path / "first.svg").read_text()
 
 
-def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -> None:
+def test_own_estimator_reports_at_least_the_grip_used(capsys: Output) -> None:
     own_estimator.main()
     (row,) = json.loads(capsys.readouterr().out.replace("'", '"'))
     assert row["mu_lower"] <= row["mu"] <= row["mu_upper"]

@@ -63,7 +63,7 @@ def test_the_schemas_of_kubernetes_find_nothing_wrong(overlay: str) -> None:
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_every_reference_leads_to_what_is_there(overlay: str) -> None:
+def test_every_reference_has_a_target(overlay: str) -> None:
     objects = build_overlay(overlay)
     labels = labels_of(objects)
     secrets = set()

@@ -39,7 +39,7 @@ def test_clients_of_a_router_hear_each_other() -> None:
             queryable.undeclare()
 
 
-def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
+def test_router_process_prints_its_endpoint_and_ends_on_a_signal() -> None:
     command = [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"]
     for _ in range(8):  # a signal directly after the line must not kill the process
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -67,7 +67,7 @@ def test_an_address_that_is_no_endpoint_names_the_form() -> None:
         router.load_configuration(listen="127.0.0.1:7447")
 
 
-def test_a_taken_port_is_said() -> None:
+def test_occupied_port_is_reported() -> None:
     session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
     with session, pytest.raises(InputError, match="^listen: .*; free the port"):
         router.open_router(listen=endpoints[0])

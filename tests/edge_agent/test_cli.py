@@ -302,7 +302,7 @@ def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
-def test_a_signalled_agent_flushes_hears_the_answer_and_leaves(
+def test_signalled_agent_sends_its_records_and_waits_for_the_answer(
     tmp_path: Path, router: Router, service: Service, number: signal.Signals
 ) -> None:
     options = ["run", "--source", "simulated", "--estimator", "ckf", *config(tmp_path, router)]

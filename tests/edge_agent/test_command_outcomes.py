@@ -224,7 +224,7 @@ def test_drive_within_its_unpublished_ends_is_reported(tmp_path: Path, capsys: O
     ) in capsys.readouterr().err
 
 
-def test_replay_tells_what_it_leaves_in_the_outbox_and_how_to_go_on(
+def test_replay_reports_unsent_records_and_how_to_continue(
     tmp_path: Path, capsys: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing listens at the router. A log states a time, or begins such that it ends now."""

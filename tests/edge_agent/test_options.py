@@ -177,8 +177,8 @@ ELSEWHERE = {
     },
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
     "tune": {
-        "log": "test_drives_of_one_s_own_are_searched_on",
-        "--vehicle": "test_drives_of_one_s_own_are_searched_on",
+        "log": "test_tuning_can_use_the_users_own_drives",
+        "--vehicle": "test_tuning_can_use_the_users_own_drives",
         "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
         "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file",
     },
@@ -438,14 +438,14 @@ def test_every_setting_of_the_agent_is_in_a_table() -> None:
 
 
 @pytest.mark.parametrize("name", OBSERVED)
-def test_every_setting_of_what_is_told_changes_what_is_told(name: str) -> None:
+def test_every_setting_of_observations_changes_the_records(name: str) -> None:
     usual = AgentConfig()
     other = AgentConfig.model_validate({name: OBSERVED[name]})
     assert getattr(usual, name) != OBSERVED[name]
     assert records(usual) != records(other)
 
 
-def test_the_estimator_of_the_configuration_tells_another_friction() -> None:
+def test_configured_estimator_changes_the_friction() -> None:
     assert records(AgentConfig()) != records(AgentConfig(estimator="sr-ukf"))
 
 

@@ -242,7 +242,7 @@ def test_queue_belongs_to_one_watch(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("service")
-def test_watch_says_stretches_as_json_and_sends_them(
+def test_watch_prints_stretches_as_json_and_sends_them(
     router: ZenohSettings, session: zenoh.Session, service: Running, tmp_path: Path
 ) -> None:
     with receiver() as (url, heard):

@@ -121,7 +121,7 @@ def test_a_bad_query_is_one_line_that_names_the_field_and_exit_code_2(
     assert err.count("\n") == 1
 
 
-def test_a_missing_router_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_router_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "--connect", "tcp/127.0.0.1:1"]) == 1
     assert capsys.readouterr().err.startswith("error: connect: no router at tcp/127.0.0.1:1; ")
 
@@ -147,7 +147,7 @@ def test_overlapping_regions_are_refused(
     assert not (tmp_path / "archive").exists()
 
 
-def test_a_taken_archive_is_said(
+def test_second_service_on_an_archive_exits_with_an_error(
     tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with running(router, tmp_path):
@@ -240,7 +240,7 @@ BREAKS = "service.Service._shut_down = lambda self, *_: [][0]"
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])
-def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
+def test_exit_code_of_a_forced_end_shows_success_or_failure(
     tmp_path: Path, router: ZenohSettings, more: str, code: int
 ) -> None:
     config = tmp_path / "service.json"
@@ -258,7 +258,7 @@ def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
 
 
 @pytest.mark.campaign
-def test_a_service_that_has_to_be_ended_gives_its_lease_free(
+def test_terminated_service_releases_its_lease(
     tmp_path: Path, router: ZenohSettings, bucket: BucketServer
 ) -> None:
     config = tmp_path / "service.json"

@@ -99,7 +99,7 @@ def test_a_quantile_has_its_share_of_the_mass_below(p: list[float], q: float) ->
     assert below == pytest.approx(q, abs=1e-9)
 
 
-def test_channels_have_the_order_that_the_indices_say() -> None:
+def test_channels_are_in_the_order_of_their_indices() -> None:
     assert len(CHANNELS) == 18
     for index in S:
         assert CHANNELS[index] in (index.name.lower(), f"{index.name.lower()}_{WHEELS[0]}")

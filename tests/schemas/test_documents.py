@@ -44,12 +44,12 @@ ENCODINGS = (
 
 @BOTH
 @pytest.mark.parametrize("flag", [flag for flag in Health if flag])
-def test_every_health_flag_stands_with_its_bit(text: str, flag: Health) -> None:
+def test_contract_lists_every_health_flag_with_its_bit(text: str, flag: Health) -> None:
     assert re.search(rf"\b{flag.value}\W+{flag.name}\b", text)
 
 
 @BOTH
-def test_no_health_flag_stands_that_does_not_exist(text: str) -> None:
+def test_contract_lists_only_existing_health_flags(text: str) -> None:
     named = set(
         re.findall(
             r"\b(?:NO_[A-Z]{3,}(?:_[A-Z]+)?|TIME_GAP|OUTLIER|SLIDING|RESET|CONTRADICTION)\b", text
@@ -114,17 +114,17 @@ def to_plain_letters(text: str) -> str:
 
 @BOTH
 @pytest.mark.parametrize("statement", SHARED)
-def test_a_number_of_the_contract_stands_as_the_code_has_it(text: str, statement: str) -> None:
+def test_contract_readme_states_the_numbers_of_the_code(text: str, statement: str) -> None:
     assert statement in to_plain_letters(text)
 
 
 @pytest.mark.parametrize("statement", IN_PROTO)
-def test_a_number_of_the_messages_stands_in_the_proto(statement: str) -> None:
+def test_proto_file_states_the_numbers_of_the_code(statement: str) -> None:
     assert statement in COMMENTS
 
 
 @pytest.mark.parametrize("statement", IN_README)
-def test_a_number_for_other_languages_stands_in_the_readme(statement: str) -> None:
+def test_contract_readme_states_the_numbers_for_other_languages(statement: str) -> None:
     assert statement in " ".join(README.split())
 
 

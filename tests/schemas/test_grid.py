@@ -17,7 +17,7 @@ longitudes = st.floats(-180.0, 180.0, exclude_max=True)
 
 
 @given(latitudes, longitudes)
-def test_a_position_lies_in_its_cell(latitude: float, longitude: float) -> None:
+def test_cell_of_a_position_contains_it(latitude: float, longitude: float) -> None:
     west, south, east, north = (float(v) for v in grid.bounds(grid.cell_of(latitude, longitude)))
     # A longitude just below 180° is rounded to -180°.
     assert (longitude - west + 1e-9) % 360.0 <= east - west + 2e-9
@@ -56,7 +56,7 @@ def test_quadkeys_are_those_of_the_published_example() -> None:
     assert grid.quadkey(int(grid.interleave(np.array(3), np.array(5))), 3) == "213"
 
 
-def test_cells_are_as_long_as_the_design_says() -> None:
+def test_cell_length_is_that_of_the_design() -> None:
     for latitude, side in ((0.0, 19.1), (57.7, 10.2), (60.0, 9.6)):
         west, _, east, _ = (float(v) for v in grid.bounds(grid.cell_of(latitude, 10.0)))
         assert np.radians(east - west) * 6_378_137 * np.cos(np.radians(latitude)) == pytest.approx(

@@ -102,7 +102,7 @@ def test_third_party_reads_tile_and_alert_caused_by_its_reports(
     assert found["standing"] == ["application/protobuf;gripmap.v1.StandingAlerts", [cell]]
 
 
-def test_three_forms_of_an_answer_say_the_same(found: dict[str, Any]) -> None:
+def test_three_forms_of_an_answer_agree(found: dict[str, Any]) -> None:
     encoding, (cell,) = found["arrow"]
     assert encoding == "application/vnd.apache.arrow.stream"
     assert (cell["cell"], cell["sector"], cell["basis"], cell["vehicles"]) == (

@@ -24,7 +24,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
         "tests/edge_agent/inputs/test_doctor.py::test_slides_and_constant_speed_accuse_no_sensor",
     ),
     "1b replay stops without a vehicle file": (
-        f"{_HOUR}test_replay_without_a_vehicle_file_says_how_to_get_one",
+        f"{_HOUR}test_replay_without_a_vehicle_file_explains_how_to_get_one",
     ),
     "2 steering in degrees is not named": (
         f"{_HOUR}test_real_minute_with_steering_in_degrees_is_named",
@@ -48,10 +48,10 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
         f"{_HOUR}test_times_in_csv_answers_are_iso_8601",
     ),
     "7a page asks for an archive that it has": (
-        f"{_PAGE}test_states.py::test_empty_map_says_that_no_vehicle_reported_and_what_to_do",
+        f"{_PAGE}test_states.py::test_empty_map_states_that_no_vehicle_reported_and_what_to_do",
     ),
     "7b print shows buttons and no legend": (
-        f"{_PAGE}test_page_uses.py::test_on_paper_are_the_map_and_the_words_and_nothing_to_press",
+        f"{_PAGE}test_page_uses.py::test_printed_page_has_map_and_text_but_no_controls",
     ),
     "7c exports of page and service differ": (
         f"{_PAGE}test_page_uses.py::test_page_exports_triangles_with_columns_of_the_service",
@@ -88,7 +88,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "8j title states another speed than the curve": (
         f"{_HOUR}test_title_of_the_first_estimate_has_the_speed_of_its_curve",
     ),
-    "8k exit code without a router": (f"{_FLEET_CLI}test_a_missing_router_is_said",),
+    "8k exit code without a router": (f"{_FLEET_CLI}test_missing_router_is_reported",),
     "8l words on a white bar": (
         f"{_PAGE}test_page_uses.py::test_unvisited_place_has_words_without_a_bar",
     ),

@@ -19,7 +19,7 @@ from schemas.errors import InputError
 TABLE = rule_table()
 
 
-def test_where_nothing_is_wrong_no_rule_changes_r() -> None:
+def test_rules_leave_r_unchanged_if_the_noise_is_right() -> None:
     assert infer_two(0.0, 0.0, ALPHA, RATE, TABLE) == 0.0
 
 

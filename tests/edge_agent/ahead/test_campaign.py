@@ -64,7 +64,7 @@ def test_warnings_are_timed_over_a_real_router() -> None:
     assert 0.0 < figures["ahead.latency_p50_ms"] < 1e4
 
 
-def test_a_map_that_is_right_helps_at_entry_and_nothing_of_it_is_published() -> None:
+def test_correct_map_helps_at_entry_and_is_not_published() -> None:
     fleet = SimulatedFleet("hills-100", 2, 100, 100.0, rough=0.5)
     trace = entry.record_beliefs(fleet, 20.0)
     known = map_of_places(places_of(fleet.scenario, 20.0), entry.START_NS)

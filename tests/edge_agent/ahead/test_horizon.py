@@ -42,7 +42,7 @@ def test_place_across_the_antimeridian_is_near() -> None:
     assert north[0] == 0.0
 
 
-def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:
+def test_every_metre_of_a_route_is_in_the_cell_of_its_position() -> None:
     path = GivenRoute(*line()).ahead(HOME, 200.0)
     assert path is not None
     assert path.kind == "route"
@@ -53,7 +53,7 @@ def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:
     assert np.abs(path.curvature).max() < 1e-6
 
 
-def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
+def test_route_continues_from_the_car_and_is_none_after_it_left() -> None:
     route = GivenRoute(*line())
     latitude, longitude = line()
     further = HOME._replace(latitude=float(latitude[300]), longitude=float(longitude[300]))
@@ -69,7 +69,7 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
 @pytest.mark.parametrize("spacing", [1.0, 60.0])
 @pytest.mark.parametrize("turned", [0.0, 35.0, 70.0, 89.0])
 @pytest.mark.parametrize("ahead", [-12.0, 0.0, 12.0])
-def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
+def test_car_that_turns_early_or_late_stays_on_its_route(
     ahead: float, turned: float, spacing: float
 ) -> None:
     """The route has a right angle to the left after 120 m. A car that turns before this corner, or
@@ -90,7 +90,7 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
 
 
 @pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
-def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
+def test_car_at_the_start_of_a_route_is_on_it_at_any_heading(turned: float) -> None:
     """A car must count as on its route although its heading differs from the direction in which the
     route begins. A navigation system leaves out the part already driven, so the route may begin at
     the next corner.
@@ -176,7 +176,7 @@ def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     assert not look_ahead(path, alone, NOW + round((ALERT_HELD_S + 1) * NS)).alerted.any()
 
 
-def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
+def test_full_cache_drops_the_cells_received_longest_ago() -> None:
     cache = LocalMap(most_cells=50)
     first = cells(keys_on(), 0.5)
     far = cells(keys_on(3000.0, start=2500.0), 0.5)
@@ -186,7 +186,7 @@ def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
     assert np.isin(cache.keys(), far.key).all()
 
 
-def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
+def test_part_of_a_tile_replaces_only_its_own_cells() -> None:
     keys = keys_on(100.0)
     cache = LocalMap()
     cache.store_cells(1, cells(keys, 0.8), NOW)
@@ -196,7 +196,7 @@ def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
     assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
 
 
-def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
+def test_older_tile_does_not_replace_a_newer_one() -> None:
     keys = keys_on(100.0)
     cache = LocalMap()
     cache.store_cells(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
@@ -262,7 +262,7 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
     assert min(known_m[1:]) > 100
 
 
-def test_behind_the_last_place_of_a_road_nothing_is_known() -> None:
+def test_road_behind_its_last_place_is_unknown() -> None:
     (way,) = ways_on(HOME, keys_on(60.0), 400.0)
     horizon = look_ahead(way, make_local_map([cells(keys_on(60.0), 0.8)]), NOW)
     assert len(way.distance) > 180
@@ -285,13 +285,13 @@ def test_safe_speed_allows_stopping_in_sight_and_falls_comfortably() -> None:
     assert (np.diff(speed) <= 1e-9).all()
 
 
-def test_the_safe_speed_holds_a_bend_and_says_nothing_of_an_unknown_one() -> None:
+def test_safe_speed_of_a_bend_is_none_if_its_friction_is_unknown() -> None:
     bend = np.where(np.arange(80) > 50, 1.0 / 30.0, 0.0)
     assert safe_speed(bend, np.full(80, 0.2))[60] == pytest.approx(math.sqrt(0.2 * GRAVITY * 30.0))
     assert np.isnan(safe_speed(bend, np.full(80, np.nan))).all()
 
 
-def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
+def test_look_ahead_covers_the_stopping_distance_on_an_unknown_road() -> None:
     assert horizon_length(14.0) > 14.0 * 1.5 + 14.0**2 / (2 * UNKNOWN_LOWER * GRAVITY)
     assert horizon_length(0.0) == 150.0
     assert horizon_length(80.0) == 1000.0

@@ -15,7 +15,7 @@ from tests.benchmarks.ahead.listening import Drive, ListeningTown, measure
 
 
 @pytest.mark.campaign
-def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(
+def test_town_warned_by_its_own_map_makes_the_same_map_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A town whose cars receive the map must make the same map as one whose cars receive none. The
@@ -66,7 +66,7 @@ def test_the_figures_count_vehicles_that_slid_and_cells_that_are_covered() -> No
     assert found["prior.entry_error_ratio.town"].value == 0.5
 
 
-def test_where_nothing_happened_no_bar_holds() -> None:
+def test_no_target_is_met_without_events() -> None:
     found = {figure.name: figure for figure in measure([Drive()], [Drive()])}
     for name in ("ahead.lost_grip_ratio", "prior.map_loop"):
         assert math.isnan(found[name].value)

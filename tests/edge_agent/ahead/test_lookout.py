@@ -114,7 +114,7 @@ def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(
         assert car.next_warning().state == "ended"
 
 
-def test_an_alert_is_told_at_once_and_not_with_the_next_look(
+def test_alert_causes_a_warning_at_once(
     router: Router, town: MadeUpService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lookout, "LOOK_S", 1e6)
@@ -128,7 +128,7 @@ def test_an_alert_is_told_at_once_and_not_with_the_next_look(
         assert car.lookout.counts.looks == 3
 
 
-def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(
+def test_car_queries_active_alerts_when_it_enters_a_tile(
     router: Router, town: MadeUpService
 ) -> None:
     town.standing = [alert(int(key), time=NOW) for key in keys_on(2600.0, start=2560.0)]
@@ -206,7 +206,7 @@ def test_ice_during_a_router_outage_is_received_after_reconnect(
         assert any("alert" in asked for asked in town.asked[before:])
 
 
-def test_a_service_that_comes_after_the_car_is_asked_too(router: Router) -> None:
+def test_service_that_starts_after_the_car_is_queried_too(router: Router) -> None:
     with driving(router) as car:
         until(lambda: car.lookout.counts.looks > 1)
         with MadeUpService(router.settings, time.time_ns()) as town:

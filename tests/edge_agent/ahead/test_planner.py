@@ -104,7 +104,7 @@ def test_limit_falls_at_once_and_rises_after_a_while() -> None:
     assert steady.value == math.inf
 
 
-def test_a_road_that_nobody_measured_gives_no_limit() -> None:
+def test_unmeasured_road_gives_no_speed_limit() -> None:
     assert limit_ahead(np.arange(5.0), np.full(5, np.nan)) == math.inf
     assert PlannerKey(3, "RIHS01_ab").key.startswith(
         "3/planning/scenario_planning/max_velocity_candidates/"

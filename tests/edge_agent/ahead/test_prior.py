@@ -47,7 +47,7 @@ def key(k: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([k])
 
 
-def test_without_a_map_the_vehicle_believes_what_its_filter_believes() -> None:
+def test_belief_without_a_map_is_that_of_the_filter() -> None:
     prior = MapPrior(1)
     own = saying(0.7)
     out = prior.step(key(5), own, saying(0.7), {0: None})
@@ -96,7 +96,7 @@ def test_a_wrong_map_is_abandoned_quickly_and_trusted_less_in_next_cells() -> No
     assert says[-1] < says[0] - 0.1
 
 
-def test_a_map_says_nothing_twice() -> None:
+def test_repeated_map_belief_does_not_become_more_certain() -> None:
     """A car drives through many cells for which the map has the same belief. Repetition must not
     make this belief more certain. Therefore the car's friction interval must not become narrower
     after the second cell.

@@ -65,6 +65,6 @@ def test_invalid_route_file_is_refused_with_the_field(tmp_path: Path, text: str)
         read_route(file)
 
 
-def test_a_file_that_is_not_there_is_said_so(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read"):
         read_route(tmp_path / "none.gpx")

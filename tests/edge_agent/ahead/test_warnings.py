@@ -150,7 +150,7 @@ def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> N
     assert "no longer" in ended[0].reason
 
 
-def test_a_car_that_takes_another_way_is_told_that_the_warning_is_over() -> None:
+def test_warning_ends_when_the_car_takes_another_road() -> None:
     car = Car(dry_but(icy()))
     raised = car.drive(224.0)
     assert raised[0].state == "raised"
@@ -170,7 +170,7 @@ def test_nearly_touching_stretches_are_one_warning_distant_ones_two() -> None:
     assert sorted(one.state for one in apart) == ["ended", "ended", "raised", "raised"]
 
 
-def test_at_a_fork_a_stretch_on_one_way_is_told_as_possible() -> None:
+def test_stretch_behind_a_fork_is_reported_as_possible() -> None:
     cache = dry_but(icy(100.0, 40.0))
     pose = HOME._replace(speed=20.0)
     route = GivenRoute(*line(ROAD)).ahead(pose, 300.0)

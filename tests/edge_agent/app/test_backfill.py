@@ -45,9 +45,7 @@ def logs(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.parquet"))
 
 
-def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(
-    drives: Path, tmp_path: Path
-) -> None:
+def test_number_of_jobs_does_not_change_the_estimates(drives: Path, tmp_path: Path) -> None:
     paths = [str(path) for path in logs(drives)]
     for jobs in ("1", "2"):
         out = ["--out", str(tmp_path / jobs), "--jobs", jobs]
@@ -160,7 +158,7 @@ def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
     assert not logs(tmp_path)
 
 
-def test_a_bad_log_is_told_and_the_others_are_estimated(
+def test_bad_log_is_reported_and_the_others_are_estimated(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = tmp_path / "bad.parquet"

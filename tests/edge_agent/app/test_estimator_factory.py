@@ -34,7 +34,7 @@ def test_tuned_estimator_runs_with_the_memberships_of_its_file(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", TUNED)
-def test_the_pure_core_reads_no_file_and_says_who_does(name: str) -> None:
+def test_create_without_memberships_refers_to_bank_of(name: str) -> None:
     with pytest.raises(InputError, match=r"memberships: .*bank_of"):
         create(name, [drive("slalom", 0.3, seconds=1.5)[2]])
 

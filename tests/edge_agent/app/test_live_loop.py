@@ -260,7 +260,7 @@ def test_the_loop_ends_after_its_duration() -> None:
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_systemd_gets_signs_of_life_unless_the_thread_that_sends_has_died(
+def test_systemd_watchdog_is_fed_unless_the_sending_thread_has_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: bool
 ) -> None:
     monkeypatch.setattr(Basket, "is_broken", broken)

@@ -21,7 +21,7 @@ from tests.edge_agent.service import Router, Service
 from tests.waiting import PATIENCE_S, until
 
 
-def test_an_agent_shows_what_was_settled_and_what_waits(
+def test_agent_metrics_show_settled_and_waiting_records(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False

@@ -41,7 +41,7 @@ def test_comparison_without_a_report_is_refused(
     assert "compare: works only with a report" in capsys.readouterr().err
 
 
-def test_report_of_an_implausible_drive_says_so(
+def test_report_of_an_implausible_drive_states_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = tmp_path / "drive.parquet"

@@ -47,7 +47,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_both_engines_write_the_same_bytes_and_tell_the_same_of_a_bad_log(
+def test_both_engines_write_the_same_bytes_and_errors(
     session: Any,  # noqa: ANN401
     drives: list[Path],
     tmp_path: Path,

@@ -68,7 +68,7 @@ def test_nothing_is_admitted_before_the_doctor_has_passed(smooth: Recorded, tmp_
     assert not trip.health_problems()
 
 
-def test_a_fault_is_never_admitted_and_teaches_nothing(
+def test_faulty_trip_is_not_admitted_and_teaches_no_calibration(
     smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "car.json"
@@ -106,9 +106,7 @@ def test_calibration_learned_on_a_trip_applies_from_the_next_trip(
     assert offset == pytest.approx(0.012, abs=0.004)
 
 
-def test_a_fault_that_comes_up_takes_the_doctors_word_back(
-    smooth: Recorded, tmp_path: Path
-) -> None:
+def test_new_fault_revokes_the_admission_by_the_doctor(smooth: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "car.json"
     drive_trip(Trip(smooth.vehicle, PROFILE, path), smooth)
     broken = Trip(smooth.vehicle, PROFILE, path)
@@ -117,7 +115,7 @@ def test_a_fault_that_comes_up_takes_the_doctors_word_back(
     assert not Trip(smooth.vehicle, PROFILE, path).is_admitted()
 
 
-def test_another_car_or_a_broken_file_begins_anew(
+def test_other_car_or_damaged_state_file_is_not_admitted(
     smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "car.json"
@@ -133,7 +131,7 @@ def test_another_car_or_a_broken_file_begins_anew(
         assert "learning starts again" in caplog.text
 
 
-def test_a_short_trip_teaches_nothing_and_a_disk_that_refuses_is_no_crash(
+def test_short_trip_teaches_nothing_and_a_full_disk_is_survived(
     smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "car.json"
@@ -149,7 +147,7 @@ def replace_rows(drive: Recorded, rows: int) -> Recorded:
     return drive._replace(t=drive.t[:rows], signals=drive.signals[:rows])
 
 
-def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> None:
+def test_doctor_runs_next_to_the_live_loop(smooth: Recorded, tmp_path: Path) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
     for block in trip.corrected_blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
         replace(block)  # stands for the main loop, which does not wait for the doctor

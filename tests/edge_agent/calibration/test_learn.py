@@ -127,7 +127,7 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
         assert getattr(theirs, name)[1] > getattr(ours, name)[1]
 
 
-def test_torque_tells_its_gain_times_the_mass() -> None:
+def test_torque_determines_its_gain_times_the_mass() -> None:
     drive = drives(1, 33, rough=False, seconds=180)[0]
     assert np.isfinite(drive.signals[:, S.TORQUE]).any()
     torques = [S.TORQUE + wheel for wheel in range(4)]
@@ -229,7 +229,7 @@ def test_surer_value_of_two_calibrations_is_kept() -> None:
     assert surer_values(one, None) == one
 
 
-def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:
+def test_standing_car_teaches_no_calibration(smooth: Recorded) -> None:
     still = np.zeros_like(smooth.signals[:3000])
     with pytest.raises(InputError, match="enough excitation"):
         learn_calibration([(smooth.t[:3000], still)], smooth.vehicle)

@@ -50,7 +50,7 @@ def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
     assert dugoff(3.0) == pytest.approx(1.0 - 1.0 / 12.0)
 
 
-def test_inverse_curve_undoes_it_and_knows_no_slip_beyond_the_peak() -> None:
+def test_inverse_curve_inverts_the_curve_up_to_its_peak() -> None:
     for rho in (-0.95, -0.2, 0.0, 0.5, 0.99):
         assert tyres.magic_formula(
             tyres.magic_formula_inverse(rho, 1.4), 1.4, 0.0

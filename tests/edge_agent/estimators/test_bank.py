@@ -208,7 +208,7 @@ def test_a_time_that_is_not_a_number_at_first_is_waited_out() -> None:
     assert (reported.health[:10] & int(Health.TIME_GAP)).all()
 
 
-def test_the_adaptation_is_what_tells_the_estimators_apart() -> None:
+def test_only_the_fuzzy_estimator_adapts_r() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     fuzzy = run("fckf", t, signals, vehicle)
     plain = run("ckf", t, signals, vehicle)
@@ -246,7 +246,7 @@ def test_a_bank_of_no_vehicles_is_refused() -> None:
         create("ckf", [])
 
 
-def test_on_a_split_road_the_sides_are_told_apart() -> None:
+def test_sides_of_a_split_road_are_distinguished() -> None:
     t, signals, vehicle = drive("split-braking", None)
     reported = run("fckf", t, signals, vehicle)
     assert reported.mu_wheel is not None
@@ -267,7 +267,7 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
 
 
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
-def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
+def test_gentle_acceleration_reports_no_ice(name: str) -> None:
     """During gentle acceleration the estimator must report no ice, although four sliding wheels
     with a suitable stiffness or sensor offset would also explain the slip.
     """
@@ -278,7 +278,7 @@ def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
 
 
 @pytest.mark.parametrize("size", [60.0, 5.0])
-def test_a_single_false_acceleration_is_told_refused_and_bridged(size: float) -> None:
+def test_single_false_acceleration_is_flagged_and_bridged(size: float) -> None:
     t, signals, vehicle = drive("slalom", 0.3)
     broken = signals.copy()
     broken[200::10, [S.AX, S.AY]] += size
@@ -298,14 +298,14 @@ def test_lasting_jump_of_acceleration_is_accepted_at_the_second_reading() -> Non
     assert refused.tolist() == [300]
 
 
-def test_creeping_after_a_hard_stop_tells_no_ice() -> None:
+def test_creeping_after_a_hard_stop_reports_no_ice() -> None:
     t, signals, vehicle = drive("braking", 0.85)
     reported = run("fckf", t, signals, vehicle)
     assert reported.vx[-1, 0] < 2.0
     assert (reported.mu_upper[t > 2.0] > 0.7).all()
 
 
-def test_wheels_that_spin_beyond_belief_tell_nothing_false() -> None:
+def test_implausibly_spinning_wheels_cause_no_false_estimate() -> None:
     t, signals, vehicle = drive("acceleration", 0.3)
     broken = signals.copy()
     broken[300:, S.OMEGA : S.OMEGA + 4] = 600.0

@@ -315,7 +315,7 @@ def test_every_constant_has_its_move() -> None:
 
 
 @pytest.mark.parametrize("name", MOVES)
-def test_a_constant_moves_what_it_is_for_in_its_direction_and_by_its_size(name: str) -> None:
+def test_each_constant_has_the_expected_effect(name: str) -> None:
     move = MOVES[name]
     usual, changed = (
         figures(move.drive, *one)[move.figure] for one in ((None, 1.0), (name, move.times))

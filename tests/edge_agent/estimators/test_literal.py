@@ -95,7 +95,9 @@ def test_square_root_form_survives_single_precision(turn: tuple[GivenMotion, Flo
     assert np.abs(found.mu[50:] - truth[50:]).mean() < 0.003
 
 
-def test_alpha_of_one_gives_the_same_result(turn: tuple[GivenMotion, FloatArray]) -> None:
+def test_alpha_of_the_sigma_points_does_not_change_the_result(
+    turn: tuple[GivenMotion, FloatArray],
+) -> None:
     given, _ = turn
     small, large = (
         wheel_friction_ukf.estimate(given, AS_PRINTED._replace(alpha=alpha)).mu

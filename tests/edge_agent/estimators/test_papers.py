@@ -108,7 +108,7 @@ def test_slow_sampling_and_standing_still_are_survived(name: str, rate: int) -> 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", PAPERS)
-def test_without_evidence_the_observer_tells_friction_with_its_interval(name: str) -> None:
+def test_observer_without_evidence_reports_friction_and_interval(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
     t = t[:, None]
     signals = signals[:, None]
@@ -123,7 +123,7 @@ def test_without_evidence_the_observer_tells_friction_with_its_interval(name: st
 
 
 @pytest.mark.parametrize("name", SET_BY_HAND)
-def test_friction_that_is_set_and_not_estimated_is_told_as_the_prior(name: str) -> None:
+def test_friction_that_is_not_estimated_is_reported_as_the_prior(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=2.0)
     reported = run(name, t, signals, vehicle)
     assert np.ptp(reported.mu) == 0.0

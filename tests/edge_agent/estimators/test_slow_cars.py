@@ -71,7 +71,7 @@ def test_a_node_that_was_wrong_at_walking_pace_does_not_win_later(lane_changes: 
     assert estimates.mu_upper.min() > 0.8
 
 
-def test_nothing_is_charged_below_the_speed_at_which_slip_has_a_meaning(
+def test_no_penalty_is_charged_at_walking_pace(
     lane_changes: DriveSet,
 ) -> None:
     (vehicle,) = lane_changes.vehicles

@@ -46,7 +46,7 @@ def stop(seed: int, *, mirrored: bool) -> tuple[FloatArray, Estimates]:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_split_stop_without_torque_tells_the_sides_and_the_speed(
+def test_split_stop_without_torque_gives_the_sides_and_the_speed(
     seed: int, *, mirrored: bool
 ) -> None:
     vx, estimates = stop(seed, mirrored=mirrored)

@@ -42,7 +42,7 @@ def turn(name: str, gain: float, mu: float, vehicle: str, seed: int, seconds: fl
 
 @pytest.mark.parametrize("vehicle", ["small", "sedan", "van"])
 @pytest.mark.parametrize(("name", "gain"), TURNS)
-def test_a_turn_on_a_dry_road_leaves_its_friction_possible(
+def test_turn_on_a_dry_road_does_not_exclude_the_true_friction(
     name: str, gain: float, vehicle: str
 ) -> None:
     for seed in (801, 802):

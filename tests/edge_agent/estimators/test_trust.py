@@ -93,7 +93,7 @@ def test_weight_of_evidence_falls_to_zero_at_the_limit() -> None:
     assert shares == sorted(shares, reverse=True)
 
 
-def test_tilted_and_turned_sensors_strain_and_as_the_file_says_they_do_not() -> None:
+def test_strain_is_high_only_with_tilted_or_turned_sensors() -> None:
     t, signals, vehicle = drive("slalom", 0.6, seconds=12.0)
     wrong = signals.copy()
     wrong[:, S.AX] += 0.5

@@ -26,7 +26,7 @@ def one_visit(name: str, mu: float | None, seed: int) -> tuple[np.ndarray, Estim
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_stop_from_dry_road_onto_snow_tells_of_the_dry_road_first(seed: int) -> None:
+def test_evidence_at_the_jump_of_a_stop_onto_snow_is_of_the_dry_road(seed: int) -> None:
     t, estimates = one_visit("jump-braking", None, seed)
     assert estimates.jumps is not None
     assert estimates.evidence is not None
@@ -48,7 +48,7 @@ def test_a_friction_that_stays_never_jumps(name: str) -> None:
         assert not estimates.jumps.any()
 
 
-def test_evidence_is_told_at_closes_and_jumps_alone() -> None:
+def test_evidence_is_given_only_at_visit_ends_and_jumps() -> None:
     _, estimates = one_visit("jump-braking", None, 2)
     assert estimates.jumps is not None
     assert estimates.evidence is not None

@@ -159,7 +159,7 @@ def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
     assert gram - np.diag(np.diag(gram)) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
 
 
-def test_a_downdate_takes_a_column_away() -> None:
+def test_downdate_removes_a_column() -> None:
     cov = covariance(5, 8)
     column = 0.2 * np.random.default_rng(9).normal(size=5)
     root = root_of(cov)

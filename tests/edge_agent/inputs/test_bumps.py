@@ -37,7 +37,7 @@ def uneven_drive(bumps: float) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize(("bumps", "front_first"), [(0.1, 1), (0.0, 0)])
-def test_bumps_tell_front_from_rear_and_a_smooth_road_does_not(
+def test_bumps_distinguish_front_from_rear_and_a_smooth_road_does_not(
     bumps: float, front_first: int
 ) -> None:
     t, signals = uneven_drive(bumps)

@@ -263,7 +263,7 @@ def test_a_live_bus_fills_the_context_between_its_messages(every: int) -> None:
     assert (found[np.isfinite(found[:, C.ABS]), C.ABS] == 1.0).all()
 
 
-def test_a_live_source_that_tells_no_context_leaves_it_unknown() -> None:
+def test_live_source_without_context_signals_leaves_them_unknown() -> None:
     profile = plain_profile({name: name for name in ("ax", *CONTEXT)})
     assert np.isnan(live_blocks({}, 1, 20, profile)).all()
 
@@ -305,7 +305,7 @@ def test_databroker_sends_lasting_signals_first_and_then_changes() -> None:
         feed.close()
 
 
-def test_a_reading_holds_for_a_while_and_is_unknown_then() -> None:
+def test_reading_is_held_for_a_limited_time() -> None:
     series = Series(np.array([1.0, 2.0, 2.1]), np.array([1.0, np.nan, 0.0]))
     t = np.array([0.9, 1.0, 2.05, 2.1, 3.0, 3.2])
     found = held_readings("abs_active", series, t, lasting=False)
@@ -380,7 +380,7 @@ def test_a_log_has_the_context_of_its_columns_and_none_without_them(tmp_path: Pa
     )
 
 
-def test_a_simulated_source_hands_over_what_it_knows() -> None:
+def test_context_block_has_the_given_context_signals() -> None:
     block = context_block(
         4, 2, {"abs_active": np.array([[False, True]] * 4), "air_temperature": -3.0}
     )

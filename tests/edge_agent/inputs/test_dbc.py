@@ -70,7 +70,7 @@ def test_recorded_frames_decode_as_by_cantools() -> None:
             assert [float(row[signal]) for row in decoded] == values.tolist(), signal
 
 
-def test_a_multiplexed_signal_is_missing_where_its_switch_says_so() -> None:
+def test_multiplexed_signal_is_missing_when_not_selected() -> None:
     text = (
         'BO_ 5 M: 4 X\n SG_ S M : 0|8@1+ (1,0) [0|0] "" X\n SG_ A m1 : 8|8@1+ (2,0) [0|0] "" X\n'
         ' SG_ B m2 : 8|8@1- (1,1) [0|0] "" X\n'

@@ -204,7 +204,7 @@ def test_time_stamps_in_whole_seconds_are_a_fault(rough: Recorded) -> None:
 
 
 @pytest.mark.parametrize("rows", [2, 3])
-def test_a_log_of_a_few_rows_tells_nothing(rough: Recorded, rows: int) -> None:
+def test_log_of_a_few_rows_gives_no_finding(rough: Recorded, rows: int) -> None:
     said = diagnose(rough.t[:rows], rough.signals[:rows], rough.vehicle)
     assert not said.findings
     assert not said.sound
@@ -235,7 +235,7 @@ def test_fit_removes_the_offset_from_the_samples_of_its_plot(rough: Recorded) ->
     assert abs(float(np.median(away))) < 0.1 * float(fit.left.std())
 
 
-def test_a_standing_car_tells_nothing_and_does_not_pass(rough: Recorded) -> None:
+def test_standing_car_gives_no_finding_and_does_not_pass(rough: Recorded) -> None:
     still = rough.signals[:3000].copy()
     still[:, : S.LATITUDE] = 0.0
     still[:, S.LATITUDE :] = np.nan

@@ -153,7 +153,7 @@ def test_an_unfinished_measurement_is_read(tmp_path: Path) -> None:
     assert np.allclose(recording.signals["ax"].values, np.arange(5.0))
 
 
-def test_libraries_do_not_report_what_nobody_asked(tmp_path: Path) -> None:
+def test_info_messages_of_the_can_library_are_disabled(tmp_path: Path) -> None:
     read_source(
         write(tmp_path / "a.trc", ";$FILEVERSION=1.1\n1)  10.0  Rx  00AA  2  10 27\n"),
         None,

@@ -246,7 +246,7 @@ def test_clocks_that_do_not_meet_are_an_error_with_its_remedy(
     assert main([*arguments, *out, shift[1]]) == 0
 
 
-def test_note_tells_that_a_log_was_cut_off(tmp_path: Path, capsys: Output) -> None:
+def test_note_states_that_a_log_was_cut_off(tmp_path: Path, capsys: Output) -> None:
     whole = BLF.read_bytes()
     for name, size in (("whole", len(whole)), ("cut", len(whole) // 2)):
         path = tmp_path / f"{name}.blf"

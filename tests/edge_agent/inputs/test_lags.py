@@ -103,7 +103,7 @@ def test_correlation_by_spectra_equals_that_of_each_shift() -> None:
     assert np.isnan(correlate_by_spectra(left, np.ones(n), among, most)).all(), "no variation"
 
 
-def test_wheels_that_are_late_are_found_and_a_straight_drive_says_nothing() -> None:
+def test_late_wheels_are_found_and_a_straight_drive_gives_no_finding() -> None:
     t = np.arange(0.0, 60.0, 0.01)
     yaw_rate = 0.2 * np.sin(t) + 0.1 * np.sin(2.3 * t + 1.0)
     late = 0.12

@@ -78,7 +78,7 @@ def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("kind", [*COUNTED, "gpsd"])
 @pytest.mark.campaign
-def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_path: Path) -> None:
+def test_restarted_source_is_read_again(kind: str, tmp_path: Path) -> None:
     place, source = peer_addresses(kind)
     name, dbc = write_profile("can" if kind == "gpsd" else kind, tmp_path)
     feeds, _, _ = open_sources([source], name, dbc)
@@ -226,7 +226,7 @@ def test_a_source_that_makes_no_sense_is_one_clear_error(
         open_sources([source], profile)
 
 
-def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
+def test_decoder_reads_only_the_bus_of_the_profile() -> None:
     from edge_agent.inputs.live.can_bus import Decoder
     from edge_agent.inputs.profile import FOLDER
     from edge_agent.inputs.readers.dbc import read_dbc

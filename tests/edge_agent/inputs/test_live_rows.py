@@ -134,7 +134,7 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     assert not feed._thread.is_alive()
 
 
-def test_a_host_that_slept_leaves_rows_out(clock: Steered) -> None:
+def test_suspended_host_leaves_rows_out(clock: Steered) -> None:
     feed = Scripted("bus", clock)
     rows = rows_of(clock, feed)
     blocks = rows.blocks()
@@ -218,7 +218,7 @@ class Failing(Scripted):
             self.stopping.wait()
 
 
-def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(
+def test_failed_source_is_opened_again_and_reported_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     feed = Failing("bus", HostClock())

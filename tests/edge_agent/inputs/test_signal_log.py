@@ -95,7 +95,7 @@ def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(
     assert log.start_ns == pytest.approx(int(MOMENTS[0]), abs=1000)
 
 
-def test_blocks_tell_each_sample_once_in_order_with_its_absolute_time(tmp_path: Path) -> None:
+def test_blocks_contain_each_sample_once_with_its_absolute_time(tmp_path: Path) -> None:
     columns = a_log(25)
     log = read(tmp_path, columns)
     blocks = list(log.blocks(7 * NS, rows=10))

@@ -73,7 +73,7 @@ def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
             assert np.array_equal(column, found[name], equal_nan=column.dtype.kind == "f"), name
 
 
-def test_an_observation_tells_its_visit() -> None:
+def test_observation_describes_its_visit() -> None:
     """A car drives east through three cells at 10 m/s. The observation of each visit (pass through
     a cell) must have the times, pose and speed of the visit, and the friction estimated at its end.
     """
@@ -150,7 +150,7 @@ def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -
     assert not states.urgent.any()
 
 
-def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
+def test_grip_used_in_the_previous_cell_is_not_reported_again() -> None:
     """The estimator reports the largest grip of the last second. A car stops braking just before it
     enters the next cell. The braking must not count as grip used in this cell.
     """

@@ -62,10 +62,10 @@ def test_a_bound_states_that_not_all_grip_was_used() -> None:
     assert log_ratio(weighed, 0.85, 1.0) == 0.0
 
 
-def test_a_visit_without_information_states_nothing() -> None:
+def test_visit_without_information_has_a_flat_likelihood() -> None:
     flat = np.zeros((1, mugrid.BINS))
     assert np.array_equal(weigh_by_use(flat, np.array([0.5])), flat)
 
 
-def test_an_unknown_grip_used_changes_nothing() -> None:
+def test_unknown_grip_used_changes_no_belief() -> None:
     assert np.array_equal(weigh_by_use(WIDE_VALUE, np.array([np.nan])), WIDE_VALUE)

@@ -121,7 +121,7 @@ def test_a_repeated_drive_is_stored_under_the_same_names(path: Path) -> None:
     }
 
 
-def test_a_repeated_drive_replaces_what_the_first_try_left(path: Path) -> None:
+def test_repeated_drive_is_stored_once_despite_a_damaged_batch(path: Path) -> None:
     """The first try left some batches, one of them damaged. After the repeat, the outbox must have
     each batch of the drive once, and count the agent's own streams from 1.
     """
@@ -163,7 +163,7 @@ def test_a_drive_larger_than_the_outbox_can_be_completed_later(path: Path) -> No
     outbox.close()
 
 
-def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> None:
+def test_acknowledgement_of_an_unknown_batch_is_ignored(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft()], now=0.0)
     assert outbox.settle_ranges(stream(boot=BOOT + 1), [(1, 1)]) == 0
@@ -269,7 +269,7 @@ def test_first_answer_releases_batches_oldest_first_and_ever_faster(path: Path) 
     outbox.close()
 
 
-def test_a_region_that_nobody_serves_does_not_silence_the_others(path: Path) -> None:
+def test_unserved_region_does_not_suppress_the_others(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     now = 0.0
     for _ in range(60):
@@ -318,7 +318,7 @@ def test_reconnect_probes_a_silent_route_at_once_with_one_batch(path: Path) -> N
     outbox.close()
 
 
-def test_batches_of_a_former_name_are_not_put_and_are_told(path: Path) -> None:
+def test_batches_of_a_former_name_are_counted_and_not_sent(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft("car-old", records=3), draft("car-new")], now=0.0)
     outbox.close()
@@ -423,7 +423,7 @@ def test_a_file_that_is_no_outbox_is_refused_and_left_alone(path: Path) -> None:
     assert path.read_bytes().startswith(b"my shopping list")
 
 
-def test_an_unanswered_batch_is_given_up_before_it_blocks_its_stream(
+def test_unanswered_batch_is_dropped_before_it_blocks_its_stream(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("edge_agent.publish.held_batches.PASSED_OVER", 40)

@@ -119,7 +119,7 @@ def test_unanswered_batches_are_sent_again_until_answered(
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
 
 
-def test_a_lost_router_is_waited_for_and_nothing_is_lost(router: Router, tmp_path: Path) -> None:
+def test_agent_waits_for_a_lost_router_and_loses_no_record(router: Router, tmp_path: Path) -> None:
     publisher = publisher_of(settings(router, tmp_path))
     before = drive(1)[0]
     after = drive(2)[0]
@@ -222,7 +222,7 @@ def test_unreadable_or_foreign_acknowledgements_settle_nothing(
     publisher.close(within_s=0.1)
 
 
-def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
+def test_time_in_an_acknowledgement_reveals_a_wrong_clock(
     router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     service.answer = False
@@ -312,7 +312,7 @@ def test_stored_batches_are_sent_though_the_disk_refuses_to_delete(
     publisher.close(within_s=0.1)
 
 
-def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(
+def test_vehicle_has_a_liveliness_token_until_it_leaves(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     def alive() -> set[str]:
@@ -369,7 +369,7 @@ def test_a_batch_waits_for_its_time_or_for_fifty_records() -> None:
     assert batches_of(batcher, now=2.0) == [("car-a", 10)]
 
 
-def test_a_slippery_visit_takes_its_batch_along_at_once() -> None:
+def test_slippery_visit_is_sent_at_once_with_its_batch() -> None:
     batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
     batcher.add(one_vehicle(2), now=0.0)
     batcher.add(one_vehicle(1, urgent=True), now=0.1)

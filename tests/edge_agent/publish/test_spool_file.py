@@ -99,7 +99,7 @@ def test_a_batch_whose_number_of_records_is_damaged_is_noticed(tmp_path: Path) -
     outbox.close()
 
 
-def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> None:
+def test_file_damaged_in_use_is_recovered_and_sequences_continue(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     store_batches(path)
     outbox = Outbox(path, boot=6)

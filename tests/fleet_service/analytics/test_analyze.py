@@ -39,7 +39,7 @@ def analyze(archive: Path, *words: str) -> int:
 
 # The question "contract" needs roads; roads/test_contract.py covers it.
 @pytest.mark.parametrize("name", sorted(set(QUESTIONS) - {"contract"}))
-def test_every_question_prints_a_table_and_says_what_it_reads(
+def test_every_question_prints_a_table_and_its_input(
     archive: Path, stations: Path, name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     more = {"before-after": ["--at", "2026-01-28"], "weather": ["--stations", str(stations)]}.get(

@@ -61,7 +61,7 @@ NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 
 @pytest.mark.campaign
-def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
+def test_interval_coverage_is_right_when_days_differ() -> None:
     """The 90 % interval of the rate must contain the true rate RATE in most trials. The rates of
     single days differ widely, so that pairs of the same day are not independent.
     """

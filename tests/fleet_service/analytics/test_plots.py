@@ -117,7 +117,7 @@ def test_contract_shows_the_breach_and_the_verdict_of_each_link() -> None:
     assert np.asarray(axes.lines[0].get_xdata()).tolist() == [2.0]
 
 
-def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
+def test_calibration_plot_labels_and_draws_the_published_values() -> None:
     rows = [("measured", 0, 0.86, 0.97), ("measured", 1, 0.84, 0.96), ("bound", 0, 0.9, 0.98)]
     table = pa.Table.from_pylist(
         [dict(zip(("basis", "age_h", "held", "compatible"), row, strict=True)) for row in rows]
@@ -135,7 +135,7 @@ def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
 
 
 @pytest.mark.parametrize("lasts", [True, False])
-def test_a_spell_that_lasts_is_told_from_one_that_ended(lasts: bool) -> None:
+def test_lasting_and_ended_spells_are_distinguished(lasts: bool) -> None:
     table = pa.table({"onset": [NOON_US * 1e-6], "duration_s": [600.0], "lasts": [lasts]})
     (axes,) = draw_figure("spells", table).axes
     arrows = [

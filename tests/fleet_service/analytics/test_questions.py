@@ -145,7 +145,7 @@ def test_planted_change_lies_in_the_before_after_interval(
 
 
 @pytest.mark.campaign
-def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
+def test_before_after_interval_has_its_stated_coverage() -> None:
     import ibis
 
     from fleet_service.analytics.questions.before_after import expression
@@ -321,7 +321,7 @@ def test_station_with_an_impossible_value_is_refused(
         asked("weather", stations=path)
 
 
-def test_a_part_without_rows_is_said(asked: Ask) -> None:
+def test_part_without_rows_is_reported(asked: Ask) -> None:
     with pytest.raises(InputError, match="^archive: no compacted observations"):
         asked("grip", part=Extract(0, 10**9))
 

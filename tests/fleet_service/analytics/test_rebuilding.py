@@ -70,9 +70,7 @@ def test_the_roll_ups_are_those_of_the_archive_byte_for_byte(archive: Path, tmp_
     )
 
 
-def test_a_zone_done_again_leaves_the_same_files_and_no_draft(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_repeated_zone_leaves_the_same_files_and_no_draft(archive: Path, tmp_path: Path) -> None:
     out = rebuild_archive(archive, tmp_path / "out")
     before = contents(out)
     rebuild_zone(Rebuild(archive, out, UNTIL), zones_of(archive)[0])

@@ -88,7 +88,7 @@ def test_a_small_step_ahead_is_followed_at_once() -> None:
     assert clock.now() == system.wall
 
 
-def test_after_a_restart_what_was_seen_before_is_not_the_future() -> None:
+def test_records_seen_before_a_restart_are_not_in_the_future() -> None:
     seen = time.time_ns()
     system = System(seen - HOUR)
     clock = system.clock(seen)
@@ -151,7 +151,7 @@ def test_visit_that_ends_after_a_doubtful_clock_is_kept(tmp_path: Path, doubt: i
         assert engine.counts.observations == 1
 
 
-def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
+def test_vehicle_with_a_clock_a_day_ahead_is_refused_without_effect(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([message(1, now + DAY)], now)
@@ -167,7 +167,7 @@ def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: 
         assert [(seq, row) for seq, row, _ in stream.rejected] == [(1, 0)]
 
 
-def test_an_ack_says_what_came_late_once_and_what_time_it_is(tmp_path: Path) -> None:
+def test_acknowledgement_lists_late_batches_once_and_states_the_time(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([message(1, now)], now)

@@ -198,7 +198,7 @@ def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(
         )
 
 
-def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(
+def test_engine_acknowledges_nothing_while_the_bucket_is_unreachable(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
     sent = reports(0.7, 1, 2)
@@ -280,7 +280,7 @@ def drive(fleet: Fleet, sent: list[Batch]) -> bool:
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
 @pytest.mark.campaign
-def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
+def test_bucket_outage_loses_and_doubles_no_row(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
     root = tmp_path / "archive"
@@ -308,7 +308,7 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
 @pytest.mark.campaign
-def test_service_killed_between_disk_and_bucket_loses_nothing(
+def test_service_killed_between_disk_and_bucket_loses_no_row(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
     root = tmp_path / "archive"

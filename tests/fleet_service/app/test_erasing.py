@@ -184,7 +184,7 @@ def answer_requests(engine: Engine, root: Path, least: int = 1) -> None:
         thread.join(0.01)
 
 
-def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
+def test_month_is_forgotten_while_a_service_runs(tmp_path: Path) -> None:
     with closing(fill_engine(tmp_path, *OTHERS[1:])) as engine:
         sent = sent_by("sim-001", 1, is_far=False)
         engine.intake.ingest(

@@ -166,7 +166,7 @@ def test_a_process_answers_one_question_after_the_other(
 
 
 @pytest.mark.campaign
-def test_a_process_that_died_while_nobody_asked_is_begun_anew(
+def test_dead_idle_query_process_is_started_again(
     asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     for _ in range(2):
@@ -177,7 +177,7 @@ def test_a_process_that_died_while_nobody_asked_is_begun_anew(
 
 
 @pytest.mark.campaign
-def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
+def test_abandoned_answer_is_not_read_by_the_next_query(
     asker: historical_maps.HistoricalMaps, begun: list[subprocess.Popen[bytes]]
 ) -> None:
     left = asker.ask(question(bbox=NEAR), lambda _: True)

@@ -57,7 +57,7 @@ def test_a_running_service_compacts_and_keeps_every_row_once(
         assert main(["compact", "--archive", str(tmp_path)]) == 0
 
 
-def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None:
+def test_failed_job_is_counted_logged_and_repeated(tmp_path: Path) -> None:
     turns: list[int] = []
 
     def work(stop: threading.Event) -> str | None:
@@ -89,7 +89,7 @@ def test_an_unforeseen_job_failure_ends_no_other_job_and_is_reported(tmp_path: P
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_upkeep_that_has_died_is_known_and_told() -> None:
+def test_dead_background_thread_is_detected_and_reported() -> None:
     def work(stop: threading.Event) -> str | None:
         raise KeyboardInterrupt
 
@@ -143,7 +143,7 @@ def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
     assert not lines
 
 
-def test_the_command_says_when_another_compacts(
+def test_compact_reports_that_another_process_compacts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "inbox").mkdir()

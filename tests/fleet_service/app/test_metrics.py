@@ -26,7 +26,7 @@ from tests.schemas.runtime.test_metrics import fetch_page
 from tests.waiting import PATIENCE_S, matched, until
 
 
-def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
+def test_service_metrics_show_accepted_refused_and_waiting_messages(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     with running(router, tmp_path, metrics_port=0) as run:
@@ -95,7 +95,7 @@ def test_damaged_files_are_counted_by_a_job_not_by_metrics_readers(tmp_path: Pat
     engine.close()
 
 
-def test_each_trouble_is_told(tmp_path: Path) -> None:
+def test_each_health_problem_is_reported(tmp_path: Path) -> None:
     config = ServiceConfig(queue_batches=100)
     engine = Engine(config, tmp_path)
     well = Pulse(turn_age_s=0.1, queued=3, routers=1, clock_lag_s=0.0)

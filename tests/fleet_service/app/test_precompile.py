@@ -64,7 +64,7 @@ print(sorted(kernels() - warm))
 
 
 @pytest.mark.campaign
-def test_a_ready_service_compiles_nothing() -> None:
+def test_ready_service_compiles_no_kernel() -> None:
     heard = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
     )

@@ -291,7 +291,7 @@ def test_one_liar_raises_no_alert_however_often_it_reports(fleet: Fleet, service
     assert fleet.alerts.empty()
 
 
-def test_a_restart_gives_the_same_map_and_knows_what_it_holds(
+def test_restart_gives_the_same_map_and_counts_no_row_twice(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(6)
@@ -355,7 +355,7 @@ def test_a_person_can_publish_with_one_line_of_json(fleet: Fleet, service: Runni
     assert service.service.engine.state.fusion.live.visits[0] == 1
 
 
-def test_three_formats_say_the_same(fleet: Fleet) -> None:
+def test_arrow_geojson_and_json_answers_agree(fleet: Fleet) -> None:
     fleet.settle(batch("sim-001", 1, now(), [0.8]))
     arrow = pa.ipc.open_stream(ask(fleet.session)[0][2]).read_all().to_pylist()[0]
     (_, geo_encoding, geo_text), (_, encoding, text) = (
@@ -437,7 +437,7 @@ def test_a_bad_query_gets_an_error_that_names_the_field(
     assert "; " in reply.err.payload.to_string()
 
 
-def test_the_service_shows_that_it_lives_and_takes_it_back(
+def test_service_has_a_liveliness_token_while_it_runs(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     with running(router, tmp_path, name="shard-7"):
@@ -475,7 +475,7 @@ def test_two_services_share_the_world_and_a_query_gets_both(
         }
 
 
-def test_leaving_flushes_and_acknowledges_what_was_taken_in(
+def test_stopping_service_flushes_and_acknowledges_received_rows(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     with running(router, tmp_path) as run:

@@ -239,7 +239,9 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
     assert Pseudonyms(tmp_path).of("sim-001", now) != name
 
 
-def test_late_observation_is_archived_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
+def test_late_observation_is_archived_and_fused_for_its_own_time(
+    engine: Engine, tmp_path: Path
+) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
     engine.intake.ingest([make_message("sim-001", 1)], now)

@@ -120,7 +120,7 @@ def test_the_validator_refuses_a_file_whose_geometry_is_broken(tmp_path: Path) -
     )
 
 
-def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
+def test_geojson_and_csv_equal_the_map(tmp_path: Path) -> None:
     table = geo.with_cells(a_map(3))
     for ending in (".geojson", ".csv"):
         extract.write(table, tmp_path / f"map{ending}")

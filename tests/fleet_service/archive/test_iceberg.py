@@ -97,7 +97,7 @@ def test_retention_removes_rows_from_iceberg_tables_first(
     assert 0 < told["rows"] < 400
 
 
-def test_a_catalogue_that_is_away_holds_retention_up(
+def test_retention_waits_for_an_unreachable_catalogue(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "archive"
@@ -150,7 +150,7 @@ def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
         assert names[3].encode() not in path.read_bytes()
 
 
-def test_readers_elsewhere_are_told_of_the_mirror(
+def test_iceberg_tables_can_refer_to_the_files_of_a_mirror(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "archive"

@@ -49,7 +49,7 @@ def test_rows_added_while_a_segment_is_written_wait_for_the_next(
     assert len(identities(tmp_path, Kind.OBSERVATION)) == 6
 
 
-def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]) -> None:
+def test_flush_settles_the_open_segment_and_later_rows(log: SegmentLog[str]) -> None:
     add(log, "first", 1)
     log.begin()
     add(log, "second", 2)
@@ -89,7 +89,7 @@ def test_segment_order_does_not_depend_on_the_number_of_digits() -> None:
     assert sorted([newer, older], key=layout.age_key) == [older, newer]
 
 
-def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
+def test_new_pseudonym_key_survives_a_power_loss(tmp_path: Path) -> None:
     """A new pseudonym key, from which archived names are computed, must survive a power loss right
     after its creation. With another key, the service would not recognise archived batches, and
     would accept them a second time.

@@ -287,12 +287,12 @@ def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("period", "problem"), [("2026-13", "is not a month"), ("1999-01", "has no key of 1999-01")]
 )
-def test_a_period_that_is_none_is_said(tmp_path: Path, period: str, problem: str) -> None:
+def test_invalid_period_is_reported(tmp_path: Path, period: str, problem: str) -> None:
     with pytest.raises(InputError, match=f"^period: .*{problem}"):
         retention.forget_vehicle(tmp_path, "sim-003", period)
 
 
-def test_nothing_is_forgotten_beside_a_running_service(tmp_path: Path) -> None:
+def test_forget_refuses_an_archive_with_a_running_service(tmp_path: Path) -> None:
     with (
         closing(Engine(ServiceConfig(), tmp_path)),
         pytest.raises(InputError, match="belongs to a running service"),
@@ -300,7 +300,7 @@ def test_nothing_is_forgotten_beside_a_running_service(tmp_path: Path) -> None:
         retention.forget_period(tmp_path, MONTH)
 
 
-def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_path: Path) -> None:
+def test_compacted_files_are_mirrored_once_per_version(tmp_path: Path) -> None:
     root = tmp_path / "archive"
     there = tmp_path / "there"
     fill(root, 2, 50)

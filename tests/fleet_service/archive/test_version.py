@@ -182,7 +182,7 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
         assert engine.counts.files_set_aside == 0
 
 
-def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) -> None:
+def test_segments_before_1_3_have_unknown_controllers_and_wipers(tmp_path: Path) -> None:
     added = ["esc_active", "tcs_active", "wiper"]
     fill(tmp_path, 1, 20)
     (path,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
@@ -287,7 +287,7 @@ def test_the_commands_refuse_a_newer_major_version_in_one_line(
     assert not list(old.rglob("*.bad"))
 
 
-def test_a_column_without_which_a_row_is_none_is_said_by_name(tmp_path: Path) -> None:
+def test_missing_required_column_is_reported_by_name(tmp_path: Path) -> None:
     fill(tmp_path, 1, 5)
     (path,) = segments.list_segments(tmp_path, Kind.OBSERVATION)
     rewrite_file(path, lambda table: table.drop_columns(["seq"]), "1.9")

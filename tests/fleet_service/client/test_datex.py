@@ -139,13 +139,13 @@ def test_a_situation_keeps_its_id_and_counts_its_versions() -> None:
     assert text(c, ".//com:overallStartTime") == text(a, ".//com:overallStartTime")
 
 
-def test_an_end_is_told_for_an_hour_and_then_no_more() -> None:
+def test_ended_situation_stays_in_the_publication_for_an_hour() -> None:
     over = make_publication(OURS, [], NOW + NS, make_publication(OURS, stretches(*ICE), NOW))
     assert same_but_for_time(make_publication(OURS, [], NOW + (KEPT_S - 1) * NS, over), over)
     assert not records(make_publication(OURS, [], NOW + (KEPT_S + 2) * NS, over))
 
 
-def test_a_reader_that_begins_anew_goes_on_with_the_same_situation() -> None:
+def test_restarted_reader_continues_the_same_situation() -> None:
     first = make_publication(OURS, stretches(*ICE), NOW)
     without_its_first = make_publication(OURS, stretches(*ICE[6:]), NOW + NS, first)
     (a,) = records(first)
@@ -161,7 +161,7 @@ def test_ice_that_comes_back_is_a_new_situation() -> None:
     assert len({record.get("id") for record in records(later)}) == 2
 
 
-def test_where_no_service_speaks_silence_ends_nothing() -> None:
+def test_situation_does_not_end_while_no_service_answers() -> None:
     first = make_publication(OURS, stretches(*ICE), NOW)
     assert same_but_for_time(make_publication(OURS, [], NOW + NS, first, lambda *_: False), first)
 

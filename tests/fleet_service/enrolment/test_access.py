@@ -67,7 +67,7 @@ def test_access_list_has_no_breach(running: Network) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("protocol", ["quic", "tls"])
-def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: str) -> None:
+def test_attacks_succeed_in_an_unprotected_network(tmp_path: Path, protocol: str) -> None:
     with (
         open_network(tmp_path, guarded=False, protocol=protocol) as open_to_all,
         open_ground(open_to_all) as found,
@@ -75,7 +75,7 @@ def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path, protocol: 
         assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
 
 
-def test_a_vehicle_may_exactly_what_the_design_says() -> None:
+def test_vehicle_has_exactly_the_permissions_of_the_design() -> None:
     listed = access_control(make_enrolment())
     rules = {rule["id"]: rule for rule in listed["rules"]}
     granted = [
@@ -145,7 +145,7 @@ def is_heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool
     return True
 
 
-def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: Network) -> None:
+def test_readers_see_service_tokens_and_cannot_declare_them(running: Network) -> None:
     where = settings(next(iter(running.endpoints.values())), running.folder)
     served = keys.ServiceToken("1202/310/*", SERVICE, "1f")
     false = keys.ServiceToken("1202/311/*", HONEST, "2f")
@@ -223,7 +223,7 @@ def test_old_and_new_authority_get_on_while_one_replaces_the_other(
         assert is_heard(old, HONEST, service)
 
 
-def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None:
+def test_missing_certificate_is_reported_by_name(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,
         match=r"^zenoh.config.transport/link/tls/root_ca_certificate: there is no file .*",
@@ -231,7 +231,7 @@ def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None
         configuration(settings("tls/127.0.0.1:1", tmp_path), HONEST)
 
 
-def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
+def test_declared_publisher_learns_of_matching_subscribers(running: Network) -> None:
     """The access list must let a vehicle's declared publisher learn that a service subscribes.
     Otherwise the vehicle would send nothing and get no error.
     """
@@ -278,7 +278,7 @@ def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(
             assert b"ice" not in heard_by[name]
 
 
-def test_an_owner_of_what_is_no_vehicle_is_refused() -> None:
+def test_owner_of_an_unknown_vehicle_is_refused() -> None:
     with pytest.raises(ValueError, match="is not a vehicle"):
         make_enrolment(owners={"owner-0": ["nobody-1"]})
 

@@ -63,7 +63,7 @@ def test_private_keys_are_for_their_owner_alone(folder: Path) -> None:
     assert oct((folder / "authority").stat().st_mode & 0o777) == "0o700"
 
 
-def test_running_it_again_changes_nothing(folder: Path) -> None:
+def test_repeated_enrolment_changes_no_file(folder: Path) -> None:
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     done = at(folder, 1.0).enrol(make_enrolment())
     assert set(done.kept) == EVERYONE
@@ -142,7 +142,7 @@ def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
         at(tmp_path, ca_days=40.0).enrol(make_enrolment())
 
 
-def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> None:
+def test_lost_key_of_the_authority_is_reported_and_not_replaced(folder: Path) -> None:
     (folder / "authority" / "ca.key").unlink()
     with pytest.raises(InputError, match=r"lacks the authority's key; restore ca.key"):
         at(folder).enrol(make_enrolment())
@@ -215,7 +215,7 @@ def test_invalid_enrolment_is_reported_in_one_line(
     assert shown.count("\n") == 1
 
 
-def test_the_command_says_what_it_did_and_what_is_to_be_done(
+def test_certs_prints_its_results_and_the_next_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "fleet.json"
@@ -245,7 +245,7 @@ def test_foreign_files_stay_and_no_private_key_is_deleted(
     assert (folder / "revoked" / f"{gone}.key").stat().st_mode & 0o077 == 0
 
 
-def test_a_list_that_is_short_by_mistake_revokes_nobody_without_a_word(
+def test_mass_revocation_needs_confirmation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [f"car-{k:03}" for k in range(6)]

@@ -119,7 +119,7 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
     assert p.max() / p.min() < 32 / constants.CONTAMINATION
 
 
-def test_a_vote_of_no_weight_or_no_power_changes_nothing() -> None:
+def test_vote_without_weight_or_power_changes_no_belief() -> None:
     evidence = np.arange(32, dtype=np.uint8) * 8
     vote = np.empty(32)
     convolve_bias(evidence, belief.ReportKind.VALUE, vote)

@@ -61,7 +61,7 @@ def test_grip_used_counts_where_a_contradicted_estimator_reports_nothing(
         assert lower >= used - 0.15
 
 
-def test_a_value_below_what_was_used_gives_way_to_it() -> None:
+def test_value_below_the_grip_used_is_replaced_by_it() -> None:
     value = mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - 0.6) / 0.05))[None]
     assert mugrid.CENTRES[np.argmin(bound_by_used(value, np.array([0.8]))[0])] > 0.65
     assert np.array_equal(bound_by_used(value, np.array([np.nan])), value)

@@ -25,7 +25,7 @@ def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, 
     return fusion, [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
 
 
-def test_a_backlog_of_an_hour_is_fused_and_its_order_of_arrival_is_nothing() -> None:
+def test_backlog_of_an_hour_is_fused_in_any_order_of_arrival() -> None:
     straight, told = late(np.arange(400), 4)
     mixed, _ = late(np.random.default_rng(1).permutation(400), 37)
     assert all(updated.late.all() for _, updated in told)
@@ -96,7 +96,7 @@ def test_report_older_than_the_forgetting_time_is_not_fused() -> None:
     assert not len(updated.slots)
 
 
-def test_a_replay_fuses_what_was_late_where_it_was_fused() -> None:
+def test_replay_fuses_late_reports_at_the_same_point() -> None:
     fusion, told = late(np.random.default_rng(2).permutation(400), 5)
     o = drive(7, 400, 3000.0)
     n = 400

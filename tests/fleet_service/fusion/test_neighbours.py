@@ -103,7 +103,7 @@ def test_many_visits_without_a_value_weaken_a_message_to_unsure() -> None:
     assert told[-1] == pytest.approx(UNSURE, abs=0.05)
 
 
-def test_the_further_it_is_the_less_a_neighbour_tells() -> None:
+def test_influence_of_a_neighbour_falls_with_distance() -> None:
     told = [
         slippery(belief(road({0: UNTESTED, steps: snow()}))) for steps in range(1, NEIGHBOURS + 2)
     ]
@@ -111,7 +111,7 @@ def test_the_further_it_is_the_less_a_neighbour_tells() -> None:
     assert told[-1] == slippery(belief(road({0: UNTESTED})))
 
 
-def test_the_other_direction_of_the_road_tells() -> None:
+def test_snow_in_the_opposite_direction_lowers_the_belief() -> None:
     fusion = road({0: UNTESTED})
     tell(fusion, east(0, north=1), snow(), sector=2)
     assert slippery(belief(fusion)) > 0.4
@@ -130,7 +130,7 @@ def test_messages_follow_a_road_that_runs_diagonally_to_the_grid(slope: int, sec
     assert slippery(belief(fusion, sector=sector)) > 0.9
 
 
-def test_a_road_that_continues_straight_on_hears_no_cell_beside_it() -> None:
+def test_straight_road_ignores_cells_at_its_side() -> None:
     fusion = road({0: UNTESTED, 1: dry(), -1: dry()})
     for along in (-1, 1):
         tell(fusion, cell_at(along, 1, 0), snow())
@@ -204,7 +204,7 @@ def test_a_message_is_of_a_neighbours_own_reports() -> None:
     assert near[-1] == slippery(belief(road({0: UNTESTED})))
 
 
-def test_reading_leaves_a_cells_own_belief_as_it_is() -> None:
+def test_reading_a_belief_does_not_change_the_stored_one() -> None:
     fusion = road({0: UNTESTED, 1: snow()})
     before = fusion.live.belief.copy()
     alone = road({0: UNTESTED})

@@ -102,7 +102,7 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     )
 
 
-def test_observation_long_before_the_checkpoint_changes_nothing() -> None:
+def test_observation_long_before_the_checkpoint_changes_no_belief() -> None:
     fusion = Fusion(LATENESS_S)
     fusion.update(observations([0.0], [1], value([0.8])))
     fusion.update(observations([20_000.0], [2], value([0.8])))

@@ -23,7 +23,7 @@ def encode_value(mu: float, std: float = 0.05) -> np.ndarray:
     return mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - mu) / std))[None]
 
 
-def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
+def test_value_is_described_as_reported_and_a_bound_is_not() -> None:
     steps, reported = as_reported(
         np.vstack(
             [encode_value(0.85), np.minimum(encode_value(0.3), 200) + 7, 0 * encode_value(0.3)]

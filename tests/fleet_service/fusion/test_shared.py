@@ -70,7 +70,7 @@ def test_unknown_manoeuvre_counts_as_the_same_as_all_others() -> None:
     assert width(0.6, unknown) == pytest.approx(width(0.6, same), abs=1e-3)
 
 
-def test_a_manoeuvre_is_told_by_the_larger_part_of_the_grip_used() -> None:
+def test_manoeuvre_is_the_larger_part_of_the_grip_used() -> None:
     along = np.array([0.5, -0.5, 0.1, 0.1, np.nan])
     across = np.array([0.1, 0.1, 0.5, -0.5, 0.5])
     expected = [

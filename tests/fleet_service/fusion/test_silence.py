@@ -139,7 +139,7 @@ def test_only_a_slope_above_the_grip_used_states_more_grip() -> None:
 
 
 @pytest.mark.parametrize("mu", [0.5, 0.6, 0.7])
-def test_a_fleet_that_rarely_gives_values_causes_no_false_grip(mu: float) -> None:
+def test_fleet_with_few_values_causes_no_false_grip(mu: float) -> None:
     """All vehicles of another make use almost all of the grip, a tenth of them give a value, and
     none states more grip. The lower end of the interval must not exceed the true friction.
     """

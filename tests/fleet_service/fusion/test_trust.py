@@ -50,7 +50,7 @@ def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
     assert drive_liars().trust(999) == pytest.approx(constants.NEWCOMER)
 
 
-def test_two_enrolled_vehicles_that_nobody_met_raise_an_alert() -> None:
+def test_two_new_enrolled_vehicles_raise_an_alert() -> None:
     raised = []
     for enrolled in (False, True):
         fusion = drive_liars(enrolled=enrolled)

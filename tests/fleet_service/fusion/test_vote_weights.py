@@ -58,7 +58,7 @@ def test_shape_is_found_from_a_vehicle_that_differs_from_itself(slope: float) ->
     assert learned_slope(make_acquainted(slope)) == pytest.approx(slope, abs=0.15)
 
 
-def test_shape_of_nobody_is_the_prior() -> None:
+def test_shape_without_observations_is_the_prior() -> None:
     assert learned_slope(Fusion(120.0)) == pytest.approx(constants.SHAPE_PRIOR)
 
 

@@ -140,7 +140,7 @@ def test_a_posterior_is_a_value_where_grip_was_used_and_else_a_bound() -> None:
     assert (np.diff(unexcited) >= 0).all()
 
 
-def test_a_sender_that_says_nothing_changes_nothing() -> None:
+def test_posterior_without_values_contains_no_evidence() -> None:
     nan = float("nan")
     assert not posterior_evidence(nan, nan, nan, nan).any()
     assert not posterior_evidence(0.5, nan, nan, nan).any()

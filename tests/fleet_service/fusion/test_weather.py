@@ -60,7 +60,7 @@ def compute_road_time(conditions: weather.Weather, begin: float, end: float) -> 
     return drift / 3600.0, change / 3600.0
 
 
-def test_without_a_word_about_a_region_its_roads_age_by_the_clock() -> None:
+def test_roads_without_weather_reports_age_by_the_clock() -> None:
     for conditions in (
         weather.weather_of(weather.no_reports()),
         weather.weather_of(reports((0.0, RAIN), region=REGION + 1)),

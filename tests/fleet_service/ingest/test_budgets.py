@@ -96,7 +96,7 @@ def test_a_start_over_midnight_of_a_month_links_no_pseudonyms(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("with_checkpoint", [False, True])
-def test_a_sender_without_first_held_goes_on_in_a_new_month(
+def test_sender_without_first_held_continues_in_a_new_month(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_checkpoint: bool
 ) -> None:
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
@@ -239,7 +239,7 @@ def everywhere(seq: int, count: int, now: int) -> Batch:
     return replace(one, region=int(grid.region_of(cell[0])))
 
 
-def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
+def test_new_cells_per_car_are_limited_and_all_rows_archived(engine: Engine) -> None:
     now = time.time_ns()
     sent = 0
     at_once = 3_000

@@ -20,7 +20,7 @@ STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 
 
 @given(STEPS)
-def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(
+def test_sequence_tracker_knows_accepted_and_skipped_numbers(
     steps: list[tuple[int, int]],
 ) -> None:
     stream = SequenceTracker(KEY)

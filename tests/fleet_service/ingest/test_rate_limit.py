@@ -63,13 +63,13 @@ def test_a_publisher_may_send_for_many_vehicles() -> None:
     assert sum(found.allows("obs/many", 5_000) for _ in range(1000)) == 20 * 2 * RATE / 5_000
 
 
-def test_small_messages_cost_what_it_takes_to_read_one() -> None:
+def test_small_messages_have_a_minimum_cost() -> None:
     found, _ = buckets(Clock())
     assert sum(found.allows("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
 
 
 @pytest.mark.parametrize("encoding", ["application/json", "application/json;schema=gripmap"])
-def test_a_byte_of_json_costs_what_it_takes_to_read_it(encoding: str) -> None:
+def test_json_costs_more_of_the_rate_limit_per_byte(encoding: str) -> None:
     found, counts = buckets(Clock())
     size = int(BURST) // (2 * JSON_COST)
     assert [found.allows("a/car", size, encoding) for _ in range(3)] == [True, True, False]
@@ -77,7 +77,7 @@ def test_a_byte_of_json_costs_what_it_takes_to_read_it(encoding: str) -> None:
     assert all(found.allows("a/other", size) for _ in range(2 * JSON_COST))
 
 
-def test_one_that_sends_too_much_takes_nothing_from_the_others() -> None:
+def test_sender_over_its_limit_does_not_affect_others() -> None:
     found, _ = buckets(Clock())
     for _ in range(1000):
         found.allows("obs/1202/310/232/loud", 60_000)

@@ -172,14 +172,14 @@ def test_a_bad_batch_among_good_ones_is_refused_alone(desk: Desk) -> None:
     ]
 
 
-def test_a_refused_batch_that_comes_again_is_refused_again(desk: Desk) -> None:
+def test_repeated_batch_that_was_refused_is_refused_again(desk: Desk) -> None:
     bad = batch("sim-001", 1, NOW - SECOND, [0.8], speed=[1e9])
     for _ in range(2):
         assert desk.take(message(bad)) == 0
         assert len(desk.list_rejected()) == 1
 
 
-def test_a_batch_is_admitted_once_however_often_and_wherever_it_comes(desk: Desk) -> None:
+def test_repeated_batch_is_admitted_once_at_any_service(desk: Desk) -> None:
     assert desk.take(message(good()), message(good())) == 2
     assert desk.take(message(good())) == 0
     assert desk.counts == ServiceCounts(duplicates=2)

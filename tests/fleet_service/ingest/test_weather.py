@@ -47,7 +47,7 @@ from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.waiting import matched, until
 
 
-def test_a_report_survives_the_wire_and_what_is_left_out_is_unknown() -> None:
+def test_weather_report_round_trips_and_missing_values_are_unknown() -> None:
     prior = np.full(mugrid.BINS, 1.0 / mugrid.BINS)
     got = weather.decode(
         weather.encode(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))

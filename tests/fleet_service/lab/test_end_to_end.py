@@ -46,7 +46,7 @@ def test_observations_of_the_vehicles_are_joined_with_their_truth(tmp_path: Path
     assert ((mu > 0.05) & (mu < 1.2)).all()
 
 
-def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
+def test_figure_without_data_is_nan_and_meets_no_target() -> None:
     assert np.isnan(end_to_end.mean_or_nan(np.array([])))
     assert end_to_end.mean_or_nan(np.array([True, False])) == 0.5
 
@@ -109,7 +109,7 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
     assert end_to_end.false_ice([], rows) == (0, 0)
 
 
-def test_alerts_are_those_of_a_service_that_hears_second_by_second() -> None:
+def test_alerts_equal_those_of_a_service_fed_second_by_second() -> None:
     fusion = Fusion(120.0)
     raised = end_to_end.raised_alerts(
         fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8))
@@ -128,7 +128,7 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
     ]
 
 
-def test_a_cell_of_two_surfaces_is_told_apart() -> None:
+def test_cell_with_two_surfaces_is_recognised() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     same = end_to_end.one_surface(

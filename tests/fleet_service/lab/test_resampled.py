@@ -106,6 +106,6 @@ def test_vehicles_of_two_ways_are_different_ones() -> None:
     assert resampled.join_ways([way, way]).vehicle.tolist() == [0, 0, 2, 2, 3, 3, 5, 5]
 
 
-def test_nothing_is_said_of_a_fleet_that_was_never_excited() -> None:
+def test_fleet_without_grip_demand_has_no_figures() -> None:
     way = visits_on(np.full(4, 0.5), np.zeros(4, np.int64), np.ones(1))
     assert models.measure_real(way._replace(excited=np.zeros(4, bool)), range(1)) == {}

@@ -40,7 +40,7 @@ def in_danger(four: tuple[str, ...], two: tuple[str, ...]) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("sight", SIGHTS)
 @pytest.mark.parametrize("palette", [ALL, DARK], ids=["light", "dark"])
-def test_any_two_classes_and_the_ground_are_told_apart(
+def test_any_two_colours_and_the_background_can_be_distinguished(
     sight: str, palette: tuple[str, ...]
 ) -> None:
     assert len(set(palette)) == 8

@@ -121,7 +121,7 @@ def pull(address: str) -> Callable[[], bytes]:
 
 
 @pytest.mark.campaign
-def test_silence_of_a_service_that_went_ends_nothing(
+def test_situation_does_not_end_when_its_service_disappears(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     file = DatexFile(OURS, tmp_path / "situations.xml", print)
@@ -136,7 +136,7 @@ def test_silence_of_a_service_that_went_ends_nothing(
         assert not text(records(pulled())[0], ".//com:overallEndTime")
 
 
-def test_a_page_without_a_publication_says_how_to_have_one(bare: str) -> None:
+def test_page_without_datex_explains_how_to_enable_it(bare: str) -> None:
     status, _, body = ask(bare, ROUTE)
     assert (status, b"--datex" in body) == (404, True)
 

@@ -120,7 +120,7 @@ def test_pages_follow_each_other_and_nothing_is_there_twice(
     assert one["properties"]["vehicles"] == len(street.CARS)
 
 
-def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
+def test_bbox_returns_every_cell_that_touches_it(page: RunningPage, drive: Drive) -> None:
     drive_parts(page, drive, "ice", "avenue")
     west, south, east, north = (
         float(v) for v in grid.bounds(int(street.cells(street.PARTS["ice"])[2]))
@@ -140,7 +140,7 @@ def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
     )
 
 
-def test_a_time_is_the_map_of_then_and_an_interval_what_was_observed_in_it(
+def test_time_gives_the_map_then_and_an_interval_its_observations(
     page: RunningPage, drive: Drive
 ) -> None:
     drive_parts(page, drive, "ice")
@@ -202,7 +202,7 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
         "/1-9",
     ],
 )
-def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str) -> None:
+def test_invalid_request_is_answered_with_problem_and_fix(bare: str, asked: str) -> None:
     status, _, body = ask(bare, ITEMS + asked)
     assert status == 400
     assert b"; " in body

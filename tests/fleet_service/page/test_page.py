@@ -165,7 +165,7 @@ _PAINTED: Final = """
 """
 
 
-def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive) -> None:
+def test_ice_stays_visible_at_low_zoom(page: RunningPage, drive: Drive) -> None:
     drive()
     with open_map(page) as seen:
         for zoom, level in ((12.0, 18), (6.0, 14)):
@@ -203,7 +203,7 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
     assert len(set(there)) == 7
 
 
-def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(
+def test_place_panel_shows_interval_basis_vehicles_and_safe_speed(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice", "passed")
@@ -277,7 +277,7 @@ def test_page_receives_changes_and_shows_an_alert_with_its_reason(
 
 
 @pytest.mark.campaign
-def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(
+def test_region_of_a_missing_service_is_reported_and_not_empty(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("ice")
@@ -341,7 +341,7 @@ def list_snapshots(archive: Path) -> list[int]:
     )
 
 
-def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
+def test_clicked_or_dropped_route_shows_unknown_parts(
     page: RunningPage, drive: Drive, tmp_path: Path
 ) -> None:
     drive("ice", "wet")
@@ -374,7 +374,7 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
 
 
 @pytest.mark.campaign
-def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
+def test_shared_link_restores_the_whole_page_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_map(page) as seen:
         near(seen, cell_of("ice"), 18.5)
@@ -407,7 +407,7 @@ def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
         )
 
 
-def test_a_file_that_leaves_has_no_mu_for_a_bound(page: RunningPage, drive: Drive) -> None:
+def test_downloaded_file_has_no_mu_for_a_lower_bound(page: RunningPage, drive: Drive) -> None:
     drive("passed")
     with open_map(page) as seen:
         near(seen, cell_of("passed", 3), 17)

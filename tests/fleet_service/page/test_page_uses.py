@@ -104,9 +104,7 @@ def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, driv
         waits(seen, "gripmap.timeline.timer === null")
 
 
-def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
-    page: RunningPage, drive: Drive
-) -> None:
+def test_new_alert_plays_a_sound_only_if_enabled(page: RunningPage, drive: Drive) -> None:
     with open_map(page) as seen:
         silent = seen.page.context.new_page()
         silent.goto(page.address)
@@ -126,9 +124,7 @@ def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(
         assert silent.evaluate("beeps") == 0
 
 
-def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(
-    page: RunningPage, drive: Drive
-) -> None:
+def test_printed_page_has_map_and_text_but_no_controls(page: RunningPage, drive: Drive) -> None:
     drive("ice", "dry")
     with open_map(page) as seen:
         near(seen, cell_of("ice"), 17)

@@ -170,7 +170,7 @@ def test_alert_of_one_direction_is_not_shown_for_the_other(page: RunningPage, dr
 
 
 @pytest.mark.parametrize("width", [390, 1280, 3840])
-def test_words_stand_beside_what_they_name_on_every_screen(
+def test_labels_are_next_to_their_elements_on_every_screen(
     router: ZenohSettings, width: int
 ) -> None:
     size: Any = {"width": width, "height": 900}

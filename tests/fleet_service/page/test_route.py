@@ -76,7 +76,7 @@ def test_the_other_direction_is_another_road() -> None:
     assert found["worst"] is None
 
 
-def test_a_route_that_nobody_knows_is_unknown_and_not_dry() -> None:
+def test_unmeasured_route_is_unknown_and_not_dry() -> None:
     assert grip_profile(ends(-5, 5), MAP_SCHEMA.empty_table())["share"]["unknown"] == pytest.approx(
         1.0
     )

@@ -113,7 +113,7 @@ def test_every_answer_forbids_what_the_page_does_not_need(bare: str) -> None:
         "/blocks?tiles=" + "1," * 300,
     ],
 )
-def test_a_wrong_question_is_told_its_field_and_the_fix(bare: str, path: str) -> None:
+def test_invalid_query_is_answered_with_field_and_fix(bare: str, path: str) -> None:
     status, _, body = ask(bare, path)
     assert status == 400
     assert b": " in body
@@ -156,7 +156,7 @@ def test_another_language_is_one_file(tmp_path: Path) -> None:
     }
 
 
-def test_the_words_are_given_in_a_language_that_there_is(bare: str) -> None:
+def test_unknown_language_gets_the_english_texts(bare: str) -> None:
     status, headers, body = ask(bare, "/texts", **{"Accept-Language": "../../x, xx"})
     assert (status, json.loads(body)["language"]) == (200, "en")
     assert "Accept-Language" in headers["vary"]
@@ -192,7 +192,7 @@ def test_client_receives_the_present_state_and_then_changes(
     until(lambda: count_heads() >= street.count_known("ice", "avenue"))
 
 
-def test_an_alert_reaches_who_listens_with_its_reason(page: RunningPage, drive: Drive) -> None:
+def test_subscriber_receives_an_alert_with_its_reason(page: RunningPage, drive: Drive) -> None:
     with listening(page.address) as events:
         assert next(events) == ("alerts", [])
         drive("ice")
@@ -201,7 +201,7 @@ def test_an_alert_reaches_who_listens_with_its_reason(page: RunningPage, drive: 
     assert "P(mu < 0.4)" in alert["reason"]
 
 
-def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSettings) -> None:
+def test_event_stream_beyond_the_limit_gets_503_and_retry_after(router: ZenohSettings) -> None:
     with page_of(router, most=1) as address:
         with listening(address) as events:
             next(events)
@@ -223,7 +223,7 @@ def ask_briefly(address: str) -> int:
     return answer.status
 
 
-def test_a_region_whose_service_went_is_told_and_its_cells_stay(
+def test_region_without_its_service_is_reported_and_keeps_its_cells(
     page: RunningPage, drive: Drive
 ) -> None:
     drive("dry")
@@ -242,7 +242,7 @@ def test_a_region_whose_service_went_is_told_and_its_cells_stay(
     assert json.loads(ask(page.address, "/tiles")[2]), "what was known is not emptiness"
 
 
-def test_one_cell_is_told_as_the_service_has_it(page: RunningPage, drive: Drive) -> None:
+def test_cell_route_returns_the_values_of_the_service(page: RunningPage, drive: Drive) -> None:
     drive("ice", "passed")
     ice, passed = (int(street.cells(street.PARTS[name])[1]) for name in ("ice", "passed"))
 
@@ -265,7 +265,7 @@ def test_one_cell_is_told_as_the_service_has_it(page: RunningPage, drive: Drive)
     assert found["share"]["unknown"] > 0
 
 
-def test_a_page_without_a_router_says_so(router: ZenohSettings) -> None:
+def test_page_without_a_router_reports_it(router: ZenohSettings) -> None:
     nowhere = ZenohSettings(connect=["tcp/127.0.0.1:1"])
     with page_of(nowhere) as address:
         assert not json.loads(ask(address, "/health")[2])["router"]
@@ -273,7 +273,7 @@ def test_a_page_without_a_router_says_so(router: ZenohSettings) -> None:
         assert json.loads(ask(address, "/tiles")[2]) == []
 
 
-def test_a_slow_watcher_is_told_to_reload_and_nothing_else_piles_up() -> None:
+def test_slow_client_is_asked_to_reload_and_its_queue_is_limited() -> None:
     async def slow() -> list[bytes]:
         world = MapMirror()
         watchers = Watchers(world, dict, most=1)
@@ -306,7 +306,7 @@ def test_metrics_are_read_by_name_and_label() -> None:
     assert parse_metrics(text) == {"rows": {"observation": 12.0}, "cells": {"": 5.0}}
 
 
-def test_a_stranger_on_the_map_ends_nothing(
+def test_page_survives_invalid_publications(
     page: RunningPage, session: zenoh.Session, drive: Drive
 ) -> None:
     for key in (
@@ -320,7 +320,7 @@ def test_a_stranger_on_the_map_ends_nothing(
 
 
 @pytest.mark.parametrize("way", ["connect", "config"])
-def test_every_option_of_the_command_does_what_it_says(
+def test_every_option_of_the_command_has_its_effect(
     router: ZenohSettings, tmp_path: Path, way: str
 ) -> None:
     archive = tmp_path / "archive"

@@ -90,7 +90,7 @@ def show_ice(seen: Opened, zoom: float = 17.2) -> None:
     waits(seen, ICE_DRAWN)
 
 
-def test_empty_map_says_that_no_vehicle_reported_and_what_to_do(page: RunningPage) -> None:
+def test_empty_map_states_that_no_vehicle_reported_and_what_to_do(page: RunningPage) -> None:
     with open_map(page) as seen:
         seen.page.set_viewport_size(LAPTOP)
         assert "No vehicle has reported yet" in card(seen, "empty")
@@ -102,7 +102,7 @@ def test_empty_map_says_that_no_vehicle_reported_and_what_to_do(page: RunningPag
         keep_picture(seen, "empty")
 
 
-def test_map_without_a_service_says_so_and_is_hatched(bare: str) -> None:
+def test_map_without_a_service_states_it_and_is_hatched(bare: str) -> None:
     with open_page(bare) as seen:
         seen.page.wait_for_selector(READY, state="attached")
         assert "No fleet service answers" in card(seen, "no_service")
@@ -110,7 +110,7 @@ def test_map_without_a_service_says_so_and_is_hatched(bare: str) -> None:
         keep_picture(seen, "no-service")
 
 
-def test_slow_map_says_that_it_loads(page: RunningPage, drive: Drive) -> None:
+def test_slow_map_shows_that_it_loads(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_page("about:blank") as seen:
         seen.page.set_viewport_size(LAPTOP)
@@ -176,7 +176,7 @@ def test_region_without_a_service_is_hatched_and_named(page: RunningPage, drive:
         keep_picture(seen, "service-away")
 
 
-def test_page_without_a_past_says_so_and_offers_no_slider(
+def test_page_without_history_states_it_and_has_no_slider(
     router: ZenohSettings, tmp_path: Path
 ) -> None:
     with (
@@ -192,7 +192,7 @@ def test_page_without_a_past_says_so_and_offers_no_slider(
         keep_picture(seen, "no-history")
 
 
-def test_place_without_a_past_says_that_there_is_none(page: RunningPage, drive: Drive) -> None:
+def test_place_without_history_states_it(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with open_map(page) as seen:
         seen.page.route("**/history/**", lambda route: route.fulfill(json=[]))

@@ -298,7 +298,7 @@ def test_compacted_file_across_the_checkpoint_is_not_replayed_twice(tmp_path: Pa
         assert again.counts.duplicates == 8
 
 
-def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None:
+def test_checkpoint_that_crashes_the_service_is_abandoned(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         path = keep(engine, tmp_path)

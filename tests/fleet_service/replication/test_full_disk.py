@@ -72,7 +72,7 @@ def test_standby_with_a_full_disk_waits_and_takes_over_when_there_is_space(
     ],
     ids=["files", "identity"],
 )
-def test_disk_that_is_full_at_the_take_over_delays_it_and_loses_nothing(
+def test_full_disk_delays_a_takeover_without_loss(
     bucket: BucketServer,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

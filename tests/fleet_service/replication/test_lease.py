@@ -53,7 +53,7 @@ GONE: dict[str, Callable[[Host], None]] = {
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("how", GONE)
-def test_a_standby_goes_on_with_all_that_was_acknowledged(
+def test_standby_continues_with_all_acknowledged_rows(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, how: str
 ) -> None:
     fleet = Fleet(session)
@@ -394,7 +394,7 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
         assert two.part.stop() == 0
 
 
-def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(
+def test_active_lease_is_refused_to_a_service_that_is_no_standby(
     bucket: BucketServer, tmp_path: Path
 ) -> None:
     one = Machine(tmp_path / "one", bucket)
@@ -404,7 +404,7 @@ def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(
     Machine(tmp_path / "two", bucket).close()  # the lease was released
 
 
-def test_a_copy_of_a_folder_is_somebody_else(tmp_path: Path) -> None:
+def test_copied_folder_is_another_lease_holder(tmp_path: Path) -> None:
     one = tmp_path / "one"
     two = tmp_path / "two"
     one.mkdir()

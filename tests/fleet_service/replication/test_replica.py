@@ -83,7 +83,7 @@ def test_settled_files_are_in_the_bucket_byte_for_byte(
         assert there(bucket) == list_copied_files(root)
 
 
-def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
+def test_rows_settle_once_after_a_bucket_outage_and_not_during_it(
     bucket: BucketServer, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
@@ -113,7 +113,7 @@ def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
     assert len(identities(root, Kind.OBSERVATION)) == 5 * 5
 
 
-def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(
+def test_upload_whose_answer_was_lost_is_no_error(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -274,7 +274,7 @@ def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
-def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
+def test_unreachable_bucket_at_the_start_is_reported_without_hanging(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(replica, "SLOW_S", 1.0)
@@ -305,7 +305,7 @@ def test_folder_of_this_machine_serves_as_a_bucket_for_trials(tmp_path: Path) ->
     assert (tmp_path / "a bucket" / "north" / "lease" / "1").read_bytes() == b"mine"
 
 
-def test_settings_that_cannot_be_used_say_which_and_why(
+def test_unusable_settings_are_named_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")

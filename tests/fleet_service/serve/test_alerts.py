@@ -46,7 +46,7 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
     assert alerts.slots == {0}
 
 
-def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
+def test_alert_is_judged_by_the_belief_about_the_road() -> None:
     # These cells are too far apart to influence each other.
     fusion = Fusion(120.0)
     cells = 64 * np.arange(40)
@@ -85,7 +85,7 @@ def test_one_vehicle_with_many_unexcited_others_raises_nothing() -> None:
     assert fusion.live.vehicles[0] == 21
 
 
-def test_an_alert_that_nobody_confirms_ends_by_itself_with_the_reason() -> None:
+def test_unconfirmed_alert_ends_by_itself_with_the_reason() -> None:
     _, alerts, _ = icy([1, 2, 3])
     assert not alerts.expire(START + HOUR // 4)
     (ended,) = alerts.expire(START + 6 * HOUR)

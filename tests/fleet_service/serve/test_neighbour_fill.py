@@ -64,7 +64,7 @@ def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
     assert behind[-1] > mugrid.PRIOR @ (mugrid.CENTRES < 0.4)
 
 
-def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
+def test_belief_between_two_surfaces_excludes_a_third() -> None:
     cells = borrow_beliefs({5: 0.2, 12: 0.9})
     found = {
         int(np.flatnonzero(c == EAST)[0]): b for c, b in zip(cells.cell, cells.belief, strict=True)
@@ -76,7 +76,7 @@ def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
     assert between[np.abs(mugrid.CENTRES - 0.9) < 0.05].max() > mugrid.PRIOR[0]
 
 
-def test_without_a_route_only_what_adjoins_is_borrowed() -> None:
+def test_only_adjoining_cells_are_borrowed_without_a_route() -> None:
     cells = borrow_beliefs({5: 0.3}, route=None)
     assert len(cells.cell) == 8
     assert set(widths(borrow_beliefs({5: 0.3}))) >= {4, 6}

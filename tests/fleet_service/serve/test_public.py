@@ -111,7 +111,7 @@ def test_the_past_is_no_more_public_than_the_present(start: Start) -> None:
     assert not rows(engine, at=at)
 
 
-def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start) -> None:
+def test_route_states_the_deceleration_that_is_safe_at_95_percent(start: Start) -> None:
     engine = start(1)
     hear(engine, "sim-001", "sim-002", "sim-003")
     (row,) = rows(engine, route=f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}")
@@ -189,7 +189,7 @@ def test_vehicle_alone_at_night_stays_hidden_where_many_passed_by_day(start: Sta
     assert not rows(engine, night, at=f"{hour + timedelta(hours=17):%Y-%m-%dT%H:%M:%SZ}")
 
 
-def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(
+def test_restart_restores_recent_vehicles_with_or_without_checkpoint(
     start: Start, tmp_path: Path
 ) -> None:
     engine = start(3)

@@ -226,7 +226,7 @@ def test_light_questions_beyond_their_share_are_still_answered(
     assert not half.counts.refused_queries
 
 
-def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) -> None:
+def test_most_costly_query_is_deferred_under_overload(half: Half) -> None:
     large = [
         half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0) for _ in range(WAITING + 2)
     ]

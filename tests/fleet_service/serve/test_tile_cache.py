@@ -42,7 +42,7 @@ def vehicles(made: TileCache, now: int, tile: int = TILE) -> list[int]:
     return [int(n) for n in made.read_tiles([tile], now)[0].columns["vehicles"]]
 
 
-def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state: MapState) -> None:
+def test_unchanged_tile_is_cached_for_a_second(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
     first = made.read_tiles([TILE], NOW)[0]
     assert made.read_tiles([TILE], NOW + tile_cache.SHOWN_NS)[0] is first
@@ -63,7 +63,7 @@ def test_acknowledged_change_is_visible_at_once_others_within_a_second(state: Ma
     assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [3]
 
 
-def test_a_promise_about_another_tile_does_not_make_this_one_anew(state: MapState) -> None:
+def test_change_of_another_tile_keeps_the_cached_tile(state: MapState) -> None:
     made = TileCache(state, nullcontext(), 1)
     first = made.read_tiles([TILE], NOW)[0]
     visit(state, 2, (TILE + 1) << 14)

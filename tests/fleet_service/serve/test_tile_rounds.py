@@ -67,7 +67,7 @@ def test_skipped_tile_rounds_are_counted_and_changes_come_in_the_next() -> None:
     assert made.counts.tile_rounds_skipped == skipped
 
 
-def test_when_somebody_passed_does_not_move_the_moment_of_a_put() -> None:
+def test_time_of_a_publication_does_not_reveal_the_time_of_a_visit() -> None:
     moments = []
     for passed in (0.13, 0.64, 0.97):
         made = Made()
@@ -90,7 +90,7 @@ def test_a_stalled_worker_begins_one_round_and_counts_the_missed_ones() -> None:
     assert made.turn(0.3) == 1
 
 
-def test_a_service_that_leaves_puts_what_is_left_and_each_once() -> None:
+def test_stopping_service_publishes_remaining_tiles_once_each() -> None:
     made = Made()
     made.changed = {1, 2, 3, 4, 5}
     made.turn(1.0)

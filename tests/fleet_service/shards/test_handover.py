@@ -124,7 +124,7 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         assert two.end().exit_code == 0
 
 
-def test_a_region_stays_where_nobody_stands_by_for_it(
+def test_region_without_a_standby_is_not_handed_over(
     router: ZenohSettings, bucket: BucketServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["hand-over", EVERYWHERE, "--connect", router.connect[0], "--to"]

@@ -364,7 +364,7 @@ def test_unserved_area_is_named_with_the_fewest_regions() -> None:
     ]
 
 
-def test_a_token_says_its_region_and_a_stranger_says_none() -> None:
+def test_service_token_round_trips_and_invalid_tokens_raise() -> None:
     for region in ("*/*/*", NAMES[0], "1202/*/*"):
         told = keys.ServiceToken(region, "shard-0", "1f")
         assert keys.parse_served(told.key) == told

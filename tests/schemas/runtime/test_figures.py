@@ -39,7 +39,7 @@ def _run_git(folder: Path, *words: str) -> str:
     return done.stdout.strip()
 
 
-def test_the_commit_is_that_of_the_source_and_says_whether_it_was_changed(
+def test_commit_is_that_of_the_source_with_a_mark_if_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

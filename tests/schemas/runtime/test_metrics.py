@@ -74,7 +74,7 @@ def test_without_a_port_nothing_listens() -> None:
         assert address is None
 
 
-def test_a_taken_port_is_said() -> None:
+def test_occupied_port_is_reported() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

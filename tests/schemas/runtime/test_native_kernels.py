@@ -153,7 +153,7 @@ def test_a_kernel_that_allocates_memory_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "library.so").exists()
 
 
-def test_types_are_told_apart_and_parts_become_words() -> None:
+def test_types_are_distinguished_and_parts_become_words() -> None:
     words: list[int] = []
     array = np.zeros((2, 3))
     kind = describe_type((array, (1, 2.0), True), words)
@@ -162,7 +162,7 @@ def test_types_are_told_apart_and_parts_become_words() -> None:
 
 
 @pytest.mark.parametrize("value", [np.zeros((2, 2)).T[:1], np.zeros(4)[::2], "text", 1 << 63])
-def test_a_value_that_no_library_takes_is_refused(value: object) -> None:
+def test_value_without_a_library_type_is_refused(value: object) -> None:
     with pytest.raises(OtherTypesError):
         describe_type(value, [])
 

@@ -65,7 +65,7 @@ def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
 
 
-def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
+def test_kernels_compile_without_optional_libraries() -> None:
     words = (
         "import sys; from schemas.runtime.process import trim_memory, limit_memory; "
         "limit_memory('scipy')\n"

@@ -72,7 +72,7 @@ def test_the_annotations_are_the_fields_and_those_of_a_base_come_first() -> None
     assert record_type(Widest).names == ("first", "second")
 
 
-def test_a_kernel_reads_and_writes_the_rows_it_is_given_and_no_other() -> None:
+def test_kernel_accesses_only_the_given_rows() -> None:
     rows = records(Outer, 4)
     rows["inner"]["level"] = 0.5
     fill_rows(rows, 1, 3)
@@ -82,7 +82,7 @@ def test_a_kernel_reads_and_writes_the_rows_it_is_given_and_no_other() -> None:
     assert rows["table"][2].tolist() == [[0.0] * SIZE, [20.0, 21.0, 22.0]]
 
 
-def test_a_named_tuple_is_put_into_a_row_with_what_it_holds() -> None:
+def test_nested_named_tuple_is_copied_into_a_record() -> None:
     rows = records(Outer, 2)
     put_record(
         rows[1], Outer(True, 7, Inner(0.25, np.arange(3.0)), np.ones((2, SIZE)), np.arange(4))

@@ -55,7 +55,7 @@ def test_a_batch_comes_back_as_it_was_sent(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", Kind)
-def test_the_json_mapping_says_the_same_as_the_bytes(kind: Kind) -> None:
+def test_json_mapping_equals_the_binary_message(kind: Kind) -> None:
     sent = batch(kind)
     message = (pb.ObservationBatch if kind is Kind.OBSERVATION else pb.StateBatch).FromString(
         wire.encode(sent)

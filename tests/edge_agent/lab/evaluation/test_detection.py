@@ -184,7 +184,7 @@ def test_the_oracle_finds_the_friction_of_a_slide_and_not_of_rolling() -> None:
     assert slippery_favoured(calm) < 1.0
 
 
-def test_a_town_goes_through_the_whole_pipeline_and_fills_the_table() -> None:
+def test_simulated_town_fills_the_table_of_results() -> None:
     lines: list[str] = []
     chosen = [
         DetectionTown(FIGURES, "rough", 45.0, 3),

@@ -138,7 +138,7 @@ def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(
     assert found["width"] == pytest.approx([0.25, 0.25])
 
 
-def test_arrival_counts_from_the_change_or_to_the_end_if_it_never_comes(
+def test_arrival_time_counts_from_the_change_or_to_the_end(
     jumping: DriveSet,
 ) -> None:
     assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
@@ -149,7 +149,7 @@ def test_arrival_counts_from_the_change_or_to_the_end_if_it_never_comes(
     assert (measures.arrival(jumping, fake(0.85, 0.7, 0.9, jumping)) > 1.0).all()
 
 
-def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: DriveSet) -> None:
+def test_false_change_is_an_interval_that_stays_away_from_the_truth(jumping: DriveSet) -> None:
     reported = fake(0.85, 0.1, 1.0, jumping)
     assert measures.false_changes(jumping, reported).tolist() == [0.0, 0.0]
     reported.mu_upper[20:30] = 0.3
@@ -158,7 +158,7 @@ def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: Driv
     assert measures.false_changes(jumping, reported).tolist() == [0.0, 1.0]
 
 
-def test_sides_are_told_apart() -> None:
+def test_sides_are_distinguished() -> None:
     batch = realistic(replace(PAPERS["003.split"], duration_s=2.0), range(2))
     found = measures.sides(batch, fake(0.3, 0.2, 0.4, batch))
     assert found["low_error"] == pytest.approx([0.0, 0.0])

@@ -53,7 +53,7 @@ def made_up(*rows: PaperRow) -> Reproduction:
     return done
 
 
-def test_row_holds_or_misses_its_printed_number() -> None:
+def test_row_compares_a_figure_with_its_printed_number() -> None:
     assert HELD.holds
     assert not MISSED.holds
     assert SHOWN.limit is None

@@ -28,7 +28,7 @@ def drives() -> dict[str, PlottedDrive]:
     }
 
 
-def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(
+def test_title_states_manoeuvre_speed_friction_vehicle_and_seed(
     drives: dict[str, PlottedDrive],
 ) -> None:
     said = plots.title("004.dlc", drives["ckf"], 7)

@@ -72,7 +72,7 @@ def test_measured_friction_lies_in_the_interval_or_it_is_wrong(
     ("known", "used", "right"),
     [(0.8, 0.0, 1.0), (1.0, 0.0, 0.0), (None, 0.7, 1.0), (None, 0.9, 0.0)],
 )
-def test_without_it_the_interval_reaches_what_is_known_or_was_used(
+def test_interval_without_median_must_reach_known_or_used_grip(
     known: float | None, used: float, right: float
 ) -> None:
     assert judge(np.nan, known=known, used=used).right == right

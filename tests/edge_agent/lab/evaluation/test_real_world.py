@@ -52,7 +52,7 @@ def figures(driven: tuple[DriveSet, FloatArray], reported: Estimates) -> dict[st
     return tally.means()
 
 
-def test_the_prior_is_always_right_and_never_tells_anything(
+def test_prior_always_covers_and_never_finds_ice(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
     found = figures(driven, saying(driven[0], *PRIOR))
@@ -149,7 +149,7 @@ def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(
     assert real_world.in_use(batch).max() > 0.3
 
 
-def test_cars_stand_on_the_slope_they_were_put_on() -> None:
+def test_cars_stand_still_on_a_slope() -> None:
     batches = real_world.simulate_standing(0.05, range(FIGURES, FIGURES + 3), 2.0)
     assert len(batches) == 6
     for batch in batches:
@@ -160,7 +160,7 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
     assert np.isnan(batches[-1].signals[..., S.TORQUE]).all()
 
 
-def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
+def test_oracle_error_comes_only_from_unknown_parameters() -> None:
     """The oracle is an estimator that knows all true values, except those that the vehicle file and
     the sensors' data sheet leave open. Unknown are for example the errors of wheel radius, tyre
     stiffness and sensor offsets.

@@ -70,9 +70,7 @@ def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
 
 
 @pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
-def test_watching_a_drive_changes_nothing_that_is_said_of_it(
-    estimator: str, turning: DriveSet
-) -> None:
+def test_computing_ranks_does_not_change_the_estimates(estimator: str, turning: DriveSet) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
     reported, ranks = estimate_with_ranks(bank_of(estimator, turning.vehicles), turning)
     assert np.array_equal(plain.values, reported.values)

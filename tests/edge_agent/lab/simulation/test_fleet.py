@@ -184,7 +184,7 @@ def test_warned_driver_slows_down_only_for_the_stretch() -> None:
     assert np.array_equal(free[:75], careful[:75]), "nobody reacts before his reaction time"
 
 
-def test_where_a_driver_will_go_is_where_he_goes() -> None:
+def test_predicted_path_of_a_driver_is_the_driven_one() -> None:
     fleet = SimulatedFleet("demo", 3, 3, 50.0)
     fleet.step(100)
     routes = [fleet.scenario.from_latlon(*fleet.route_ahead(k, 200.0)) for k in range(3)]

@@ -172,7 +172,7 @@ def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float)
     assert (circles[1][1] - circles[0][1]) * share > 0.0
 
 
-def test_driving_goes_forward_and_loads_the_rear() -> None:
+def test_acceleration_moves_forward_and_loads_the_rear() -> None:
     x, p, u = rolling(10.0, 0.9)
     command(p, u, 0.0, 4000.0)
     w = run(x, p, u, 1.0)

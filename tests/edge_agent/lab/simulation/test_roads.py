@@ -52,7 +52,7 @@ def test_every_lane_joins_the_next_without_a_gap_or_a_kink(scenario: Scenario) -
 
 
 @EVERY
-def test_from_every_lane_one_comes_back_to_it(scenario: Scenario) -> None:
+def test_every_lane_can_be_reached_again_from_itself(scenario: Scenario) -> None:
     network = scenario.network
     for begin in range(network.roads):
         seen: set[int] = set()

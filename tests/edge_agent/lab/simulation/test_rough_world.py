@@ -330,7 +330,7 @@ def test_misalignments_are_independent_with_the_sizes_of_the_table() -> None:
     assert rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max() > 0.9 * whole.lag_s
 
 
-def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None:
+def test_wheel_speed_is_zero_at_standstill_and_quantised_in_motion() -> None:
     log, _ = simulate_manoeuvre(
         "stop-and-go", seed=3, setup=DriveSetup(sensors="rough-coarse", road="hilly")
     )

@@ -48,7 +48,7 @@ def test_hashed_numbers_are_normal_and_uniform_and_streams_are_unrelated() -> No
     assert ((u > 0) & (u < 1)).all()
 
 
-def test_ideal_sensors_say_the_truth() -> None:
+def test_ideal_sensors_measure_the_true_values() -> None:
     log, vehicle = simulate_manoeuvre("sine", setup=DriveSetup(sensors="ideal"))
     for name in ("ax", "ay", "yaw_rate"):
         np.testing.assert_array_equal(error(log, name), 0.0)

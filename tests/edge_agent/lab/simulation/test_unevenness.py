@@ -31,7 +31,7 @@ def swings(surface: FloatArray, speed: float, heading: float = 0.0) -> FloatArra
     return np.array([load_swing(surface, (cos * s, sin * s), velocity) for s in run.tolist()])
 
 
-def test_a_level_road_leaves_load_and_radius_as_they_are() -> None:
+def test_level_road_changes_neither_load_nor_radius() -> None:
     assert load_swing(Relief().surface_table, (3.0, 4.0), (20.0, 0.0)) == 0.0
     assert radius_change(0.0) == 0.0
 

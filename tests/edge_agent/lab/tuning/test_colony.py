@@ -136,7 +136,7 @@ def test_a_converged_colony_still_finds_new_paths() -> None:
     assert np.all(np.diff(late) > 0)
 
 
-def test_same_seed_gives_the_same_result_and_another_seed_another_way() -> None:
+def test_result_depends_only_on_the_seed() -> None:
     first, again, other = (run(colony, decoy(7), seed) for seed in (11, 11, 12))
     np.testing.assert_array_equal(first.best, again.best)
     assert first.history == again.history

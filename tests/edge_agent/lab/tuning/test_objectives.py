@@ -262,12 +262,12 @@ def test_table_has_a_row_per_way_and_set_of_drives() -> None:
     assert [row.split()[0] for row in rows] == [way for way in WAYS for _ in range(2)]
 
 
-def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None:
+def test_other_drive_gives_another_score(drives: TuningSet) -> None:
     other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
     assert scores_of(Memberships(), other, ESTIMATOR) != scores_of(Memberships(), drives, ESTIMATOR)
 
 
-def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
+def test_tuning_can_use_the_users_own_drives(tmp_path: Path) -> None:
     """A user's recorded drives, in which the true friction is unknown, must be usable for tuning.
     The fuzzy sets are then scored by how well the filter predicts the next measurement, on the last
     third of the recordings.

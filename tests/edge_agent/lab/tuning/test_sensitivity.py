@@ -33,7 +33,9 @@ def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.Judg
     assert changes[0].effect > sensitivity.SMALL
 
 
-def test_a_filter_measured_twice_gives_the_same(drives: list[sensitivity.JudgedDrives]) -> None:
+def test_repeated_measurement_of_a_filter_gives_the_same_result(
+    drives: list[sensitivity.JudgedDrives],
+) -> None:
     usual = design_of(shipped_memberships(worth.ESTIMATOR), adaptive=True)
     assert sensitivity.measure(usual, drives) == sensitivity.measure(usual, drives)
 

@@ -59,7 +59,7 @@ def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: Stud
     )
 
 
-def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
+def test_conditions_state_the_assumed_noise_of_the_filter() -> None:
     scales = [
         study.filter_setting(CONDITIONS[name]).noise[0] / VARIANCE
         for name in ("right", "too-small", "too-large")

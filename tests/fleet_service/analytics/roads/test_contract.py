@@ -52,7 +52,7 @@ def test_a_breach_runs_from_the_first_slot_below_to_the_next_that_is_not() -> No
     assert begin == 11 * SLOT_S
 
 
-def test_between_two_measurements_nobody_knows() -> None:
+def test_friction_between_two_measurements_is_unknown() -> None:
     far = 20 + GAP_S // SLOT_S
     by_mean, least, most, _ = measure_contract((10, 0.8), (20, 0.2), (far + 1, 0.2), (far + 9, 0.8))
     assert least == SLOT_S, "two breaches, surely"
@@ -72,7 +72,7 @@ def test_before_the_first_and_after_the_last_measurement_it_is_unknown() -> None
     assert measure_contract((5, 0.8), (6, 0.8))[:3] == (0, 0, 0)
 
 
-def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
+def test_interval_of_a_slot_has_its_stated_coverage() -> None:
     rng = np.random.default_rng(11)
     truth = 0.5
     std = 0.08
@@ -87,7 +87,7 @@ def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
 
 
 @pytest.mark.campaign
-def test_each_link_that_froze_is_told_and_no_other(
+def test_contract_lists_exactly_the_links_with_readings(
     asked: Ask, links: Path, rows: pd.DataFrame
 ) -> None:
     found = asked("contract", roads=links, level=LEVEL, within_s=1.0 * HOUR).to_pandas()
@@ -156,7 +156,7 @@ def test_roads_elsewhere_are_reported(asked: Ask, links: Path, tmp_path: Path) -
     assert b"no measured friction lies on a road of" in found.schema.metadata[b"said"]
 
 
-def test_the_command_asks_it_of_an_archive(
+def test_contract_command_reads_an_archive(
     archive: Path, links: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [
@@ -193,7 +193,7 @@ def test_the_command_asks_it_of_an_archive(
         (["grip", "--roads", "a"], "roads"),
     ],
 )
-def test_options_that_say_nothing_are_refused(
+def test_invalid_options_of_a_contract_are_refused(
     words: list[str], field: str, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["analyze", *words, "--archive", str(archive)]) == 2

@@ -63,7 +63,7 @@ def frame_of(*roads: list[DirectedLink]) -> pd.DataFrame:
     return found
 
 
-def test_the_sector_tells_the_direction_of_a_road_with_two() -> None:
+def test_sector_distinguishes_the_two_directions_of_a_road() -> None:
     frame = frame_of(road("a", (0, 0), (500, 0)))
     assert on(frame, 250, -3, 0) == [("a", "forward")]
     assert on(frame, 250, 3, 2) == [("a", "backward")]
@@ -71,7 +71,7 @@ def test_the_sector_tells_the_direction_of_a_road_with_two() -> None:
     assert not on(frame, 250, REACH_M + 15, 0)
 
 
-def test_at_a_crossing_the_heading_decides_and_beside_it_the_distance() -> None:
+def test_heading_decides_at_a_crossing_and_distance_elsewhere() -> None:
     frame = frame_of(road("east", (-300, 0), (300, 0)), road("north", (0, -300), (0, 300)))
     assert on(frame, 0, 0, 0) == [("east", "forward")]
     assert on(frame, 0, 0, 1) == [("north", "forward")]

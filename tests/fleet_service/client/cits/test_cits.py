@@ -414,7 +414,7 @@ def test_batches_of_an_event_are_numbered_and_short() -> None:
     assert all(batch["first_held"] == batch["seq"] for batch in batches)
 
 
-def test_a_denm_that_says_nothing_about_grip_makes_no_report() -> None:
+def test_denm_without_grip_makes_no_report() -> None:
     denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE, heading=0.0)
     said = json.loads(encode_reports(denm, "cits-se", 5, 1, START)[0][1])
     assert said["mu"] == [0.12]
