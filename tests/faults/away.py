@@ -116,70 +116,102 @@ def run(site: Site) -> list[Figure]:
         return _run_outage(site, engine)
 
 
-def _run_outage(site: Site, engine: Engine) -> list[Figure]:
-    cars = site.choose_amount(20, 2)
-    away_s = site.choose_amount(3600, 600)
-    outboxes = [Outbox(site.folder / f"{n}.sqlite", boot=n + 1) for n in range(cars)]
-    service = Made(cars, engine)
-    made = 0
-    now = 0.0
-    cells = set[int]()
-    stored = 0
+class Cars:
+    """Simulated cars with their outboxes, which send reports to a simulated service.
 
-    def advance_step(driving: bool) -> int:
-        nonlocal made, now, stored
-        for n, outbox in enumerate(outboxes):
-            fresh = []
-            if driving:
-                draft, cell = _make_draft(n, now)
-                cells.add(cell)
-                fresh = outbox.store([draft], now)
-            made += sum(len(batch.payload) for batch in fresh)
-            stored += len(fresh)
-            for one in [one for one in fresh if one.fresh] + outbox.due_batches(now, 640):
-                service.put(one)
-        now += STEP_S
-        before = engine.counts.observations
-        for vehicle, ack in service.store_queued(now):
+    Attributes:
+        now: simulated time since the start [s].
+        stored: number of batches that the cars have stored.
+        made: bytes of these batches.
+        cells: cells that the cars have visited.
+    """
+
+    def __init__(self, count: int, site: Site, service: Made) -> None:
+        self._outboxes = [Outbox(site.folder / f"{n}.sqlite", boot=n + 1) for n in range(count)]
+        self._service = service
+        self.now = 0.0
+        self.stored = 0
+        self.made = 0
+        self.cells = set[int]()
+
+    @property
+    def held(self) -> int:
+        """Return the number of batches that the cars hold, because they are not acknowledged."""
+        return sum(len(outbox.held) for outbox in self._outboxes)
+
+    def advance(self, seconds: float, driving: bool = True) -> None:
+        """Advance the simulation by `seconds`. Cars that do not drive make no new batches."""
+        for _ in range(math.ceil(seconds / STEP_S)):
+            self.advance_step(driving)
+
+    def advance_step(self, driving: bool = True) -> int:
+        """Advance the simulation by STEP_S. Return the number of observations that the service has
+        accepted in this time.
+        """
+        for car, outbox in enumerate(self._outboxes):
+            fresh = self._store_reports(car, outbox) if driving else []
+            for one in [one for one in fresh if one.fresh] + outbox.due_batches(self.now, 640):
+                self._service.put(one)
+        self.now += STEP_S
+        counts = self._service.engine.counts
+        before = counts.observations
+        for vehicle, ack in self._service.store_queued(self.now):
             for stream in wire.decode_ack(ack)[1]:
                 found = Stream(vehicle, stream.boot, stream.kind, stream.region)
-                outboxes[int(vehicle.removeprefix("car-"))].settle_ranges(found, stream.durable)
-        return engine.counts.observations - before
+                outbox = self._outboxes[int(vehicle.removeprefix("car-"))]
+                outbox.settle_ranges(found, stream.durable)
+        return counts.observations - before
 
-    def advance_seconds(seconds: float, driving: bool = True) -> list[int]:
-        return [advance_step(driving) for _ in range(math.ceil(seconds / STEP_S))]
+    def _store_reports(self, car: int, outbox: Outbox) -> list[StoredBatch]:
+        draft, cell = _make_draft(car, self.now)
+        self.cells.add(cell)
+        fresh = outbox.store([draft], self.now)
+        self.stored += len(fresh)
+        self.made += sum(len(batch.payload) for batch in fresh)
+        return fresh
 
-    advance_seconds(60)
+    def close(self) -> None:
+        """Close the outboxes."""
+        for outbox in self._outboxes:
+            outbox.close()
+
+
+def _run_outage(site: Site, engine: Engine) -> list[Figure]:
+    count = site.choose_amount(20, 2)
+    away_s = site.choose_amount(3600, 600)
+    service = Made(count, engine)
+    cars = Cars(count, site, service)
+    cars.advance(60)
     before = service.messages
     service.up = False
-    advance_seconds(away_s)
+    cars.advance(away_s)
     while_away = service.messages - before
-    backlog = sum(len(outbox.held) for outbox in outboxes)
+    backlog = cars.held
     service.up = True
-    taken: list[int] = []
-    while sum(len(outbox.held) for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
-        taken.append(advance_step(driving=True))
-    advance_seconds(30, driving=False)
-    lost = abs(stored - engine.counts.observations)
-    left = sum(len(outbox.held) for outbox in outboxes)
-    for outbox in outboxes:
-        outbox.close()
-    # From now on vehicles have noticed that the service is back.
-    begun = next((at for at, n in enumerate(taken) if n > cars), 0)
-    drain = sum(taken[begun:]) / max(len(taken) - begun, 1) / (TAKEN_PER_S * STEP_S * cars)
+    accepted: list[int] = []
+    while cars.held > QUEUED * count and cars.now < 4 * away_s:
+        accepted.append(cars.advance_step())
+    cars.advance(30, driving=False)
+    lost = abs(cars.stored - engine.counts.observations)
+    left = cars.held
+    cars.close()
+    # From this step on, vehicles have noticed that the service is back.
+    noticed = next((step for step, n in enumerate(accepted) if n > count), 0)
+    mean = sum(accepted[noticed:]) / max(len(accepted) - noticed, 1)
+    drain = mean / (TAKEN_PER_S * STEP_S * count)
     site.say(
         f"{backlog} batches waited; {while_away} messages while away; drained in "
-        f"{len(taken) * STEP_S:.0f} s"
+        f"{len(accepted) * STEP_S:.0f} s"
     )
     return [
-        make_figure("faults.away.bytes_ratio", service.sent / made),
+        make_figure("faults.away.bytes_ratio", service.sent / cars.made),
         make_figure("faults.away.lost", lost + left),
         make_figure("faults.away.drain_share", drain),
-        make_figure("faults.away.backlog", backlog / cars),
-        make_figure("faults.away.map_missing", len(cells - _list_shown_cells(engine))),
+        make_figure("faults.away.backlog", backlog / count),
+        make_figure("faults.away.map_missing", len(cars.cells - _list_shown_cells(engine))),
         make_figure("faults.away.late", engine.counts.late),
-        Figure("faults.away.messages_while_away", while_away / cars, "messages a car"),
-        Figure("faults.away.noticed_s", begun * STEP_S, "s until cars go fast again"),
+        Figure("faults.away.messages_while_away", while_away / count, "messages a car"),
+        Figure("faults.away.noticed_s", noticed * STEP_S, "s until cars go fast again"),
     ]
 
 
