@@ -10,6 +10,7 @@ must have all acknowledged rows exactly once.
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import statistics
 import time
@@ -17,7 +18,7 @@ from collections import defaultdict
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from deploy.router import open_router
 from fleet_service.archive.format import reading
@@ -44,6 +45,7 @@ from tests.faults.cluster_stage import (
     write_town_archive,
 )
 from tests.faults.frame import Campaign, Site, run_and_exit, run_campaigns
+from tests.faults.processes import Part
 from tests.standbys import open_hosts, restore_archive
 from tests.waiting import until
 
@@ -87,87 +89,119 @@ OWES: Final = (
 )
 
 
+class Course(NamedTuple):
+    """Course of a campaign.
+
+    Attributes:
+        happened: failovers in which a standby took over.
+        pauses: pauses of service [s] during planned hand-overs.
+        differences: differences of the map before and after planned hand-overs.
+    """
+
+    happened: list[Failover]
+    pauses: list[float]
+    differences: list[float]
+
+
 def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
     """Run `failovers` failovers of all kinds in turn, and return the figures about losses, takeover
     times and pauses.
     """
-    random_ = random.Random(site.seed)
-    happened: list[Failover] = []
-    pauses = []
-    differences = []
     with ExitStack() as stack:
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
         bucket = stack.enter_context(bucket_server(site.folder / "objects"))
-        module = "tests.faults.cluster_service"
-        names = ["one", "two", "three"]
-        there = stack.enter_context(
+        hosts = stack.enter_context(
             open_hosts(
                 site.folder,
-                names,
+                ["one", "two", "three"],
                 endpoint,
                 bucket,
-                module=module,
+                module="tests.faults.cluster_service",
                 named=True,
                 lease_s=lease_s,
                 **PERIODS,
             )
         )
-        box = write_town_archive(there[0].root)
-        there[0].part.start()
-        until(lambda: there[0].has_said("ready: "), PATIENCE_S)
-        cells = int(there[0].part.line_with("ready: ").split(", ")[1].split()[0])
+        box = write_town_archive(hosts[0].root)
+        hosts[0].part.start()
+        until(lambda: hosts[0].has_said("ready: "), PATIENCE_S)
+        cells = int(hosts[0].part.line_with("ready: ").split(", ")[1].split()[0])
         site.say(f"{cells} cells")
-        parts = start_loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
-        for part in parts:
-            stack.callback(part.kill)
-        machines = Machines(
-            there, bucket.path_of("lease"), lease_s, Journals(part.log for part in parts), random_
-        )
+        loads = start_loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
+        for load in loads:
+            stack.callback(load.kill)
+        random_ = random.Random(site.seed)
+        journals = Journals(load.log for load in loads)
+        machines = Machines(hosts, bucket.path_of("lease"), lease_s, journals, random_)
         asking = Asking(endpoint, box, site.say)
-        ways = list(WAYS)
-        router_of = ZenohSettings(connect=[endpoint])
+        course = Course([], [], [])
+        settings = ZenohSettings(connect=[endpoint])
         for number in range(failovers):
-            way = ways[number % len(ways)]
-            machines.start_standbys(2 if way == TWO else 1)
+            machines.start_standbys(2 if _way_of(number) == TWO else 1)
             time.sleep(random_.uniform(*HOLD_S))
-            found = machines.fail_over(way)
-            happened += [found] if found else []
-            told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
-            site.say(
-                f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that "
-                "nobody serves"
-            )
-            if number % EVERY == EVERY // 2 - 1:
-                machines.start_standbys(1)
-                pauses.append(machines.pause_s(router_of))
-                site.say(f"handed over, a pause of {pauses[-1]:.1f} s")
-            if number % EVERY == EVERY - 1:
-                machines.start_standbys(1)
-                differences.append(machines.map_difference(router_of, parts))
-                site.say(f"handed over, the map differs by {differences[-1]:g}")
+            _fail_over(number, course, machines, asking, site)
+            _hand_over(number, course, machines, loads, settings, site)
         asking.end()
-        drain_loads(parts)
-        seen = machines.stop_all()
-        rows = [rows_of(host.root) for host in seen]
-        census = [compare_with_archive([part.log for part in parts], host.root) for host in seen]
-        empty = restore_archive(site.folder / "empty", bucket)
-        rows.append(rows_of(empty))
-        census.append(compare_with_archive([part.log for part in parts], empty))
+        drain_loads(loads)
+        roots = [host.root for host in machines.stop_all()]
+        roots.append(restore_archive(site.folder / "empty", bucket))
+        rows = [rows_of(root) for root in roots]
+        census = [compare_with_archive([load.log for load in loads], root) for root in roots]
     site.say(f"rows {rows}; {census}")
+    handovers = len(course.pauses) + len(course.differences)
     return [
-        *_make_figures(failovers, happened, census),
-        *_make_median_figures(happened),
+        *_make_figures(failovers, course.happened, census),
+        *_make_median_figures(course.happened),
         *ack_p50_s(),
-        make_figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
-        make_figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
-        _make_figure(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
+        make_figure("cluster.handover.pause_s", max(course.pauses, default=math.nan)),
+        make_figure("cluster.handover.map_difference", max(course.differences, default=math.nan)),
+        _make_figure(failovers, "cluster.handovers", handovers, "hand-overs"),
         make_figure("cluster.cells", cells),
         make_figure("cluster.silent_regions", asking.silent),
         make_figure("cluster.unserved_answers", asking.unserved),
         make_figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
         make_figure("cluster.empty_disk.rows", rows[-1]),
     ]
+
+
+def _fail_over(number: int, course: Course, machines: Machines, asking: Asking, site: Site) -> None:
+    """Let the active service fail in the way of failover `number`, and add the result to the
+    course.
+    """
+    found = machines.fail_over(_way_of(number))
+    course.happened.extend([found] if found else [])
+    told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
+    site.say(
+        f"{len(course.happened)} of {number + 1}: {told}; {asking.unserved} answers say that "
+        "nobody serves"
+    )
+
+
+def _hand_over(
+    number: int,
+    course: Course,
+    machines: Machines,
+    loads: list[Part],
+    settings: ZenohSettings,
+    site: Site,
+) -> None:
+    """Hand the region over to a standby in the middle and at the end of each group of EVERY
+    failovers, and add the measured pause or difference of the map to the course.
+    """
+    if number % EVERY == EVERY // 2 - 1:
+        machines.start_standbys(1)
+        course.pauses.append(machines.pause_s(settings))
+        site.say(f"handed over, a pause of {course.pauses[-1]:.1f} s")
+    if number % EVERY == EVERY - 1:
+        machines.start_standbys(1)
+        course.differences.append(machines.map_difference(settings, loads))
+        site.say(f"handed over, the map differs by {course.differences[-1]:g}")
+
+
+def _way_of(number: int) -> str:
+    """Return the kind of failure of failover `number`; all kinds follow each other in turn."""
+    return list(WAYS)[number % len(WAYS)]
 
 
 def rows_of(root: Path) -> int:

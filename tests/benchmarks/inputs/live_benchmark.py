@@ -173,67 +173,68 @@ def count_crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
     An agent fails if it does not report the loss or the return of its source, or does not end
     correctly.
     """
-    vehicle = folder / "car.json"
-    vehicle.write_text(
-        Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True)
+    vehicle = Vehicle.model_validate(PRESETS["sedan"].vehicle)
+    (folder / "car.json").write_text(vehicle.model_dump_json(exclude_none=True))
+    kinds = (*COUNTED, "gpsd")
+    failures = [_kill_source(kind, folder, kills) for kind in kinds]
+    return [failure for failure in failures if failure is not None], kills * len(kinds)
+
+
+def _kill_source(kind: str, folder: Path, kills: int) -> str | None:
+    """Start an agent that reads a source of the given kind, and kill this source `kills` times.
+    Return a message if the agent failed, else None.
+    """
+    place, source = peer_addresses(kind)
+    (port,) = free_ports(1)
+    agent = subprocess.Popen(
+        [sys.executable, "-m", "edge_agent.cli", *_agent_arguments(kind, source, port, folder)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
     )
-    bad: list[str] = []
-    losses = 0
-    for kind in (*COUNTED, "gpsd"):
-        place, source = peer_addresses(kind)
-        name, dbc = write_profile("can" if kind == "gpsd" else kind, folder)
-        config = folder / f"{kind}.agent.json"
-        (port,) = free_ports(1)
-        settings = {
-            "spool": str(folder / f"{kind}.sqlite"),
-            "estimator": "ckf",
-            "metrics_port": port,
-        }
-        config.write_text(
-            json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **settings}), encoding="utf-8"
-        )
-        words = [
-            "run",
-            "--source",
-            source,
-            "--profile",
-            name,
-            "--vehicle",
-            str(vehicle),
-            "--name",
-            "car-one",
-        ]
-        words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
-        if kind == "gpsd":  # gpsd sends only positions, so a CAN source is added
-            words += ["--source", peer_addresses("can")[1]]
-        command = [sys.executable, "-m", "edge_agent.cli"]
-        agent = subprocess.Popen(
-            [*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
-        )
-        missed = (
-            []
-            if _shows_silence(agent, port, source, silent=True, patience_s=START_S)
-            else ["no source at the start"]
-        )
-        for kill in range(kills):
-            with run_peer(kind, place, 100_000) as running:
-                running.send_go()
-                running.wait_for("ready")
-                running.send_go()
-                if not _shows_silence(agent, port, source, silent=False):
-                    missed.append(f"return {kill + 1}")
-            losses += 1
-            if not _shows_silence(agent, port, source, silent=True):
-                missed.append(f"loss {kill + 1}")
-        agent.terminate()
-        output, _ = agent.communicate(timeout=PATIENCE_S)
-        if missed or agent.returncode or not output.strip().endswith("}"):
-            unseen = f"did not notice {', '.join(missed)}" if missed else "noticed every change"
-            bad.append(
-                f"{kind}: the agent {unseen}, exited with code {agent.returncode}, and printed "
-                f"{output[-200:]!r}"
-            )
-    return bad, losses
+    missed = []
+    if not _shows_silence(agent, port, source, silent=True, patience_s=START_S):
+        missed.append("no source at the start")
+    for kill in range(kills):
+        with run_peer(kind, place, 100_000) as running:
+            running.send_go()
+            running.wait_for("ready")
+            running.send_go()
+            if not _shows_silence(agent, port, source, silent=False):
+                missed.append(f"return {kill + 1}")
+        if not _shows_silence(agent, port, source, silent=True):
+            missed.append(f"loss {kill + 1}")
+    agent.terminate()
+    output, _ = agent.communicate(timeout=PATIENCE_S)
+    if not missed and not agent.returncode and output.strip().endswith("}"):
+        return None
+    unseen = f"did not notice {', '.join(missed)}" if missed else "noticed every change"
+    return (
+        f"{kind}: the agent {unseen}, exited with code {agent.returncode}, and printed "
+        f"{output[-200:]!r}"
+    )
+
+
+def _agent_arguments(kind: str, source: str, port: int, folder: Path) -> list[str]:
+    """Write the configuration of an agent that reads `source` and shows its metrics at `port`.
+    Return the arguments of its command.
+    """
+    profile, dbc = write_profile("can" if kind == "gpsd" else kind, folder)
+    config = folder / f"{kind}.agent.json"
+    settings = {
+        "zenoh": {"connect": ["tcp/127.0.0.1:9"]},
+        "spool": str(folder / f"{kind}.sqlite"),
+        "estimator": "ckf",
+        "metrics_port": port,
+    }
+    config.write_text(json.dumps(settings), encoding="utf-8")
+    words = ["run", "--source", source, "--profile", profile, "--name", "car-one", "--trust"]
+    words += ["--vehicle", str(folder / "car.json"), "--config", str(config)]
+    if dbc:
+        words += ["--dbc", str(dbc)]
+    if kind == "gpsd":  # gpsd sends only positions, so a CAN source is added
+        words += ["--source", peer_addresses("can")[1]]
+    return words
 
 
 def _shows_silence(
