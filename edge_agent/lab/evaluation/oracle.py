@@ -109,6 +109,34 @@ def speed(seeds: Sequence[int]) -> FloatArray:
     return np.array([_oracle_speed_rmse(oracle_signals, n, rho) for n, rho in enumerate(known)])
 
 
+class _Regression(NamedTuple):
+    """Readings of one drive as linear functions of the oracle's unknowns: left = table · unknowns,
+    for a_y (`across`) and a_x (`along`) at each of T samples [m/s²].
+
+    Unknowns, in the order of `_PRIOR_STD`: error of the wheel radius, roll leak, lag of the roll
+    leak, cornering stiffness, offset of a_y, pitch leak, offset of a_x.
+    """
+
+    across: FloatArray  # (T,)
+    across_table: FloatArray  # (T, 7)
+    along: FloatArray  # (T,)
+    along_table: FloatArray  # (T, 7)
+
+
+_WHITE_STD, _OFFSET_STD = SENSORS[USUAL].acceleration
+_PRIOR_STD: Final = np.array(
+    [
+        KNOWN["wheel_radius"],
+        ROLL_LEAK_STD,
+        ROLL_LAG_STD,
+        KNOWN["cornering_stiffness"],
+        _OFFSET_STD,
+        PITCH_LEAK_STD,
+        _OFFSET_STD,
+    ]
+)
+
+
 def _oracle_speed_rmse(signals: OracleSignals, n: int, rho: float) -> float:
     """Return the RMSE of the oracle's speed for drive n [m/s].
 
@@ -117,10 +145,39 @@ def _oracle_speed_rmse(signals: OracleSignals, n: int, rho: float) -> float:
     wheel speeds by its estimate.
     """
     batch = signals.batch
-    car = PAPERS["002.sine"].vehicle
-    v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))
-    dt = float(batch.t[1, n] - batch.t[0, n])
+    v = batch.truth["true_vx"][:, n]
     wheels = (1.0 + rho) * v
+    dt = float(batch.t[1, n] - batch.t[0, n])
+    regression = _make_regression(signals, n, wheels, dt)
+    stretch = round(STRETCH_S / dt)
+    information = np.diag(_PRIOR_STD**-2)
+    vector = np.zeros(len(_PRIOR_STD))
+    error = np.empty(len(v))
+    estimate = 0.0
+    for first in range(0, len(v), round(1.0 / dt)):
+        now = slice(first, first + round(1.0 / dt))
+        error[now] = wheels[now] / (1.0 + estimate) - v[now]
+        starts = range(now.start, min(now.stop, len(v)) - stretch + 1, stretch)
+        table = np.stack([regression.along_table[k : k + stretch].mean(axis=0) for k in starts])
+        along = np.array([regression.along[k : k + stretch].mean() for k in starts])
+        root = np.sqrt(stretch)
+        rows = np.concatenate([regression.across_table[now], root * table]) / _WHITE_STD
+        readings = np.concatenate([regression.across[now], root * along]) / _WHITE_STD
+        information = information + rows.T @ rows
+        vector = vector + rows.T @ readings
+        estimate = float(np.linalg.solve(information, vector)[0])
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def _make_regression(signals: OracleSignals, n: int, wheels: FloatArray, dt: float) -> _Regression:
+    """Return the linear equations of drive n. `wheels` (T,) is the speed of the wheels [m/s] with
+    the nominal radius, and `dt` the time between samples [s].
+    """
+    batch = signals.batch
+    car = PAPERS["002.sine"].vehicle
+    v = batch.truth["true_vx"][:, n]
+    vy = batch.truth["true_vy"][:, n]
+    r = batch.truth["true_yaw_rate"][:, n]
     slipping = vy - car.vehicle.cg_to_rear_axle * r
     across = batch.signals[:, n, S.AY] - signals.body_acceleration[:, 1] + (v - wheels) * r
     along = (
@@ -129,39 +186,13 @@ def _oracle_speed_rmse(signals: OracleSignals, n: int, rho: float) -> float:
     none = np.zeros_like(v)
     one = np.ones_like(v)
     rolling = (signals.rolled, car.roll_leak * np.gradient(signals.rolled, dt))
-    sideways = np.stack([-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1)
-    ahead = np.stack(
+    across_table = np.stack(
+        [-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1
+    )
+    along_table = np.stack(
         [-np.gradient(wheels, dt), none, none, r * slipping, none, signals.pitched, one], axis=1
     )
-    white, offset = SENSORS[USUAL].acceleration
-    std = np.array(
-        [
-            KNOWN["wheel_radius"],
-            ROLL_LEAK_STD,
-            ROLL_LAG_STD,
-            KNOWN["cornering_stiffness"],
-            offset,
-            PITCH_LEAK_STD,
-            offset,
-        ]
-    )
-    stretch = round(STRETCH_S / dt)
-    information = np.diag(std**-2)
-    vector = np.zeros(len(std))
-    off = np.empty(len(v))
-    estimate = 0.0
-    for first in range(0, len(v), round(1.0 / dt)):
-        now = slice(first, first + round(1.0 / dt))
-        off[now] = wheels[now] / (1.0 + estimate) - v[now]
-        starts = range(now.start, min(now.stop, len(v)) - stretch + 1, stretch)
-        long = np.stack([ahead[k : k + stretch].mean(axis=0) for k in starts])
-        measured = np.array([along[k : k + stretch].mean() for k in starts])
-        rows = np.concatenate([sideways[now], np.sqrt(stretch) * long]) / white
-        readings = np.concatenate([across[now], np.sqrt(stretch) * measured]) / white
-        information = information + rows.T @ rows
-        vector = vector + rows.T @ readings
-        estimate = float(np.linalg.solve(information, vector)[0])
-    return float(np.sqrt(np.mean(off**2)))
+    return _Regression(across, across_table, along, along_table)
 
 
 def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:

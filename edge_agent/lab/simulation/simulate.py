@@ -219,7 +219,9 @@ def _drive_manoeuvre(
     dt = 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     across = cross_slope(world.relief, 0.0)
-    steer = force = lost = 0.0
+    steer = 0.0  # [rad] steering angle, which lags behind the driver's wish
+    force = 0.0  # [N] pedal force
+    lost = 0.0  # [m] integral of the speed error over time
     currents = at_rest()
     for k in range(samples):
         east, north = gradient(world.relief, (x[Motion.X], x[Motion.Y]), (1.0, 0.0), across)
@@ -248,14 +250,21 @@ def _drive_manoeuvre(
                     currents[i], truth.motors, demanded_torque, float(x[Motion.OMEGA + i]), dt
                 )
                 u[Control.BRAKE, i] = 0.0
-        velocity = ground_velocity(x)
-        for i in range(4):
-            place = wheel_place(x, p, i)
-            u[Control.MU, i] = world.friction(k * dt, *place)
-            u[Control.SWING, i] = load_swing(world.surface, place, velocity)
+        _set_road(x, p, u, world, k * dt)
         observe(x, p, u, w, records[k])
         advance(x, p, u, w, dt / substeps, substeps)
     return records
+
+
+def _set_road(x: FloatArray, p: FloatArray, u: FloatArray, world: ProvingGround, t: float) -> None:
+    """Write to the controls `u` the friction and the load swing of the road under each wheel at the
+    time t [s]. `x` is the state of the car, and `p` its parameters.
+    """
+    velocity = ground_velocity(x)
+    for i in range(4):
+        place = wheel_place(x, p, i)
+        u[Control.MU, i] = world.friction(t, *place)
+        u[Control.SWING, i] = load_swing(world.surface, place, velocity)
 
 
 def _moment_of(t: float, x: FloatArray, speed: float) -> Moment:
