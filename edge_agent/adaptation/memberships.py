@@ -65,6 +65,12 @@ SHARE_REACH = 1.5  # [nat] largest change of `shares` and `strained` by an optim
 CLOSEST = 0.01  # [1] smallest distance of neighbouring peaks, and smallest overlap of two sets
 
 
+def _require(is_valid: bool | np.bool_, field: str, problem: str, fix: str) -> None:
+    """Raise an InputError about a field of the memberships if it is not valid."""
+    if not is_valid:
+        raise InputError(f"memberships.{field}", problem, fix)
+
+
 @dataclass(frozen=True)
 class Memberships:
     """Vertices (corners) of the fuzzy sets, and the scales of measurement noise that are tuned with
@@ -99,54 +105,40 @@ class Memberships:
     def __post_init__(self) -> None:
         for name, length in LENGTHS.items():
             value = np.asarray(getattr(self, name), float)
-            if value.shape != (length,) or not np.isfinite(value).all():
-                raise InputError(
-                    f"memberships.{name}", "not a list of finite numbers", f"give {length} numbers"
-                )
-        if (
-            np.any(np.diff(self.inputs) < CLOSEST)
-            or self.inputs[0] < -1.0
-            or self.inputs[-1] > LARGEST_MISMATCH
-        ):
-            raise InputError(
-                "memberships.inputs",
-                "not rising inside the range of the mismatch",
-                f"order them in [-1, {LARGEST_MISMATCH:g}]",
-            )
-        if np.any(np.diff(self.outputs) < 0.0) or max(map(abs, self.outputs)) > LARGEST_STEP:
-            raise InputError(
-                "memberships.outputs",
-                "not rising within a step: R must grow where the actual innovation exceeds the "
-                "theoretical",
-                f"order them in [-{LARGEST_STEP:g}, {LARGEST_STEP:g}]",
-            )
-        if self.outputs[0] > 0.0 or self.outputs[-1] < 0.0:
-            raise InputError(
-                "memberships.outputs",
-                "must shrink R at one end and grow it at the other",
-                "bracket zero",
-            )
-        if max(map(abs, self.ln_scales)) > LARGEST_SCALE:
-            raise InputError(
-                "memberships.ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat"
-            )
+            is_complete = value.shape == (length,) and np.isfinite(value).all()
+            _require(is_complete, name, "not a list of finite numbers", f"give {length} numbers")
+        _require(
+            np.all(np.diff(self.inputs) >= CLOSEST)
+            and self.inputs[0] >= -1.0
+            and self.inputs[-1] <= LARGEST_MISMATCH,
+            "inputs",
+            "not rising inside the range of the mismatch",
+            f"order them in [-1, {LARGEST_MISMATCH:g}]",
+        )
+        _require(
+            np.all(np.diff(self.outputs) >= 0.0) and max(map(abs, self.outputs)) <= LARGEST_STEP,
+            "outputs",
+            "not rising within a step: R must grow where the actual innovation exceeds the "
+            "theoretical",
+            f"order them in [-{LARGEST_STEP:g}, {LARGEST_STEP:g}]",
+        )
+        _require(
+            self.outputs[0] <= 0.0 <= self.outputs[-1],
+            "outputs",
+            "must shrink R at one end and grow it at the other",
+            "bracket zero",
+        )
+        is_in_range = max(map(abs, self.ln_scales)) <= LARGEST_SCALE
+        _require(is_in_range, "ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat")
         for name in RAMPS:
             foot, peak = getattr(self, name)
-            if not 0.0 <= foot <= peak - CLOSEST:
-                raise InputError(
-                    f"memberships.{name}",
-                    "is not increasing",
-                    f"give a foot and a peak {CLOSEST:g} above it",
-                )
-        if min(self.consequents) < 0.0 or max(self.consequents) > LARGEST_SCALE:
-            raise InputError(
-                "memberships.consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}"
-            )
+            fix = f"give a foot and a peak {CLOSEST:g} above it"
+            _require(0.0 <= foot <= peak - CLOSEST, name, "is not increasing", fix)
+        is_in_range = min(self.consequents) >= 0.0 and max(self.consequents) <= LARGEST_SCALE
+        _require(is_in_range, "consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}")
         for name in ("shares", "strained"):
-            if not all(LEAST_SHARE <= value <= 0.0 for value in getattr(self, name)):
-                raise InputError(
-                    f"memberships.{name}", "out of range", f"stay within {LEAST_SHARE:g} and 0 nat"
-                )
+            is_in_range = all(LEAST_SHARE <= value <= 0.0 for value in getattr(self, name))
+            _require(is_in_range, name, "out of range", f"stay within {LEAST_SHARE:g} and 0 nat")
 
     def to_vector(self) -> FloatArray:
         """Return the parameters of the fuzzy sets as a vector (30,) for an optimiser: all fields,
