@@ -250,7 +250,7 @@ def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig)
     finally:
         blocks.close()
         trip.close()
-        if any(feed.listening for feed in feeds):
+        if any(feed.is_listening for feed in feeds):
             left_behind.set()
 
 

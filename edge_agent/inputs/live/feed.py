@@ -64,11 +64,12 @@ class Stamps:
     """Conversion of the time stamps of one live source to the clock of the host (this computer)."""
 
     def __init__(self) -> None:
-        self._previous_min_delay = self._current_min_delay = float("inf")
+        self._previous_min_delay = float("inf")
+        self._current_min_delay = float("inf")
         self._turn_time = 0.0
 
     @property
-    def lead(self) -> float:
+    def added_s(self) -> float:
         """Return the time [s] that is added to the source's time stamps; 0 where the stamps are
         used unchanged.
         """
@@ -84,7 +85,7 @@ class Stamps:
             self._current_min_delay = float("inf")
             self._turn_time = arrival
         self._current_min_delay = min(self._current_min_delay, arrival - stamp)
-        return stamp + self.lead
+        return stamp + self.added_s
 
 
 class Feed(ABC):
@@ -102,7 +103,11 @@ class Feed(ABC):
     def __init__(self, name: str, clock: HostClock) -> None:
         self.name = name
         self.clock = clock
-        self.received_count = self.lost = self.broken = self.openings = self.losses = 0
+        self.received_count = 0
+        self.lost = 0
+        self.broken = 0
+        self.openings = 0
+        self.losses = 0
         self.stopping = threading.Event()
         self.stamps = Stamps()
         self.last = 0.0  # time of the last message [s of the host's clock]
@@ -136,7 +141,7 @@ class Feed(ABC):
         self._thread.join(LEAVE_S)
 
     @property
-    def listening(self) -> bool:
+    def is_listening(self) -> bool:
         """Return True if the listening thread is still running. After `close`, True means that the
         thread hangs in a driver, whose library may block the exit of the process.
         """
@@ -170,7 +175,7 @@ class Feed(ABC):
         return self.series(received) if received else {}
 
     @property
-    def trouble(self) -> str | None:
+    def silence_message(self) -> str | None:
         """Return a message if the live source has delivered nothing for SILENT_S; else None."""
         silent = self.clock.now() - self.last
         return f"{self.name} has sent nothing for {silent:.0f} s" if silent > SILENT_S else None

@@ -124,7 +124,7 @@ class LiveRows:
 
     def health_problems(self) -> list[str]:
         """Return one message for each live source that delivers nothing."""
-        return [trouble for feed in self.feeds if (trouble := feed.trouble)]
+        return [message for feed in self.feeds if (message := feed.silence_message)]
 
     def _may_deliver(self, time: float) -> bool:
         """Return True if a source may still deliver readings for rows before `time` [s].
@@ -135,7 +135,7 @@ class LiveRows:
         return any(
             feed.received_count
             and feed.newest < time
-            and feed.trouble is None
+            and feed.silence_message is None
             and "course" not in kept
             for feed, kept in zip(self.feeds, self._readings, strict=True)
         )
@@ -167,7 +167,7 @@ class LiveRows:
                 continue
             series = Series(series.t - channel.delay_s, series.values)
             if name in CONTEXT:
-                lasting = channel.lasting and self.feeds[place].trouble is None
+                lasting = channel.lasting and self.feeds[place].silence_message is None
                 context[:, CONTEXT.index(name)] = held_readings(name, series, t, lasting=lasting)
             elif sparse:
                 fixes[name] = series
@@ -247,7 +247,7 @@ class LiveRows:
         """
         if self._date_ns is None and self._used["latitude"] > -math.inf:
             leads = [
-                feed.stamps.lead
+                feed.stamps.added_s
                 for feed, kept in zip(self.feeds, self._readings, strict=True)
                 if "course" in kept
             ]

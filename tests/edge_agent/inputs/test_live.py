@@ -92,7 +92,7 @@ def test_restarted_source_is_read_again(kind: str, tmp_path: Path) -> None:
                 running.send_go()
                 before = feed.received_count
                 until(lambda: feed.received_count > before + 20)  # noqa: B023 waited for here
-            until(lambda: feed.trouble is not None)
+            until(lambda: feed.silence_message is not None)
     finally:
         feed.close()
     assert feed.broken == 0

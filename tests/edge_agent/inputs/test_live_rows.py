@@ -83,7 +83,7 @@ def test_foreign_time_stamps_are_moved_by_the_least_delay() -> None:
     assert places[1:] == pytest.approx([1.05, 2.05, 3.05])
     early = Stamps()
     assert early.host_time(10.5, 10.1) == pytest.approx(10.1), "from the future: another clock"
-    assert own.lead == 0.0
+    assert own.added_s == 0.0
     assert max(delays) < BELIEVED_S
 
 
@@ -276,10 +276,10 @@ def test_a_source_that_hangs_is_left_behind_and_known_to_be(
         source.start()
     hanging.entered.wait()
     hanging.close()
-    assert hanging.listening
+    assert hanging.is_listening
     monkeypatch.setattr(feed, "LEAVE_S", 30.0)
     other.close()
-    assert not other.listening
+    assert not other.is_listening
     hanging.released.set()
     hanging.close()
-    assert not hanging.listening
+    assert not hanging.is_listening
