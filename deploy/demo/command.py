@@ -86,12 +86,12 @@ def _check_options(args: argparse.Namespace) -> None:
     from deploy.demo.screenshot import check_screenshot
     from edge_agent.lab.simulation.counter_rng import checked_seed
     from edge_agent.lab.simulation.fleet import check_live_fleet
-    from edge_agent.lab.simulation.listeners import warned_ones
+    from edge_agent.lab.simulation.listeners import choose_warned
     from fleet_service.page.server import LOOPBACK, open_socket
 
     check_live_fleet(args.vehicles)
     checked_seed(args.seed)
-    warned_ones(args.vehicles, args.warned)
+    choose_warned(args.vehicles, args.warned)
     if math.isinf(args.duration):
         raise InputError("duration", "a drive of inf s never ends", "give seconds, e.g. 150")
     try:

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from deploy.demo.ice import NewIce
-from edge_agent.lab.simulation.listeners import warned_ones
+from edge_agent.lab.simulation.listeners import choose_warned
 from fleet_service.archive.format import reading
 from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
@@ -302,7 +302,7 @@ def lost_grip(
         since[np.isin(visits["cell"].to_numpy(), cells)] = known
     vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
     count = max((_vehicle_number(name) for name in vehicles), default=0)
-    warned = warned_ones(count, share)
+    warned = choose_warned(count, share)
     passes: dict[tuple[str, int], tuple[bool, int]] = {}  # lost, cell; by vehicle and number
     enter, left = (
         visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time")

@@ -96,11 +96,11 @@ def run(args: argparse.Namespace) -> int:
 
         def pass_warning(name: str, warning: GripWarning) -> None:
             show(name, warning)
-            drivers.hear(name, warning)
+            drivers.store_warning(name, warning)
 
-        lookout = Lookout(fleet.names, pass_warning, drivers.route_of, drivers.listens)
+        lookout = Lookout(fleet.names, pass_warning, drivers.route_of, drivers.is_warned)
         parts.append(LookoutPart(lookout))
-        source = drivers.heeding(source)
+        source = drivers.pass_warnings(source)
     options = AgentOptions(
         fleet.vehicles, fleet.names, config, args.estimator, memberships_of(args), args.duration
     )

@@ -24,7 +24,7 @@ AROUND_M: Final = 25.0
 EVERY: Final = 10  # blocks between two updates of the route
 
 
-def warned_ones(vehicles: int, share: float) -> BoolArray:
+def choose_warned(vehicles: int, share: float) -> BoolArray:
     """Return an array (N,) that is True for drivers who receive warnings. They are evenly
     distributed over vehicles with small and with large sensor errors.
 
@@ -50,12 +50,12 @@ class WarnedDrivers:
 
     def __init__(self, fleet: SimulatedFleet, share: float) -> None:
         self._fleet = fleet
-        self.warned = warned_ones(len(fleet.names), share)
+        self.warned = choose_warned(len(fleet.names), share)
         self._number = {name: k for k, name in enumerate(fleet.names)}
         self._routes: dict[int, GivenRoute] = {}
         self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
-    def listens(self, k: int) -> bool:
+    def is_warned(self, k: int) -> bool:
         """Return True if the driver of vehicle k receives warnings."""
         return bool(self.warned[k])
 
@@ -63,7 +63,7 @@ class WarnedDrivers:
         """Return the route ahead of vehicle k; None if no route has been stored yet."""
         return self._routes.get(k)
 
-    def hear(self, name: str, warning: GripWarning) -> None:
+    def store_warning(self, name: str, warning: GripWarning) -> None:
         """Store a warning for the driver of the vehicle called `name`. The driver gets the warning
         with the next block of samples; the driver's reaction time starts then.
 
@@ -71,22 +71,22 @@ class WarnedDrivers:
         """
         self._warnings.put((self._number[name], warning))
 
-    def heeding(self, blocks: Iterator[Block]) -> Iterator[Block]:
+    def pass_warnings(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Yield the blocks of samples of a source unchanged, and pass the stored warnings to the
         simulated drivers after each block.
         """
         for number, block in enumerate(blocks):
             if number % EVERY == 0:
-                self.refresh()
+                self.update_routes()
             yield block
-            self.act()
+            self.deliver_warnings()
 
-    def refresh(self) -> None:
+    def update_routes(self) -> None:
         """Update the stored routes ahead of the drivers who receive warnings."""
         for k in self.warned.nonzero()[0].tolist():
             self._routes[k] = GivenRoute(*self._fleet.route_ahead(k, ROUTE_M))
 
-    def act(self) -> None:
+    def deliver_warnings(self) -> None:
         """Pass the stored warnings to the simulated drivers who receive them."""
         while not self._warnings.empty():
             k, warning = self._warnings.get()

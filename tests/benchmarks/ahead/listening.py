@@ -197,7 +197,7 @@ class ListeningTown:
             self.received_map.store_cells(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _warn_drivers(self) -> None:
-        self.drivers.refresh()
+        self.drivers.update_routes()
         seen = self.pipeline.seen
         assert seen is not None
         for k, row in enumerate(zip(*(column.tolist() for column in seen), strict=True)):
@@ -214,8 +214,8 @@ class ListeningTown:
             )
             self.drive.warnings += sum(one.state == "raised" for one in issued)
             for warning in issued:
-                self.drivers.hear(self.fleet.names[k], warning)
-        self.drivers.act()
+                self.drivers.store_warning(self.fleet.names[k], warning)
+        self.drivers.deliver_warnings()
 
     def _compare_estimates(self) -> None:
         beliefs = self.bank.beliefs()
