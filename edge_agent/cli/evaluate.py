@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plots",
         choices=("png", "svg", "pdf"),
         default="png",
-        help="their format (default %(default)s)",
+        help="format of the plots (default %(default)s)",
     )
     parser.add_argument(
         "--no-plots", action="store_true", help="figures and table only; needs no matplotlib"

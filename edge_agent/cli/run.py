@@ -83,9 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate",
         type=commandline.parse_positive,
         default=100.0,
-        help="samples per second of the simulation",
+        help="samples per second of the simulation (default 100)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation (default 0)")
     parser.add_argument(
         "--duration",
         type=commandline.parse_positive,

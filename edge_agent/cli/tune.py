@@ -76,7 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of both searches (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
-    parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
+    parser.add_argument(
+        "--iterations", type=int, help=f"iterations of each search (default {ITERATIONS})"
+    )
     parser.add_argument(
         "--objective",
         choices=tuple(OBJECTIVES),
@@ -91,7 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of searches of each kind (default %(default)s)",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s"
+        "--out",
+        type=Path,
+        default=Path(f"{ESTIMATOR}.json"),
+        help="file for the fuzzy sets found (default %(default)s)",
     )
     parser.add_argument(
         "--study",

@@ -57,7 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="FILE", type=Path, help=f"output file ({', '.join(ENDINGS)})"
     )
     parser.add_argument(
-        "--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s"
+        "--engine",
+        default="duckdb",
+        metavar="duckdb|spark",
+        help="engine of the query (default %(default)s)",
     )
     parser.add_argument(
         "--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map"
@@ -71,8 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--step", metavar="SECONDS", type=float, help="replay: seconds between frames"
     )
-    vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
-    parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
+    parser.add_argument(
+        "--min-vehicles",
+        metavar="K",
+        type=int,
+        help="worst, spells, contract: only stretches that K vehicles measured (default "
+        f"{USUAL_VEHICLES})",
+    )
     parser.add_argument(
         "--roads",
         metavar="FILE",

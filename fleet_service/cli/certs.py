@@ -41,16 +41,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder in which the routers find the files (default: --out)",
     )
     parser.add_argument(
-        "--days", type=float, default=365.0, help="validity of a certificate (default 365)"
+        "--days", type=float, default=365.0, help="validity of a certificate in days (default 365)"
     )
     parser.add_argument(
-        "--ca-days", type=float, default=3650.0, help="validity of a new authority (default 3650)"
+        "--ca-days",
+        type=float,
+        default=3650.0,
+        help="validity of a new authority in days (default 3650)",
     )
     parser.add_argument(
         "--renew-days",
         type=float,
         default=30.0,
-        help="renew certificates that end sooner (default 30)",
+        help="renew certificates that end within this many days (default 30)",
     )
     parser.add_argument(
         "--revoke",

@@ -63,7 +63,7 @@ def add_supplier(parser: argparse.ArgumentParser) -> None:
         "--status",
         choices=STATUSES,
         default="test",
-        help="datex: status of the information; default test",
+        help="datex: status of the information (default test)",
     )
 
 

@@ -26,7 +26,9 @@ LOOK_S: Final = 5.0  # [s] period of the checks whether the service is still run
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `fleet-service forget`."""
     add_archive(parser)
-    parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
+    parser.add_argument(
+        "--period", metavar="MONTH", required=True, help="month to forget, e.g. 2026-01"
+    )
     parser.add_argument("--vehicle", metavar="NAME", help="remove only this vehicle's rows")
     parser.add_argument(
         "--config",

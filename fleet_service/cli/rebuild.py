@@ -27,7 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", dest="until", metavar="TIME", help="moment of the map (default: now)"
     )
     parser.add_argument(
-        "--engine", default="local", metavar="local|spark", help="default %(default)s"
+        "--engine",
+        default="local",
+        metavar="local|spark",
+        help="where to compute (default %(default)s)",
     )
     parser.add_argument(
         "--as-it-lies",

@@ -168,10 +168,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parse.add_argument(
         "towns", nargs="+", type=town_named, help="SEED, SEED:KIND, SEED:KIND:SECONDS[:winter]"
     )
-    parse.add_argument("--estimator", default=DEFAULT)
-    parse.add_argument("--cars", type=int, default=CARS)
-    parse.add_argument("--no-oracle", action="store_true")
-    parse.add_argument("--json", type=Path, help="write name -> value")
+    parse.add_argument(
+        "--estimator", default=DEFAULT, help="name of the estimator (default %(default)s)"
+    )
+    parse.add_argument(
+        "--cars", type=int, default=CARS, help="vehicles in each town (default %(default)s)"
+    )
+    parse.add_argument("--no-oracle", action="store_true", help="omit the figures of the oracle")
+    parse.add_argument(
+        "--json", type=Path, help="file for the figures, a JSON object of name and value"
+    )
     args = parse.parse_args(arguments)
     began = time.monotonic()
     results = judge_towns(

@@ -227,8 +227,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folder given by the option `--out`.
     """
     parser = argparse.ArgumentParser(description="Sensitivity of the estimator to its constants")
-    parser.add_argument("--out", type=Path, default=Path(".evaluation/sensitivity"))
-    parser.add_argument("--only", default="", help="numbers whose name contains this text")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(".evaluation/sensitivity"),
+        help="folder for the table and the figures (default %(default)s)",
+    )
+    parser.add_argument(
+        "--only", default="", help="vary only numbers whose name contains this text"
+    )
     options = parser.parse_args(arguments)
     changes = campaign(
         simulate_drives(SEEDS), only=options.only, log_line=lambda line: print(line, flush=True)
