@@ -159,7 +159,7 @@ def test_an_answer_of_the_archive_has_no_mu_for_a_bound(
         assert find_painted(read_rows(out), known, colour) == []
 
 
-def test_a_picture_hatches_what_was_not_measured() -> None:
+def test_unmeasured_cells_are_hatched_in_a_picture() -> None:
     from matplotlib.figure import Figure
 
     axes = Figure().subplots()

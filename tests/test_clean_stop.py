@@ -29,7 +29,9 @@ def there(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals) -> None:
+def test_agent_and_service_settle_all_records_and_stop(
+    there: Stage, number: signal.Signals
+) -> None:
     (load,) = there.loads
     for part in (load, there.service):
         assert part.stop(number) == 0

@@ -119,7 +119,7 @@ def test_a_minus_sign_is_a_number_behind_an_option(given: list[str], understood:
     assert commandline.join_negative_numbers(given) == understood
 
 
-def test_the_western_hemisphere_is_asked_like_the_eastern(
+def test_bbox_with_a_negative_longitude_is_accepted(
     archive: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     words = ["export", "observations", "--archive", str(archive), "--out", str(tmp_path / "a.csv")]

@@ -227,7 +227,7 @@ def test_straight_drive_keeps_the_upper_end_of_the_prior(system: System) -> None
     )
 
 
-def test_garbage_is_refused_and_the_service_goes_on(system: System) -> None:
+def test_garbage_is_refused_and_the_service_continues(system: System) -> None:
     session = open_session(ZenohSettings(connect=[system.endpoint]))
     assert session is not None
     with session:

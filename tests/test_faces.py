@@ -29,7 +29,7 @@ FACES = (edge_agent, fleet_service)
 
 
 @pytest.mark.parametrize("face", FACES, ids=lambda face: str(face.__name__))
-def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
+def test_every_public_name_exists_and_is_documented(face: object) -> None:
     names = face.__all__  # type: ignore[attr-defined]
     assert list(names) == sorted(names)
     assert len(names) >= 8
@@ -46,7 +46,7 @@ def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
     )
 
 
-def test_importing_a_face_loads_nothing_heavy() -> None:
+def test_importing_a_public_package_loads_no_heavy_library() -> None:
     heavy = ("numba", "numpy", "pyarrow", "zenoh")
     words = (
         f"import sys, edge_agent, fleet_service; print([name for name in {heavy} if name in "
@@ -61,7 +61,7 @@ def test_importing_a_face_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("face", ["gripmap", "edge_agent.estimators", "fleet_service.client"])
-def test_a_package_of_ones_own_that_hides_ours_is_named(tmp_path: Path, face: str) -> None:
+def test_foreign_package_that_hides_ours_is_named(tmp_path: Path, face: str) -> None:
     own = tmp_path / "schemas" / "__init__.py"
     own.parent.mkdir()
     own.touch()
@@ -109,7 +109,7 @@ def test_estimates_of_one_of_many_vehicles_become_a_table() -> None:
         edge_agent.to_table(t, found, 2)
 
 
-def test_memberships_that_tune_wrote_change_what_replay_says(tmp_path: Path) -> None:
+def test_tuned_memberships_change_the_estimates_of_replay(tmp_path: Path) -> None:
     from edge_agent.app.tuned_memberships import FOLDER
 
     document = json.loads((FOLDER / "paper-aco-fckf.json").read_text())

@@ -35,7 +35,7 @@ from tests.fleet_service.examples import SECOND, batch, key
 from tests.waiting import until
 
 
-def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> None:
+def test_required_figures_of_campaigns_are_in_the_table_and_unique() -> None:
     owed = [name for campaign in CAMPAIGNS for name in campaign.owes]
     assert set(owed) <= set(BARS)
     assert len(owed) == len(set(owed))
@@ -116,7 +116,7 @@ def kept(tmp_path: Path) -> list[Batch]:
     return batches
 
 
-def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_path: Path) -> None:
+def test_census_finds_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_path: Path) -> None:
     journal = tmp_path / "load.journal"
     lines = [f"+ {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} {b.rows} 1.0" for b in kept]
     lines += [f"- {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} 0 3.5" for b in kept[1:]]

@@ -18,7 +18,7 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cells, list[str]]:
     return map_first_drive(tmp_path_factory.mktemp("minute"))
 
 
-def test_the_real_minute_comes_onto_the_map_under_three_names(
+def test_recorded_minute_is_on_the_map_under_three_vehicle_names(
     minute: tuple[Cells, list[str]],
 ) -> None:
     cells, _ = minute

@@ -25,7 +25,7 @@ def test_fuzzer_finds_a_planted_crash() -> None:
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_seeds_crash_nothing(name: str) -> None:
+def test_fuzz_seeds_cause_no_crash_and_no_hang(name: str) -> None:
     seeds = seeds_of(name)
     result = Fuzzer(PARSERS[name], seeds, 0, lambda kind, data: None).run(executions=50)
     assert (result.crashes, result.hangs) == (0, 0)

@@ -15,7 +15,7 @@ SEEDS = (*range(12), FOUND_BUG)
 
 
 @pytest.mark.campaign
-def test_histories_lose_and_double_nothing() -> None:
+def test_lease_histories_lose_and_double_no_row() -> None:
     judged = judge_seeds(SEEDS)
     assert (judged.acknowledged_by_two, judged.violations) == (0, 0)
     assert judged.failovers > 50

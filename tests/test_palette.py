@@ -41,7 +41,7 @@ def test_ice_snow_wet_and_dry_are_distinguished(sight: str) -> None:
 
 
 @pytest.mark.parametrize("sight", SIGHTS)
-def test_none_of_them_is_the_white_of_what_was_not_measured(sight: str) -> None:
+def test_all_friction_colours_differ_from_white(sight: str) -> None:
     white = to_lab("#ffffff", sight)
     assert (
         min(

@@ -43,7 +43,7 @@ def test_every_judged_figure_is_on_the_page_with_its_commit() -> None:
                 assert f"|`{row['name']}`|" in page
 
 
-def test_missed_bars_come_first_and_are_marked(folder: Path) -> None:
+def test_missed_targets_are_first_and_marked(folder: Path) -> None:
     left = folder / "left.json"
     figures.write(
         left,

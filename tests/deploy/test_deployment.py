@@ -217,7 +217,7 @@ def test_shipped_secure_settings_protect_privacy() -> None:
     assert service.fleet is not None
 
 
-def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
+def test_compose_file_starts_the_same_processes_as_the_units() -> None:
     file = DEPLOY / "compose.yaml"
     subprocess.run(
         [BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", file], check=True

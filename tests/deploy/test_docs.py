@@ -41,7 +41,7 @@ def test_the_examples_of_the_reference_run_in_their_order(
     assert {"drive.svg", "worst.geojson"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_every_page_stands_in_the_contents_of_the_site() -> None:
+def test_site_contents_list_every_page() -> None:
     """Every page must be in the table of contents of the site. Otherwise Sphinx warns of the page,
     and `make docs` treats the warning as an error.
     """

@@ -31,7 +31,7 @@ FOLDER = ROOT / "deploy" / "examples"
 Output = pytest.CaptureFixture[str]
 
 
-def test_every_example_stands_in_their_readme() -> None:
+def test_readme_lists_every_example() -> None:
     text = (FOLDER / "README.md").read_text()
     files = [
         path.name
@@ -73,13 +73,13 @@ def serve_ice(folder: Path) -> Iterator[str]:
             yield endpoints[0]
 
 
-def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
+def test_map_is_queried_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
     with serve_ice(tmp_path) as endpoint:
         assert query_map.main(endpoint) == 1
     assert ": 1 cells" in capsys.readouterr().out
 
 
-def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
+def test_car_is_warned_of_ice_that_three_others_found(tmp_path: Path, capsys: Output) -> None:
     """A car that approaches ice reported by three other cars must be warned. Router, service,
     reports and alert are real.
     """

@@ -53,7 +53,7 @@ def does_select(selector: dict[str, str], labels: dict[str, str]) -> bool:
 
 
 @pytest.mark.parametrize("overlay", OVERLAYS)
-def test_the_schemas_of_kubernetes_find_nothing_wrong(overlay: str) -> None:
+def test_manifests_are_valid_by_the_kubernetes_schemas(overlay: str) -> None:
     objects = build_overlay(overlay)
     assert len(objects) >= 8
     assert kubernetes.find_schema_errors(objects) == []

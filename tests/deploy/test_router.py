@@ -21,7 +21,7 @@ from schemas.runtime.zenoh_session import open_session
 from tests.waiting import PATIENCE_S, matched
 
 
-def test_clients_of_a_router_hear_each_other() -> None:
+def test_clients_of_a_router_receive_each_others_messages() -> None:
     session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
     with session:
         settings = ZenohSettings(connect=endpoints)

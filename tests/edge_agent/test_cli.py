@@ -367,7 +367,7 @@ def test_a_bad_argument_of_replay_is_one_line_and_exit_code_2(
 
 
 @pytest.mark.parametrize(("spoil", "message"), BAD_LOGS.values(), ids=BAD_LOGS)
-def test_a_bad_log_is_one_line_and_exit_code_2_and_leaves_no_output(
+def test_bad_log_gives_one_line_and_exit_code_2_without_output(
     drive: Path, tmp_path: Path, capsys: Output, spoil: Callable[[Path], None], message: str
 ) -> None:
     spoil(tmp_path / "log")

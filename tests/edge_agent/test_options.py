@@ -108,7 +108,7 @@ SENT_BY_REPLAY = "test_replay_publishes_at_the_time_of_the_drive_and_waits"
 # Tests in other modules that show the effect of the remaining options.
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
-SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
+SEEDS = "test_options_add_seeds_and_omit_plots"
 UNFIT = "test_log_that_fails_the_doctor_is_published_only_with_trust"
 LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
 LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
@@ -145,10 +145,10 @@ ELSEWHERE = {
         "--trust": UNFIT,
         "--name": SENT_BY_REPLAY,
         "--start": SENT_BY_REPLAY,
-        "--compare": "test_compared_estimators_stand_in_the_report",
+        "--compare": "test_report_contains_the_compared_estimators",
         "--jobs": "test_so_many_drives_are_under_way_at_once",
-        "--engine": "test_an_engine_is_for_several_logs_and_wants_no_jobs",
-        "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says",
+        "--engine": "test_spark_engine_needs_several_logs_and_refuses_jobs",
+        "--memberships": "test_tuned_memberships_change_the_estimates_of_replay",
     },
     "check": {
         "log": FIX,
@@ -179,7 +179,7 @@ ELSEWHERE = {
     "tune": {
         "log": "test_tuning_can_use_the_users_own_drives",
         "--vehicle": "test_tuning_can_use_the_users_own_drives",
-        "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
+        "--quick": "test_quick_tuning_writes_a_valid_file_and_reports_its_progress",
         "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file",
     },
     "evaluate": {

@@ -226,7 +226,7 @@ def test_broken_receiver_loses_no_alert_silently(tmp_path: Path, kind: str) -> N
 
 
 @pytest.mark.parametrize("url", ["ftp://x", "x", "http://", "http://[", "http://a:99999999/"])
-def test_webhook_refuses_what_is_no_url(url: str) -> None:
+def test_webhook_refuses_an_invalid_url(url: str) -> None:
     with pytest.raises(InputError, match="is not a URL"):
         check_url(url)
 

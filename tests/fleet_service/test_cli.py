@@ -56,7 +56,7 @@ def test_the_help_of_analyze_names_every_question() -> None:
     assert analyze.help == f"analyse the archive: {', '.join(QUESTIONS)}"
 
 
-def test_help_comes_without_what_commands_need() -> None:
+def test_help_works_without_optional_libraries() -> None:
     words = (
         "import sys; from schemas.runtime import commandline; from fleet_service import cli; "
         "commandline.parser_of(*cli.LINE, None); print(*sys.modules)"

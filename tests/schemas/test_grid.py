@@ -25,7 +25,7 @@ def test_cell_of_a_position_contains_it(latitude: float, longitude: float) -> No
 
 
 @given(latitudes, longitudes)
-def test_the_centre_of_a_cell_lies_in_it(latitude: float, longitude: float) -> None:
+def test_centre_of_a_cell_is_inside_it(latitude: float, longitude: float) -> None:
     cell = grid.cell_of(latitude, longitude)
     assert grid.cell_of(*grid.centre(cell)) == cell
 

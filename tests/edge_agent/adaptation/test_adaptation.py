@@ -19,7 +19,7 @@ INPUTS = np.array(SETS.inputs)
 OUTPUTS = np.array(SETS.outputs)
 
 
-def test_at_the_peak_of_a_set_its_output_alone_speaks() -> None:
+def test_peak_of_a_fuzzy_set_gives_exactly_its_output() -> None:
     for peak, output in zip(INPUTS, OUTPUTS, strict=True):
         assert infer_step(float(peak), INPUTS, OUTPUTS) == pytest.approx(float(output))
 
@@ -44,7 +44,7 @@ def test_noise_factor_stays_in_bounds_during_a_long_mismatch() -> None:
     assert low == LEAST_FACTOR
 
 
-def test_without_a_theoretical_variance_nothing_is_concluded() -> None:
+def test_zero_theoretical_variance_keeps_the_factor() -> None:
     assert adapted_factor(2.0, 1.0, 0.0, INPUTS, OUTPUTS) == 2.0
 
 

@@ -58,7 +58,7 @@ def test_vector_is_the_sets_and_a_gap_is_closed() -> None:
         ({"peaks": (0.0,) * 5}, "lower_vertices.peaks"),
     ],
 )
-def test_sets_that_leave_a_gap_or_fall_are_refused(
+def test_sets_with_a_gap_or_out_of_order_are_refused(
     change: dict[str, tuple[float, ...]], field: str
 ) -> None:
     with pytest.raises(InputError, match=field):

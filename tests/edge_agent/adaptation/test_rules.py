@@ -23,7 +23,7 @@ def test_rules_leave_r_unchanged_if_the_noise_is_right() -> None:
     assert infer_two(0.0, 0.0, ALPHA, RATE, TABLE) == 0.0
 
 
-def test_at_the_peaks_the_table_itself_speaks_and_beyond_them_its_edge() -> None:
+def test_rule_table_is_exact_at_peaks_and_constant_beyond_its_edge() -> None:
     for j, rate in enumerate(RATE):
         for i, alpha in enumerate(ALPHA):
             assert infer_two(alpha, rate, ALPHA, RATE, TABLE) == pytest.approx(
@@ -64,7 +64,7 @@ def test_the_weighted_window_finds_the_variance_of_white_noise() -> None:
     assert weighted_noise(window, 0.04, 0.09, 0.1, 10.0) == pytest.approx(0.05, rel=0.1)
 
 
-def test_the_window_speaks_when_it_is_full_and_within_its_bounds() -> None:
+def test_window_changes_the_noise_only_when_full_and_within_bounds() -> None:
     window = np.full(3, np.nan)
     for error in (5.0, 5.0):
         push_innovation(window, error)

@@ -27,7 +27,7 @@ def test_a_longer_way_costs_more_and_a_route_less_than_none() -> None:
 
 
 @pytest.mark.campaign
-def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
+def test_cars_that_reach_ice_are_counted_and_warned() -> None:
     counts = approaches.Approaches()
     approaches.drive_town(100, 60.0, 10, counts, routed=True)
     assert counts.came > 0

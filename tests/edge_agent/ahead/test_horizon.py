@@ -127,7 +127,7 @@ def test_unknown_stays_unknown() -> None:
     assert not horizon.slippery.any()
 
 
-def test_a_bound_is_no_value_and_gives_no_advice() -> None:
+def test_lower_bound_gives_no_friction_value_and_no_safe_speed() -> None:
     horizon = look_ahead(
         straight_path(HOME, 100.0),
         make_local_map([cells(keys_on(), 0.3, basis=local_map.BOUND)]),

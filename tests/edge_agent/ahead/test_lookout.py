@@ -143,7 +143,7 @@ def test_car_queries_active_alerts_when_it_enters_a_tile(
         assert set(subscriber.tiles) - before
 
 
-def test_ice_that_was_found_before_the_car_came_is_asked_for(
+def test_car_queries_ice_that_was_found_before_it_arrived(
     router: Router, town: MadeUpService
 ) -> None:
     town.standing = [alert(int(key), time=NOW) for key in ICE]
@@ -151,7 +151,7 @@ def test_ice_that_was_found_before_the_car_came_is_asked_for(
         assert car.next_warning().mu == pytest.approx(0.15, abs=0.03)
 
 
-def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(
+def test_map_without_alerts_warns_and_its_values_are_on_the_horizon(
     router: Router, town: MadeUpService
 ) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
@@ -290,9 +290,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
-def test_a_hostile_alert_is_refused_counted_and_changes_nothing(
-    router: Router, town: MadeUpService
-) -> None:
+def test_hostile_alert_is_refused_and_counted(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         assert car.next_warning().state == "raised"
@@ -420,7 +418,7 @@ def _at(metre: float, seconds: float) -> Pose:
     )
 
 
-def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> None:
+def test_boxes_ahead_are_requested_once_and_again_when_old() -> None:
     asked = RequestLog()
     pose = _at(0, 0)
     path = straight_path(pose, 150.0)

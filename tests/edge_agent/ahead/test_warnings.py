@@ -82,7 +82,7 @@ def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
     assert raised.safe_speed < 10.0
 
 
-def test_on_an_unknown_road_the_warning_comes_as_early_as_that_may_need() -> None:
+def test_warning_on_an_unknown_road_leaves_room_for_its_lower_friction() -> None:
     cache = LocalMap()
     for key in icy():
         cache.store_alert(alert(key), NOW)
@@ -105,7 +105,7 @@ def test_ice_on_the_other_carriageway_is_none_of_ours() -> None:
     assert Car(make_local_map([cells(keys_on(ROAD) + 2, 0.15, width=0.05)])).drive(450.0) == []
 
 
-def test_one_vehicle_alone_warns_nobody() -> None:
+def test_one_vehicle_alone_causes_no_warning() -> None:
     lonely = cells(icy(), 0.15, width=0.05)
     assert (
         Car(make_local_map([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(

@@ -242,7 +242,7 @@ def test_several_logs_are_not_published_or_compared(
     assert "error: compare: needs one log" in capsys.readouterr().err
 
 
-def test_an_engine_is_for_several_logs_and_wants_no_jobs(
+def test_spark_engine_needs_several_logs_and_refuses_jobs(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = [str(path) for path in logs(drives)]
@@ -255,7 +255,7 @@ def test_an_engine_is_for_several_logs_and_wants_no_jobs(
     assert "error: engine: Spark needs several logs" in capsys.readouterr().err
 
 
-def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(
+def test_repeated_estimation_of_a_drive_writes_one_file_and_no_draft(
     drives: Path, tmp_path: Path
 ) -> None:
     (task, *_) = tasks_of(logs(drives), None, tmp_path)

@@ -86,7 +86,7 @@ def test_a_track_without_knowledge_has_no_colour() -> None:
     assert None not in data_of(page_of(drive_of()))["track"]["colour"]
 
 
-def test_a_title_cannot_leave_its_place() -> None:
+def test_title_of_a_report_is_escaped() -> None:
     text = page_of(drive_of())
     assert "<drive>" not in text
     assert "a &lt;drive&gt;" in text

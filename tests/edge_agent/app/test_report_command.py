@@ -26,7 +26,7 @@ def drive(tmp_path: Path) -> Path:
     return log
 
 
-def test_compared_estimators_stand_in_the_report(drive: Path, tmp_path: Path) -> None:
+def test_report_contains_the_compared_estimators(drive: Path, tmp_path: Path) -> None:
     report = tmp_path / "drive.html"
     code = main(["replay", str(drive), "--out", str(report), "--compare", "sr-ukf"])
     assert code in (0, 3)

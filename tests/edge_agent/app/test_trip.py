@@ -58,7 +58,9 @@ def delayed_by(rows: int, late: FloatArray, raw: FloatArray) -> bool:
     return np.allclose(late[rows:], raw[: len(raw) - rows], rtol=0.0, atol=1e-12, equal_nan=True)
 
 
-def test_nothing_is_admitted_before_the_doctor_has_passed(smooth: Recorded, tmp_path: Path) -> None:
+def test_no_record_is_admitted_before_the_doctor_has_passed(
+    smooth: Recorded, tmp_path: Path
+) -> None:
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
     assert trip.health_problems()
     admitted, blocks = drive_trip(trip, smooth)

@@ -54,7 +54,7 @@ def test_group_that_makes_held_out_drives_worse_is_left_out(drive: Recorded) -> 
     assert found.after.log_likelihood > found.before.log_likelihood
 
 
-def test_nothing_is_written_where_no_group_helps(drive: Recorded) -> None:
+def test_calibration_is_empty_if_no_group_helps(drive: Recorded) -> None:
     def refuse(vehicle: Vehicle, drive: Drive) -> Prediction:
         return Prediction(0.0 if vehicle.calibration is None else -1.0, 0.0)
 

@@ -75,7 +75,7 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
     assert many.ax[1] < few.ax[1]
 
 
-def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
+def test_correction_removes_the_learned_errors(smooth: Recorded) -> None:
     bad = spoil_drive(smooth)
     calibration = learn_calibration(parts(bad, 3), bad.vehicle)
     mended = correct_log(

@@ -175,7 +175,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
+def test_faults_cause_no_nan_and_are_shown_in_health(fault: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     t = t.copy()
     signals = signals.copy()
@@ -190,7 +190,7 @@ def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
 
 
 @pytest.mark.parametrize("fault", ["no torque", "no steering", "no accelerometers"])
-def test_with_less_to_go_by_the_interval_is_wider_or_still_right(fault: str) -> None:
+def test_interval_is_right_with_fewer_signals(fault: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3)
     broken = signals.copy()
     FAULTS[fault][0](t, broken)

@@ -221,7 +221,7 @@ def test_residual_noise_equals_that_of_slip_and_force_about_a_line(
     assert distance.var() == pytest.approx(felt, rel=0.02)
 
 
-def test_two_split_nodes_share_a_friction_that_lies_between_them() -> None:
+def test_split_nodes_share_probability_with_a_friction_between_them() -> None:
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     for side in range(2):

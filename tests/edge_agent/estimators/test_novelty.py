@@ -97,7 +97,7 @@ class Bend:
         return float(self.memory["slip"]["axle_ended"][0])
 
 
-def test_nothing_is_new_in_a_steady_bend() -> None:
+def test_novelty_is_zero_in_a_steady_bend() -> None:
     assert Bend().drive_block(BEND) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -84,7 +84,7 @@ def test_however_the_samples_are_cut_the_numbers_are_the_same_and_causal(name: s
 
 @pytest.mark.parametrize("name", PAPERS)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_no_fault_makes_a_nan_and_health_says_what_happened(name: str, fault: str) -> None:
+def test_faults_cause_no_nan_and_are_shown_in_health(name: str, fault: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     t = t.copy()
     signals = signals.copy()

@@ -154,7 +154,7 @@ def test_unexplained_side_force_contradicts_until_patience_ends() -> None:
     assert ended - began == pytest.approx(CONSTANTS.chosen.patience, abs=0.2)
 
 
-def test_without_adaptation_nothing_is_strained_or_distrusted() -> None:
+def test_filter_without_adaptation_has_no_strain_and_no_distrust() -> None:
     t, signals, vehicle = drive("slalom", 0.6, seconds=6.0)
     wrong = signals.copy()
     wrong[:, S.AX] += 0.5

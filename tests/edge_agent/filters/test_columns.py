@@ -52,7 +52,7 @@ def test_gathering_is_the_square_root_prediction(offset: float) -> None:
     assert root == pytest.approx(expected_root, abs=1e-8 if offset else 1e-12)
 
 
-def test_points_that_all_agree_leave_the_noise_alone() -> None:
+def test_equal_points_give_the_covariance_of_the_noise() -> None:
     mean = np.empty(N)
     root = np.empty((N, N))
     std = np.linspace(1e-9, 1e-3, N)

@@ -168,7 +168,7 @@ def test_downdate_removes_a_column() -> None:
     assert np.array_equal(root, np.tril(root))
 
 
-def test_downdate_without_a_valid_covariance_changes_nothing() -> None:
+def test_downdate_without_a_valid_covariance_has_no_effect() -> None:
     root = root_of(covariance(3, 10))
     before = root.copy()
     assert not downdate(root, 1.0001 * root[:, 0], np.empty(3))

@@ -246,7 +246,7 @@ def test_square_root_filter_is_textbook_for_a_nonlinear_system() -> None:
         assert np.allclose(root @ root.T, cov, rtol=0, atol=1e-9)
 
 
-def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:
+def test_missing_measurement_equals_an_update_without_it() -> None:
     rule = cubature_rule(2)
     mean = np.array([1.0, 2.0])
     root = np.array([[1.0, 0.0], [0.3, 0.5]])

@@ -96,7 +96,7 @@ def test_radius_of_an_axle_scales_its_wheels_and_torques(drive: Recorded) -> Non
 
 
 @pytest.mark.parametrize("driven", [(2,), (0, 2)])
-def test_car_on_a_lift_is_recognised_and_stands(driven: tuple[int, ...]) -> None:
+def test_car_on_a_lift_is_recognised_and_its_speed_is_zero(driven: tuple[int, ...]) -> None:
     t = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(5)
     signals = np.full((len(t), len(CHANNELS)), np.nan)

@@ -88,7 +88,7 @@ def test_bomb_is_refused_with_a_bounded_memory(
 
 
 @pytest.mark.campaign
-def test_memory_is_bounded_and_given_back(tmp_path: Path) -> None:
+def test_memory_limit_is_enforced_and_then_removed(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     with (
         pytest.raises(InputError, match="needs more than 400 MB of memory"),

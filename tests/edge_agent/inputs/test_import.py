@@ -393,7 +393,7 @@ def broken(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
     "kind", ["blf", "asc", "log", "trc", "mf4", "mcap", "csv", "parquet", "nmea"]
 )
 @pytest.mark.filterwarnings("ignore")
-def test_a_hostile_file_is_one_clear_error_or_the_readings_that_are_left(
+def test_hostile_file_gives_one_clear_error_or_its_valid_readings(
     tmp_path: Path, kind: str
 ) -> None:
     few = formats.frames(60)

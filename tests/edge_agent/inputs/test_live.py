@@ -284,7 +284,7 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
     assert {batch.vehicle for batch in service.batches} == {"car-one"}
 
 
-def test_live_sources_and_a_log_do_not_go_together(
+def test_live_sources_and_a_log_cannot_be_combined(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))

@@ -149,7 +149,7 @@ def test_suspended_host_leaves_rows_out(clock: Steered) -> None:
 @pytest.mark.skipif(
     not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended"
 )
-def test_the_clock_of_the_host_goes_on_while_the_host_is_suspended(
+def test_host_clock_continues_while_the_host_is_suspended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     host = HostClock()
@@ -266,7 +266,7 @@ class Hanging(Scripted):
         self.released.wait()
 
 
-def test_a_source_that_hangs_is_left_behind_and_known_to_be(
+def test_hanging_source_is_abandoned_and_reported(
     clock: Steered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "LEAVE_S", 0.01)

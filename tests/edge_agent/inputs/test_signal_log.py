@@ -106,7 +106,7 @@ def test_blocks_contain_each_sample_once_with_its_absolute_time(tmp_path: Path) 
     assert blocks[0].signals.shape == (10, 1, len(CHANNELS))
 
 
-def test_time_may_stand_still(tmp_path: Path) -> None:
+def test_equal_times_of_rows_are_accepted(tmp_path: Path) -> None:
     columns = a_log(3) | {"t": np.array([0.0, 0.0, 0.01])}
     assert read(tmp_path, columns).t.tolist() == [0.0, 0.0, 0.01]
 

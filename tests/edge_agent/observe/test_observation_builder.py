@@ -98,7 +98,7 @@ def test_observation_describes_its_visit() -> None:
     assert columns["sector"].tolist() == [0] * len(columns["sector"])
 
 
-def test_the_pose_of_an_observation_lies_in_its_cell() -> None:
+def test_pose_of_an_observation_is_in_its_cell() -> None:
     _, observations, _ = Watch.of(6).step(wanderers(500, 6, 8), estimates(500, 6))
     columns = observations.columns
     assert np.array_equal(grid.cell_of(columns["latitude"], columns["longitude"]), columns["cell"])

@@ -40,7 +40,7 @@ def test_evidence_of_a_value_is_limited_and_does_not_lower_the_grip_used() -> No
         assert np.all(np.diff(added) <= 1e-12)
 
 
-def test_gentle_use_decides_nothing_among_roads_with_more_grip() -> None:
+def test_gentle_use_does_not_change_ratios_of_higher_frictions() -> None:
     weighed = weigh_by_use(WIDE_VALUE, np.array([0.05]))
     assert log_ratio(weighed, 0.3, 0.9) == pytest.approx(log_ratio(WIDE_VALUE, 0.3, 0.9))
 

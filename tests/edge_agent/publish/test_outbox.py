@@ -91,7 +91,7 @@ def test_each_start_draws_another_boot_of_63_bits(tmp_path: Path) -> None:
     assert all(0 < boot < 2**63 for boot in boots)
 
 
-def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
+def test_settled_ranges_are_removed_and_first_held_advances(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT)
     outbox.store([draft(records=2) for _ in range(6)], now=0.0)
     assert outbox.settle_ranges(stream(), [(1, 2), (4, 4)]) == 6

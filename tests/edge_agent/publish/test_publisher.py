@@ -205,7 +205,7 @@ def test_a_rejected_batch_is_settled_counted_and_logged(
     assert "of car-b was rejected at row 0: speed" in caplog.text
 
 
-def test_unreadable_or_foreign_acknowledgements_settle_nothing(
+def test_unreadable_or_foreign_acknowledgements_are_ignored(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False

@@ -199,7 +199,7 @@ def test_an_outbox_of_a_former_version_has_no_checksums_and_is_read(tmp_path: Pa
     outbox.close()
 
 
-def test_another_file_is_left_alone(tmp_path: Path) -> None:
+def test_file_that_is_no_database_is_refused_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     path.write_bytes(b"SQLite is what my shopping list is about" * 100)
     with pytest.raises(InputError, match="cannot be opened"):

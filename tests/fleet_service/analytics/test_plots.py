@@ -63,7 +63,7 @@ def test_grip_of_a_day_shows_that_day_and_cells_with_bounds_only() -> None:
     assert len(list_names(axes)) == 2
 
 
-def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
+def test_replay_has_one_map_per_moment_with_unmeasured_cells_hatched() -> None:
     frames = pa.array([NOON_US, NOON_US, NOON_US + 10_000_000], pa.timestamp("us", tz="UTC"))
     table = pa.table(
         {
@@ -85,7 +85,7 @@ def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
     assert [len(one.get_paths()) for one in hatched] == [1]
 
 
-def test_replay_leaves_out_another_town_and_says_so() -> None:
+def test_replay_omits_another_town_and_reports_it() -> None:
     """A drive in another country must not shrink the town to a dot."""
     cells = [CELL, CELL + 1, int(grid.cell_of(37.7, -122.4))]
     frames = pa.array([NOON_US] * 3, pa.timestamp("us", tz="UTC"))

@@ -82,7 +82,7 @@ def _refuse_task(task: str) -> str:
     raise InputError("log", f"{task} is no log", "give another")
 
 
-def test_bad_input_comes_as_itself_and_a_task_that_always_fails_as_a_line(
+def test_errors_of_spark_tasks_are_reported_as_input_errors(
     session: Any,  # noqa: ANN401
 ) -> None:
     with pytest.raises(InputError, match="log: 1.parquet is no log; give another"):

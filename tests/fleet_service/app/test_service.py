@@ -171,7 +171,7 @@ def test_acknowledged_rows_are_in_a_segment_and_on_the_map(
     assert row["south"] < LATITUDE < row["north"]
 
 
-def test_a_changed_tile_is_put_on_its_own_key(fleet: Fleet) -> None:
+def test_changed_tile_is_published_on_its_own_key(fleet: Fleet) -> None:
     fleet.settle(batch("sim-001", 1, now(), [0.8]))
     name, table = fleet.tiles.get(timeout=PATIENCE_S)
     assert name == keys.map_key(TILE)
@@ -388,7 +388,7 @@ def test_box_route_vehicles_and_key_choose_the_cells(fleet: Fleet) -> None:
     assert not ask(session, where=keys.chunks(TILE + 1, 14))
 
 
-def test_neighbours_speak_for_a_cell_only_when_asked(fleet: Fleet) -> None:
+def test_borrowed_cells_are_returned_only_on_request(fleet: Fleet) -> None:
     fleet.settle(*(batch(vehicle, 1, now(), [0.3]) for vehicle in VEHICLES))
     rows = pa.ipc.open_stream(ask(fleet.session, "basis=borrowed")[0][2]).read_all().to_pylist()
     own = next(row for row in rows if row["cell"] == CELL)

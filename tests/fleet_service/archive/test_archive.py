@@ -79,7 +79,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         assert read_settled(acks) == {"sim-001": [(seq, seq)]}
 
 
-def test_nothing_is_acknowledged_while_the_disk_fails_and_all_after(
+def test_rows_are_acknowledged_only_after_a_failing_disk_recovers(
     engine: Engine, tmp_path: Path
 ) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")

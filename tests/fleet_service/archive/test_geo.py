@@ -94,7 +94,7 @@ def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
-def test_points_are_geoparquet_too_and_so_is_nothing(tmp_path: Path, rows: int) -> None:
+def test_points_and_empty_exports_are_geoparquet(tmp_path: Path, rows: int) -> None:
     x = np.linspace(11.0, 12.0, rows)
     y = np.linspace(57.0, 58.0, rows)
     write_table(

@@ -57,7 +57,7 @@ def test_flush_settles_the_open_segment_and_later_rows(log: SegmentLog[str]) -> 
     assert log.flush() == []
 
 
-def test_failed_writes_are_not_settled_and_come_once_with_the_next(
+def test_failed_writes_are_settled_once_by_the_next_write(
     log: SegmentLog[str], tmp_path: Path
 ) -> None:
     inbox = segments.segment_folder(tmp_path, Kind.STATE)

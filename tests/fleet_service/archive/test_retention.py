@@ -47,7 +47,7 @@ def vehicles_in(root: Path, kind: Kind) -> list[str]:
     )
 
 
-def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
+def test_retention_deletes_old_raw_rows_and_keeps_roll_ups(tmp_path: Path) -> None:
     fill(tmp_path, 2, 100)
     compact(tmp_path)
     assert retention.retire_rows(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
@@ -68,7 +68,7 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     assert rollup.complete_parts(tmp_path) == 2  # parts of the day that was kept
 
 
-def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
+def test_retention_shorter_than_batch_repetition_is_refused(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
     with pytest.raises(InputError, match="^raw-days: 7 are too few "):
         retention.retire_rows(tmp_path, 7, DATE)

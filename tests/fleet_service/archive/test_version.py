@@ -366,7 +366,7 @@ def test_reader_skips_damaged_files_and_renames_none(
         assert engine.counts.files_set_aside == 3
 
 
-def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> None:
+def test_every_written_file_states_version_and_digest(tmp_path: Path) -> None:
     make(tmp_path)
     for path in files(tmp_path):
         found = read_content(path)

@@ -168,7 +168,7 @@ def test_readers_see_service_tokens_and_cannot_declare_them(running: Network) ->
             until(lambda: seen.lost_tokens == {served})
 
 
-def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:
+def test_new_vehicle_is_admitted_during_a_rolling_router_restart(running: Network) -> None:
     both = list(running.endpoints.values())
 
     def anywhere(name: str) -> zenoh.Session:

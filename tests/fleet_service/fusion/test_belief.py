@@ -59,7 +59,7 @@ def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
 
 
 @given(st.floats(0.0, 1e7))
-def test_time_leaves_the_prior_where_it_is(seconds: float) -> None:
+def test_time_does_not_change_the_prior(seconds: float) -> None:
     p = mugrid.PRIOR.copy()
     forget(p, seconds)
     np.testing.assert_allclose(p, mugrid.PRIOR, atol=1e-15)

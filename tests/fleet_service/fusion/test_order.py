@@ -123,7 +123,7 @@ def test_a_window_frees_its_places_when_the_checkpoint_passes() -> None:
     assert fusion.waiting <= 4 * 50
 
 
-def test_stores_grow_without_disturbing_what_they_hold() -> None:
+def test_growing_stores_keep_their_content() -> None:
     n = 20_000
     rng = np.random.default_rng(5)
     cells = rng.permutation(n)

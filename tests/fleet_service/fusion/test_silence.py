@@ -38,7 +38,7 @@ def visited(noticed: FloatArray, *, limited: bool = False) -> Fusion:
     return fusion
 
 
-def test_many_quiet_visits_after_ice_leave_it_undecided() -> None:
+def test_many_visits_without_grip_demand_leave_ice_undecided() -> None:
     before = Fusion(120.0)
     before.update(observations(60.0 * np.arange(8), np.arange(8), value(np.full(8, 0.15), 0.03)))
     assert slippery(belief(before)) > 0.95
@@ -98,7 +98,7 @@ def test_few_silent_visits_do_not_outweigh_many_values() -> None:
     )
 
 
-def test_silent_visits_with_little_grip_leave_values() -> None:
+def test_silent_visits_with_little_grip_do_not_change_values() -> None:
     assert median_friction(disputed_cell(3, 20, used=0.2)) == pytest.approx(
         median_friction(disputed_cell(3, 0)), abs=0.06
     )
@@ -119,7 +119,7 @@ def test_silent_visits_alone_raise_no_lower_bound() -> None:
     assert np.array_equal(silent, others)
 
 
-def test_silence_of_vehicles_that_state_nothing_leaves_values() -> None:
+def test_silence_of_vehicles_without_values_does_not_change_values() -> None:
     others = disputed_cell(3, 20, states=False)
     assert median_friction(others) == pytest.approx(median_friction(disputed_cell(3, 0)), abs=0.04)
 

@@ -80,7 +80,7 @@ def test_a_larger_fall_of_a_bound_is_evidence_against_high_friction_only() -> No
     assert interval(belief(fallen))[0] <= interval(belief(flat))[0]
 
 
-def test_ice_is_believed_after_few_passes_of_vehicles_that_had_said_dry() -> None:
+def test_few_passes_suffice_for_ice_after_vehicles_reported_dry() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations(np.arange(10) * 20.0, np.arange(10), value(np.full(10, 0.85))))
     assert slippery(belief(fusion)) < 0.01

@@ -95,7 +95,7 @@ def test_decoder_reads_messages_of_the_protobuf_module_exactly(
     st.integers(0, 2000),
     st.binary(max_size=12),
 )
-def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
+def test_decoder_agrees_with_the_protobuf_module_on_damaged_bytes(
     case: tuple[Kind, Any], flips: list[tuple[int, int]], cut: int, inserted: bytes
 ) -> None:
     kind, message = case
@@ -109,9 +109,7 @@ def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
 
 
 @given(st.binary(max_size=200), KINDS)
-def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(
-    payload: bytes, kind: Kind
-) -> None:
+def test_decoder_agrees_with_the_protobuf_module_on_any_bytes(payload: bytes, kind: Kind) -> None:
     is_agreed(kind, payload)
 
 

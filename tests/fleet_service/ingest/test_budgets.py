@@ -318,7 +318,7 @@ def test_a_budget_fills_again() -> None:
     ]
 
 
-def test_a_forgotten_month_leaves_nothing_that_names_a_vehicle(tmp_path: Path) -> None:
+def test_forgotten_month_leaves_no_vehicle_name(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.intake.ingest([message(batch("car-001", 1, now, [0.8]))], now)

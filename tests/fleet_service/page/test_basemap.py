@@ -125,9 +125,7 @@ def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
 
 
 @pytest.mark.campaign
-def test_a_person_sees_the_file_below_the_map_without_any_network(
-    router: ZenohSettings, tmp_path: Path
-) -> None:
+def test_base_map_file_is_shown_without_network(router: ZenohSettings, tmp_path: Path) -> None:
     """The picture in the operator's map file must be visible below the map, enlarged beyond the
     file's deepest zoom level. At low zoom levels the page must request no tile of the file, and at
     no level anything from another host.
@@ -174,7 +172,7 @@ def test_mbtiles_value_that_is_no_tile_is_none(tmp_path: Path, value: str) -> No
     assert cast(TileFile, base_map(str(path)).file).picture(0, 0, 0) is None
 
 
-def test_mbtiles_view_with_an_endless_query_is_given_up(tmp_path: Path) -> None:
+def test_mbtiles_view_with_an_endless_query_is_aborted(tmp_path: Path) -> None:
     path = tiles_in(tmp_path / "a.mbtiles", {(0, 0, 0): b"x"})
     endless = "with recursive n(i) as (select 1 union all select i + 1 from n) select max(i) from n"
     file = cast(TileFile, base_map(str(path)).file)

@@ -69,7 +69,7 @@ def test_known_slippery_is_never_grey() -> None:
     assert colour_of(0.35, 0.05, 1.1, 0.5) == LITTLE
 
 
-def test_nothing_is_green() -> None:
+def test_no_colour_of_the_map_is_green() -> None:
     for colour in (*ALL, *DARK):
         red, green, blue = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
         hue, saturation, _ = colorsys.rgb_to_hsv(red, green, blue)

@@ -89,7 +89,7 @@ def test_readers_of_others_open_it_and_see_bounds_without_a_value(
     assert measured.total_bounds[3] == pytest.approx(north.max())
 
 
-def test_mu_is_a_number_also_to_who_sees_only_bounds_first(
+def test_mu_is_a_number_column_even_if_all_cells_are_bounds(
     page: RunningPage, drive: Drive, tmp_path: Path
 ) -> None:
     drive_parts(page, drive, "passed")
@@ -98,7 +98,7 @@ def test_mu_is_a_number_also_to_who_sees_only_bounds_first(
     assert found["vehicles"].dtype.kind == "i"
 
 
-def test_pages_follow_each_other_and_nothing_is_there_twice(
+def test_pages_of_an_answer_are_complete_without_duplicates(
     page: RunningPage, drive: Drive
 ) -> None:
     drive_parts(page, drive, "ice", "wet")

@@ -12,7 +12,7 @@ import pytest
 from fleet_service.page.health import ServiceHealth
 
 
-def test_an_address_that_does_not_speak_http_does_not_answer() -> None:
+def test_address_without_http_counts_as_not_answering() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def reply() -> None:

@@ -294,7 +294,7 @@ def test_region_of_a_missing_service_is_reported_and_not_empty(
 
 
 @pytest.mark.campaign
-def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage) -> None:
+def test_page_detects_a_silent_server_by_its_own_clock(page: RunningPage) -> None:
     with open_map(page) as seen:
         waits(seen, "gripmap.live.state")
         # Closing the source causes no error event.

@@ -111,7 +111,7 @@ def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(
         look(seen, "borrowed")
 
 
-def test_a_route_hides_no_cell(page: RunningPage, drive: Drive) -> None:
+def test_drawn_route_covers_no_cell(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     ice = ",".join(str(int(palette.FOUR[0][k : k + 2], 16)) for k in (1, 3, 5))
     ends = [

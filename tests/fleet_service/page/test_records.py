@@ -64,7 +64,7 @@ def test_a_record_is_accurate_and_never_narrower_or_drier(table: pa.Table) -> No
     assert np.array_equal(found["vehicles"], told["vehicles"])
 
 
-def test_a_bound_has_no_number_to_colour_by_whoever_sent_it(table: pa.Table) -> None:
+def test_bound_has_no_value_to_colour_by(table: pa.Table) -> None:
     place = table.schema.get_field_index("mu")
     lying = table.set_column(
         place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.8, np.float32))
@@ -97,7 +97,7 @@ def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(
             )
 
 
-def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
+def test_one_icy_cell_among_thousands_is_visible_at_low_zoom() -> None:
     cells = np.zeros(4000, RECORD)
     cells["place"] = np.arange(4000) * 4
     for name, whole in (("mu", 170), ("lower", 160), ("upper", 180), ("basis", MEASURED)):

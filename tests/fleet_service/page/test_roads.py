@@ -103,7 +103,7 @@ def test_recent_moments_are_kept_in_steps_and_thinned_with_age() -> None:
     assert min(np.diff(times)) >= STEP_S
 
 
-def test_nothing_is_kept_twice_while_nothing_changes() -> None:
+def test_unchanged_moment_is_stored_once() -> None:
     recent = RecentMoments()
     tile = np.zeros(3, np.void)
     for second in range(0, 100, 10):

@@ -16,7 +16,7 @@ from fleet_service.page.module_bundle import bundle_modules
 from tests.structure import ROOT
 
 
-def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
+def test_every_text_is_in_the_table_and_every_entry_is_used() -> None:
     static = ROOT / "fleet_service/page/static"
     table: dict[str, str] = json.loads((static / "texts.en.json").read_text())
     source = "\n".join(path.read_text() for path in static.glob("*.js"))
@@ -42,7 +42,7 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
     assert all(f'"{key}"' not in source or key in table for key in table)
 
 
-def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
+def test_bundled_modules_behave_as_separate_ones() -> None:
     """When the page's modules are joined, each import must become the exported value. A private
     name that two modules use must become two variables.
     """

@@ -220,7 +220,7 @@ def test_rows_in_a_checkpoint_are_on_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", ["truncate", "remove", "flip"])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(
+def test_damaged_checkpoint_is_replaced_by_the_earlier_one_and_the_log(
     tmp_path: Path, harm: str
 ) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
@@ -311,7 +311,7 @@ def test_checkpoint_that_crashes_the_service_is_abandoned(tmp_path: Path) -> Non
     checkpoints.load_checkpoint(path)
 
 
-def test_checkpoint_is_given_up_if_errors_end_the_service(
+def test_checkpoint_is_abandoned_if_errors_end_the_service(
     router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -110,7 +110,7 @@ def test_cell_forgotten_by_day_does_not_return_with_one_vehicle(busy: Map) -> No
     assert busy.seen(night + LATER_S)
 
 
-def test_dropped_slots_free_what_was_held(busy: Map) -> None:
+def test_dropped_slots_release_their_memory(busy: Map) -> None:
     busy.visit(LATER_S + 1, 6)
     busy.visit(LATER_S + 1, 6, cell=CELL + 1)
     before = busy.seen(LATER_S + 5)

@@ -200,7 +200,7 @@ def half(session: zenoh.Session) -> Iterator[Half]:
     declared.undeclare()
 
 
-def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half: Half) -> None:
+def test_small_query_is_answered_during_a_large_earlier_one(half: Half) -> None:
     large = half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0)
     assert half.begun.acquire(timeout=30.0)
     assert half.ask(3) == ["last"]

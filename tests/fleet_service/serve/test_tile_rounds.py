@@ -99,7 +99,7 @@ def test_stopping_service_publishes_remaining_tiles_once_each() -> None:
     assert [tile for tile, _ in made.puts] == [1, 2, 3, 4, 5, 6]
 
 
-def test_tiles_that_are_put_together_are_put_once() -> None:
+def test_each_tile_is_published_once_per_round() -> None:
     puts: list[int] = []
 
     def put_two(waiting: list[int]) -> int:

@@ -287,7 +287,7 @@ def drive_one(session: zenoh.Session, service: Running) -> None:
 
 
 @pytest.mark.parametrize("comes_back", [False, True])
-def test_a_leaving_service_may_be_asked_instead_of_its_successor(
+def test_query_during_a_handover_may_reach_the_leaving_service(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, comes_back: bool
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"

@@ -59,7 +59,7 @@ def test_commit_is_that_of_the_source_with_a_mark_if_changed(
     assert commit(source) == f"{head}-dirty"
 
 
-def test_the_file_starts_with_a_header_and_says_what_does_not_hold(tmp_path: Path) -> None:
+def test_figures_file_has_a_header_and_marks_missed_targets(tmp_path: Path) -> None:
     figures = [Figure("good", 1.0, "s", 2.0), Figure("bad", float("nan"), "s", 2.0)]
     write(tmp_path / "out" / "figures.json", "demo", [1], figures)
     first, good, bad = json.loads((tmp_path / "out" / "figures.json").read_text())

@@ -27,7 +27,7 @@ while not Path(sys.argv[1]).exists() or not Path(sys.argv[1]).read_text():
 """
 
 
-def test_the_work_sees_the_memory_as_it_was_at_the_start(tmp_path: Path) -> None:
+def test_forked_work_uses_the_memory_at_its_start(tmp_path: Path) -> None:
     numbers = np.arange(100_000)
     expected = numbers.copy()
     working = run_forked(lambda: np.save(tmp_path / "numbers.npy", numbers))

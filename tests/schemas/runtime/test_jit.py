@@ -52,7 +52,7 @@ def run_outer(folder: Path, factor: str, before: str = "", package: str = "kerne
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("package", ["kernels", "edge_agent"])
-def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path, package: str) -> None:
+def test_changed_kernel_invalidates_the_caches_of_its_callers(tmp_path: Path, package: str) -> None:
     assert run_outer(tmp_path, "2.0", package=package) == "3.0"
     assert run_outer(tmp_path, "5.0", package=package) == "6.0"
     assert len(list((tmp_path / "cache" / "gripmap").glob("kernels-*"))) == 2

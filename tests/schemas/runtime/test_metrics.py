@@ -69,7 +69,7 @@ def test_health_follows_the_troubles() -> None:
         refused.value.close()
 
 
-def test_without_a_port_nothing_listens() -> None:
+def test_no_metrics_server_runs_without_a_port() -> None:
     with serve_metrics("127.0.0.1", None, read_metrics, list) as address:
         assert address is None
 

@@ -39,7 +39,7 @@ def encode_stream(content: pa.Table, compression: Literal["lz4", "zstd"] | None 
 
 
 @pytest.mark.parametrize("rows", [0, 1, 300])
-def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
+def test_tile_round_trips_unchanged(rows: int) -> None:
     assert decode_tile(encode_stream(make_table(rows))).equals(make_table(rows))
 
 

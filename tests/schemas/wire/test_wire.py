@@ -49,7 +49,7 @@ def assert_same(a: Batch, b: Batch) -> None:
 
 
 @pytest.mark.parametrize("kind", Kind)
-def test_a_batch_comes_back_as_it_was_sent(kind: Kind) -> None:
+def test_batch_round_trips_unchanged(kind: Kind) -> None:
     sent = batch(kind, 50)
     assert_same(decode(wire.encode(sent), wire.ENCODING[kind], kind), sent)
 

@@ -185,7 +185,7 @@ def test_foreign_tyres_make_another_drive(kind: str) -> None:
     assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
 
 
-def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
+def test_report_shows_all_figures() -> None:
     text = evaluation_report(
         [
             Figure("papers.001.rmse_vx", 0.3, "m/s", 0.02),
@@ -239,7 +239,7 @@ def test_the_quick_campaign_writes_figures_report_and_plots(
 
 
 @pytest.mark.campaign
-def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
+def test_options_add_seeds_and_omit_plots(tmp_path: Path) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (
         0,
         1,

@@ -57,7 +57,7 @@ def judge(
 
 
 @pytest.mark.parametrize(("friction", "right"), [(0.6, 1.0), (0.3, 0.0), (0.9, 0.0)])
-def test_measured_friction_lies_in_the_interval_or_it_is_wrong(
+def test_interval_is_right_only_if_it_contains_the_measured_friction(
     friction: float, right: float
 ) -> None:
     found = judge(friction)

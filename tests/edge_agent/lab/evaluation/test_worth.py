@@ -48,7 +48,7 @@ def test_worth_is_the_ratio_of_means_with_its_spread_per_surface() -> None:
     assert "fuzzy.worth.dry" not in found
 
 
-def test_bars_come_first_and_a_missing_way_does_not_hold() -> None:
+def test_figures_with_targets_are_first_and_missing_ones_fail() -> None:
     scores = {"fuzzy": {"all": np.array([1.0])}, "sets_off": {"all": np.array([1.1])}}
     found = worth.barred_figures(scores)
     assert [figure.name for figure in found[:3]] == list(worth.BARS)

@@ -122,7 +122,7 @@ def test_tyres_are_excited_and_most_of_all_where_it_is_slippery(
     assert 0.03 < share[0] < share[1] < share[2] < 0.95
 
 
-def test_ice_lies_under_the_wheels_only_once_it_has_appeared(
+def test_ice_is_under_the_wheels_only_after_it_appeared(
     drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth],
 ) -> None:
     fleet, t, _, truth = drive

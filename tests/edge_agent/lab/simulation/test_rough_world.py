@@ -111,7 +111,7 @@ def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
 
 
 @pytest.mark.parametrize("slope", [-0.06, 0.03])
-def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> None:
+def test_coasting_vehicle_gains_only_its_lost_potential_energy(slope: float) -> None:
     p = replace(PRESETS["sedan"], drag=0.0, rolling=0.0).row()
     x = np.zeros(STATES)
     u = np.zeros((INPUTS, 4))
@@ -154,7 +154,7 @@ def test_loads_sum_to_the_normal_weight_and_shift_downhill() -> None:
     assert w[Wheel.FZ, 0] > w[Wheel.FZ, 1]
 
 
-def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
+def test_brake_force_is_limited_by_brakes_and_friction() -> None:
     for force, mu, stays in (
         (-8000.0, 0.85, True),
         (-400.0, 0.85, False),
@@ -170,7 +170,7 @@ def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
 
 
 @pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])
-def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
+def test_traffic_lights_stop_hold_and_release_the_vehicle(slope: float) -> None:
     log, _ = simulate_manoeuvre("stop-and-go", setup=DriveSetup(sensors="ideal", slope=slope))
     speed = column(log, "true_vx")
     stands = speed == 0.0

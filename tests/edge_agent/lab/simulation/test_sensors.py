@@ -76,7 +76,7 @@ def test_offsets_and_gain_are_constant_in_a_drive_and_vary_between_drives() -> N
     assert np.abs(halves).max() < 0.01
 
 
-def test_position_comes_ten_times_a_second_and_wanders_by_metres() -> None:
+def test_position_has_ten_hertz_and_errors_of_metres() -> None:
     log, _ = simulate_manoeuvre("straight", duration_s=30.0)
     latitude, longitude, yaw = (column(log, name) for name in ("latitude", "longitude", "yaw"))
     fixes = np.isfinite(latitude)
@@ -88,7 +88,7 @@ def test_position_comes_ten_times_a_second_and_wanders_by_metres() -> None:
     assert log["latitude"].null_count == 3000 - 300
 
 
-def test_metres_go_to_degrees_and_back() -> None:
+def test_metres_and_degrees_convert_both_ways() -> None:
     x = np.array([0.0, 200.0, -3e3])
     y = np.array([0.0, -150.0, 4e3])
     np.testing.assert_allclose(
@@ -122,7 +122,7 @@ def test_vehicle_files_are_wrong_by_a_few_per_cent_in_listed_fields() -> None:
 
 
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_changes_its_channel_in_its_time_and_nothing_else(kind: str) -> None:
+def test_planted_fault_changes_only_its_channel_in_its_period(kind: str) -> None:
     t = np.arange(300) / 100.0
     signals = np.random.default_rng(0).normal(size=(300, len(CHANNELS)))
     faulty = apply_faults(t, signals, (Fault(kind, "ay", 1.0, 2.0, size=5.0),))

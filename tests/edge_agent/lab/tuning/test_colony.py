@@ -144,7 +144,7 @@ def test_result_depends_only_on_the_seed() -> None:
 
 
 @pytest.mark.parametrize("search", [colony, random_search])
-def test_progress_tells_every_iteration_and_the_best_never_falls(search: object) -> None:
+def test_progress_lists_every_iteration_and_the_best_never_falls(search: object) -> None:
     reported: list[Iteration] = []
     result = run(search, bowl(2), 6, progress=reported.append)
     assert tuple(reported) == result.history

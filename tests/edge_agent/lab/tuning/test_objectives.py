@@ -168,7 +168,7 @@ def test_a_wrong_calibration_costs_a_prediction_alike_on_both_sides() -> None:
     assert small < right - 20.0
 
 
-def test_towns_stand_beside_manoeuvres_and_share_no_seed() -> None:
+def test_tuning_towns_and_manoeuvres_share_no_seed() -> None:
     both = record_all("train", 2.0)
     assert len(both.vehicles) == len(TRAIN) + sum(TOWNS["train"][1] for _ in TOWNS["train"][0])
     assert both.signals.shape[:2] == both.mu.shape == (200, len(both.vehicles))
@@ -183,7 +183,7 @@ def arguments(*words: str) -> argparse.Namespace:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("objective", ["interval", "innovation", "predictive"])
-def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
+def test_quick_tuning_writes_a_valid_file_and_reports_its_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], objective: str
 ) -> None:
     out = tmp_path / "tuned.json"

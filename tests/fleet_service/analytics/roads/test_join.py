@@ -132,7 +132,7 @@ def test_road_join_is_right_at_any_latitude() -> None:
         assert own.length_m.iloc[0] == pytest.approx(400, rel=1e-3)
 
 
-def test_the_command_writes_what_the_question_reads(
+def test_roads_command_writes_the_file_that_analyses_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "roads.parquet"
