@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from deploy.demo import compare, page, processes, screenshot
 from deploy.demo.ice import new_ice
 from deploy.demo.listener import Listener
-from edge_agent.lab.simulation.scenarios import scenario_named
+from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli.common import stop_on_signals
 from schemas.config import ZenohSettings
@@ -28,7 +28,7 @@ from schemas.runtime import commandline, figures
 from schemas.runtime.zenoh_session import open_session
 
 FOLDER = Path(".demo")
-REPORT_S = 5.0
+REPORT_S = 5.0  # [s] time between two progress lines
 
 
 def drive_fleet(
@@ -102,6 +102,36 @@ def report_figures(
     return found
 
 
+def _make_folder() -> None:
+    """Make the empty folder of the demo. Raise an InputError if this is not possible."""
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    try:
+        FOLDER.mkdir()
+    except OSError as error:
+        problem = f"cannot make the folder {FOLDER} ({error.strerror})"
+        raise InputError("demo", problem, "start it in a folder that you may write to") from error
+
+
+def _drive_and_judge(
+    args: argparse.Namespace, scenario: Scenario, endpoint: str, began: float
+) -> list[figures.Figure]:
+    """Let the fleet drive, compare the map with the true road, and return the figures of the demo.
+    `began` is the monotonic time at which the demo started [s].
+    """
+    listener, counts = drive_fleet(FOLDER, endpoint, args)
+    visits = pq.read_table(FOLDER / "truth.parquet")
+    ice = new_ice(scenario, compare.start_time(visits))
+    comparison = compare.compare(listener.whole_map(), visits, ice.since_ns)
+    compare.write_truth(visits, ice.since_ns, FOLDER / "overlay.parquet")
+    show_clients(FOLDER, endpoint, comparison)
+    listener.close()
+    wall_s = time.monotonic() - began
+    demo = compare.DemoRun(visits, listener.alerts, ice, counts)
+    measured = compare.demo_figures(comparison, demo, FOLDER / "archive", wall_s)
+    grip = compare.lost_grip(visits, listener.alerts, ice, args.warned)
+    return report_figures(FOLDER, comparison, measured, grip, args.seed)
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the whole demo; return 1 if a figure misses a target that the demo must meet.
 
@@ -115,12 +145,7 @@ def run(args: argparse.Namespace) -> int:
     # End by SIGTERM as by Ctrl-C: an exception, so that the processes of the demo are stopped.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     began = time.monotonic()
-    shutil.rmtree(FOLDER, ignore_errors=True)
-    try:
-        FOLDER.mkdir()
-    except OSError as error:
-        problem = f"cannot make the folder {FOLDER} ({error.strerror})"
-        raise InputError("demo", problem, "start it in a folder that you may write to") from error
+    _make_folder()
     scenario = scenario_named(processes.SCENARIO)
     appears_s = scenario.events[0].start
     print(
@@ -134,18 +159,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"\n  Live map: {address}\n", flush=True)
         if args.open:
             webbrowser.open(address)
-        listener, counts = drive_fleet(FOLDER, endpoint, args)
-        visits = pq.read_table(FOLDER / "truth.parquet")
-        ice = new_ice(scenario, compare.start_time(visits))
-        comparison = compare.compare(listener.whole_map(), visits, ice.since_ns)
-        compare.write_truth(visits, ice.since_ns, FOLDER / "overlay.parquet")
-        show_clients(FOLDER, endpoint, comparison)
-        listener.close()
-        wall_s = time.monotonic() - began
-        demo = compare.DemoRun(visits, listener.alerts, ice, counts)
-        measured = compare.demo_figures(comparison, demo, FOLDER / "archive", wall_s)
-        grip = compare.lost_grip(visits, listener.alerts, ice, args.warned)
-        found = report_figures(FOLDER, comparison, measured, grip, args.seed)
+        found = _drive_and_judge(args, scenario, endpoint, began)
         if args.screenshot is not None:
             screenshot.take_screenshot(address, args.screenshot)
         if args.stay:

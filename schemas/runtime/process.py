@@ -35,7 +35,7 @@ def limit_memory(*without: str) -> None:
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     with suppress(AttributeError, OSError):  # the C library is not glibc
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
-    sys.meta_path.insert(0, _Without({"pandas", *without}))
+    sys.meta_path.insert(0, _BlockedImports({"pandas", *without}))
 
 
 def trim_memory() -> None:
@@ -78,7 +78,9 @@ def exit_fast(code: int) -> NoReturn:
     force_exit(code)
 
 
-class _Without(MetaPathFinder):
+class _BlockedImports(MetaPathFinder):
+    """Finder that raises ModuleNotFoundError for the modules `names`."""
+
     def __init__(self, names: set[str]) -> None:
         self._names = names
 
