@@ -69,7 +69,8 @@ class MapComparison:
         """Return a mask of the table's rows, (n,): True if the true friction lies in the map's 90 %
         interval.
         """
-        lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
+        lower = self.cells["mu_lower"].to_numpy()
+        upper = self.cells["mu_upper"].to_numpy()
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
@@ -189,7 +190,8 @@ def count_passes(rows: pa.Table) -> int:
     """
     order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
     vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
-    enter, left = (order[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
+    enter = order["enter_time"].cast(pa.int64()).to_numpy()
+    left = order["leave_time"].cast(pa.int64()).to_numpy()
     if not len(order):
         return 0
     return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > PASS_GAP_NS)))
@@ -304,9 +306,8 @@ def lost_grip(
     count = max((_vehicle_number(name) for name in vehicles), default=0)
     warned = choose_warned(count, share)
     passes: dict[tuple[str, int], tuple[bool, int]] = {}  # lost, cell; by vehicle and number
-    enter, left = (
-        visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time")
-    )
+    enter = visits["enter_time"].cast(pa.int64()).to_numpy()
+    left = visits["leave_time"].cast(pa.int64()).to_numpy()
     last: dict[str, tuple[int, int]] = {}
     order = np.argsort(enter, kind="stable")
     for k in order[on[order] & (enter[order] >= since[order])].tolist():

@@ -25,7 +25,8 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
     """
     cells = comparison.cells
     shapes = cell_shapes(cells["cell"].to_numpy(), cells["sector"].to_numpy().astype(np.int64))
-    lower, upper = (cells[name].to_numpy() for name in ("mu_lower", "mu_upper"))
+    lower = cells["mu_lower"].to_numpy()
+    upper = cells["mu_upper"].to_numpy()
     figure = Figure(figsize=(17, 5.4), layout="constrained")
     truth, found, width = figure.subplots(1, 3, sharex=True, sharey=True)
     paint(truth, shapes, comparison.truth)

@@ -193,9 +193,9 @@ class LocalMap:
         share = -np.expm1(-age_s / CHANGE_S)[:, None]
         faded = (1.0 - share) * cells.belief + share * mugrid.PRIOR
         is_known = (cells.basis != UNKNOWN) & (age_s <= HELD_S)
-        lower, mu, upper = (
-            np.where(is_known, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95)
-        )
+        lower = np.where(is_known, mugrid.quantiles(faded, 0.05), np.nan)
+        mu = np.where(is_known, mugrid.quantiles(faded, 0.5), np.nan)
+        upper = np.where(is_known, mugrid.quantiles(faded, 0.95), np.nan)
         return PlaceBelief(
             key,
             np.where(cells.basis == BOUND, np.nan, mu),

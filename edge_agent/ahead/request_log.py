@@ -155,9 +155,8 @@ def _split_path(path: Path, needed: BoolArray) -> list[tuple[int, int]]:
 
 
 def _fits_box(path: Path, first: int, last: int) -> bool:
-    wide, high = (
-        float(np.ptp(side[first : last + 1])) + 2.0 * BESIDE_M for side in (path.x, path.y)
-    )
+    wide = float(np.ptp(path.x[first : last + 1])) + 2.0 * BESIDE_M
+    high = float(np.ptp(path.y[first : last + 1])) + 2.0 * BESIDE_M
     return last - first <= LONGEST_M and wide * high <= AREA_M2
 
 

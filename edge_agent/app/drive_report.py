@@ -105,7 +105,8 @@ def curve_of(
     upper ends of the interval, in the plot's unit. Both ends are NaN for a quantity without
     interval.
     """
-    t, value = (table[name].to_numpy().astype(np.float64) for name in ("t", panel.column))
+    t = table["t"].to_numpy().astype(np.float64)
+    value = table[panel.column].to_numpy().astype(np.float64)
     if len(panel.band) == 2:
         low, high = (table[name].to_numpy().astype(np.float64) for name in panel.band)
     elif panel.band:
@@ -210,7 +211,9 @@ def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
     table = next(iter(drive.estimates.values()))
     t = drive.log.t[rows]
     at = np.clip(np.searchsorted(table["t"].to_numpy(), t), 0, table.num_rows - 1)
-    mu, lower, upper = (table[name].to_numpy()[at] for name in ("mu", "mu_lower", "mu_upper"))
+    mu = table["mu"].to_numpy()[at]
+    lower = table["mu_lower"].to_numpy()[at]
+    upper = table["mu_upper"].to_numpy()[at]
     sure = (upper - lower < 0.5) | (upper < SLIPPERY_MU)
     colours = [
         shade(float(m), *GRIP_RANGE) if ok and m == m else None

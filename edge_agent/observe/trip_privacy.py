@@ -121,9 +121,8 @@ def _join_records(first: _PlacedRecords, second: _PlacedRecords) -> _PlacedRecor
     columns = {
         name: np.concatenate([column, other.columns[name]]) for name, column in one.columns.items()
     }
-    vehicle, urgent = (
-        np.concatenate([getattr(r, n) for r in (one, other)]) for n in ("vehicle", "urgent")
-    )
+    vehicle = np.concatenate([r.vehicle for r in (one, other)])
+    urgent = np.concatenate([r.urgent for r in (one, other)])
     return _PlacedRecords(
         RecordBlock(one.kind, columns, vehicle, urgent),
         np.concatenate([first.t, second.t]),

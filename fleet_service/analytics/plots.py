@@ -269,9 +269,9 @@ def _draw_change_rates(figure: Figure, table: pa.Table) -> None:
 def _draw_contract(figure: Figure, table: pa.Table) -> None:
     shown = table.slice(0, MOST_ROWS)
     axes = figure.subplots()
-    mean, least, most = (
-        24.0 * _float_column(shown, name) / DAY_S for name in ("breach_s", "least_s", "most_s")
-    )
+    mean = 24.0 * _float_column(shown, "breach_s") / DAY_S
+    least = 24.0 * _float_column(shown, "least_s") / DAY_S
+    most = 24.0 * _float_column(shown, "most_s") / DAY_S
     names = [
         f"{row['name'] or row['link']}, {row['direction']}: {row['verdict']}"
         for row in shown.to_pylist()
@@ -315,7 +315,9 @@ def _draw_calibration(figure: Figure, table: pa.Table) -> None:
 def _draw_weather(figure: Figure, table: pa.Table) -> None:
     table = table.sort_by("temperature")
     left, right = figure.subplots(1, 2)
-    t, p10, p50 = (_float_column(table, name) for name in ("temperature", "mu_p10", "mu_p50"))
+    t = _float_column(table, "temperature")
+    p10 = _float_column(table, "mu_p10")
+    p50 = _float_column(table, "mu_p50")
     left.plot(t, p50, "o-", color=_DARK, label="median")
     left.plot(t, p10, "s:", color=_LIGHT, label="worst tenth")
     left.axvline(0.0, color="0.6", linewidth=1)

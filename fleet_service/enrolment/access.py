@@ -65,7 +65,8 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
     """
     router = fleet.routers[name]
     before = list(fleet.routers)[: list(fleet.routers).index(name)]
-    certificate, key = (str(certificates / f"{name}.{ending}") for ending in ("pem", "key"))
+    certificate = str(certificates / f"{name}.pem")
+    key = str(certificates / f"{name}.key")
     return {
         "mode": "router",
         "listen": {"endpoints": router.listens},

@@ -233,9 +233,8 @@ class SequenceTrackers:
                 *(column[first].tolist() for column in (vehicle, boot, region)), strict=True
             )
         ]
-        held, newest = (
-            largest_of(column, group, len(first)).tolist() for column in (first_held, time)
-        )
+        held = largest_of(first_held, group, len(first)).tolist()
+        newest = largest_of(time, group, len(first)).tolist()
         for stream, least, last in zip(streams, held, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)

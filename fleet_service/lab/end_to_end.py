@@ -111,7 +111,8 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     truth = truth[several]
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited_vehicles(fusion, visits)[slots])
-    lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
+    lower = mugrid.quantiles(belief, LOWER)
+    upper = mugrid.quantiles(belief, UPPER)
     with_value = is_measured(
         lower, upper, fusion.live.values[slots], belief @ mugrid.SLIPPERY_SHARE
     )

@@ -75,7 +75,8 @@ def ask_moments(folder: Path) -> list[AskedWay]:
         slots = slots[several]
         truth = truth[several]
         belief = fusion.beliefs(slots, until)
-        lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
+        lower = mugrid.quantiles(belief, LOWER)
+        upper = mugrid.quantiles(belief, UPPER)
         scores = of_beliefs(belief, truth, end_to_end.excited_vehicles(fusion, past)[slots])
         out.append(
             AskedWay(

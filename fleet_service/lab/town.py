@@ -94,7 +94,8 @@ def draw_town(rng: Generator, minutes: int, changing: float, model: ErrorModel =
 
     def draw_surface() -> FloatArray:
         drawn = rng.choice(len(names), stretches, p=share)
-        mean, spread = (np.array([n[k] for n in names])[drawn] for k in (0, 1))
+        mean = np.array([n[0] for n in names])[drawn]
+        spread = np.array([n[1] for n in names])[drawn]
         return np.repeat(mean + spread * rng.normal(size=stretches), STRETCH)
 
     steps = (

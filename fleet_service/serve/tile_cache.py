@@ -133,7 +133,8 @@ class TileCache:
             slots, owners = self._by_tile_from_south(self.public_slots(slots, now))
             cells = self.read_cells(slots, now)
         batch = batch_of(cells, now)
-        first, last = (np.searchsorted(owners, tiles, side) for side in ("left", "right"))
+        first = np.searchsorted(owners, tiles, "left")
+        last = np.searchsorted(owners, tiles, "right")
         made = []
         for k, tile in enumerate(tiles):
             payload = arrow_stream(batch.slice(first[k], last[k] - first[k]))

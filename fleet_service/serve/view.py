@@ -100,11 +100,10 @@ def coarsen_cells(cells: CellView) -> CellView:
     """Return the cells with times and counts rounded for privacy, so that no single passage of a
     vehicle is visible.
     """
-    vehicles, observations = (
-        coarse_counts(np.asarray(column, np.int64))
-        for column in (cells.vehicles, cells.observations)
-    )
-    first, last = (time // TIME_STEP_NS * TIME_STEP_NS for time in (cells.first, cells.last))
+    vehicles = coarse_counts(np.asarray(cells.vehicles, np.int64))
+    observations = coarse_counts(np.asarray(cells.observations, np.int64))
+    first = cells.first // TIME_STEP_NS * TIME_STEP_NS
+    last = cells.last // TIME_STEP_NS * TIME_STEP_NS
     return cells._replace(vehicles=vehicles, observations=observations, first=first, last=last)
 
 

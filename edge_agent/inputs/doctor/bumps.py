@@ -54,10 +54,8 @@ def leading_axle(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> int:
     if fast.sum() * STEP_M < LEAST_M:
         return 0
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
-    front, rear = (
-        _side_unevenness(np.interp(at, way, (rims[:, right] - rims[:, left])[rows]), wheelbase)
-        for left, right in ((0, 1), (2, 3))
-    )
+    front = _side_unevenness(np.interp(at, way, (rims[:, 1] - rims[:, 0])[rows]), wheelbase)
+    rear = _side_unevenness(np.interp(at, way, (rims[:, 3] - rims[:, 2])[rows]), wheelbase)
     return _travel_direction(front, rear, fast, wheelbase)
 
 

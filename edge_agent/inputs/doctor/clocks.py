@@ -79,7 +79,8 @@ def late_devices(diagnosis: Diagnosis) -> dict[str, float]:
     to the inertial unit. It is attributed to the gyroscope alone if the unit's accelerometer is not
     late compared with the wheels.
     """
-    wheel, steer = (diagnosis.lags.get(name, 0.0) for name in ("wheel_lag", "steer_lag"))
+    wheel = diagnosis.lags.get("wheel_lag", 0.0)
+    steer = diagnosis.lags.get("steer_lag", 0.0)
     if not (abs(wheel) > LARGEST_LAG_S and abs(wheel - steer) < 0.5 * abs(wheel)):
         return {"wheels": wheel, "steering": steer}
     late = -0.5 * (wheel + steer)

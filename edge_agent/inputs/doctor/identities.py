@@ -414,7 +414,8 @@ def _correlation_peak(
     good = np.isfinite(left) & np.isfinite(right) & moving.astype(bool)
     if good.sum() < FEWEST_S * RATE_HZ:
         return 0.0, False
-    x, y = (np.where(good, side - np.mean(side[good]), 0.0) for side in (right, left))
+    x = np.where(good, right - np.mean(right[good]), 0.0)
+    y = np.where(good, left - np.mean(left[good]), 0.0)
     most = round(LONGEST_LAG_S * RATE_HZ)
     size = len(x) + round(LONGEST_LAG_S * RATE_HZ)
     spectrum = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)

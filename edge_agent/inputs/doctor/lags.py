@@ -141,7 +141,8 @@ def _find_delay(
     if like[top] < least or top in (0, 2 * most):
         return None
     here = like[top]
-    before, after = (correlate_at(top - most + k) for k in (-1, 1))
+    before = correlate_at(top - most - 1)
+    after = correlate_at(top - most + 1)
     seconds = (top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ
     return _Peak(float(seconds), float(here))
 

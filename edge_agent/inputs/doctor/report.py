@@ -147,8 +147,10 @@ def _scatter_plot(name: str, fit: Fit) -> str:
     step = max(1, len(fit.right) // POINTS)
     x = fit.right[::step]
     y = fit.left[::step]
-    low, high = (float(np.percentile(x, q)) for q in (0.5, 99.5))
-    bottom, top = (float(np.percentile(y, q)) for q in (0.5, 99.5))
+    low = float(np.percentile(x, 0.5))
+    high = float(np.percentile(x, 99.5))
+    bottom = float(np.percentile(y, 0.5))
+    top = float(np.percentile(y, 99.5))
     if not (high > low and top > bottom):
         return ""
 
@@ -164,7 +166,8 @@ def _scatter_plot(name: str, fit: Fit) -> str:
         f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in points_at(x, y)
     )
     ends = np.array([low, high])
-    law, found = (" ".join(points_at(ends, gain * ends)) for gain in (1.0, fit.gain))
+    law = " ".join(points_at(ends, ends))
+    found = " ".join(points_at(ends, fit.gain * ends))
     across, up = AXES[name]
     return (
         f"<figure><svg width='{SIDE}' height='{SIDE}' viewBox='0 0 {SIDE} {SIDE}' role='img'>"

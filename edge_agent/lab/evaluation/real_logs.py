@@ -240,10 +240,8 @@ def known_friction(
     friction, if there is one.
     """
     at = np.arange(t[0], t[-1], 1.0 / RATE_HZ)
-    along, across = (
-        smooth_twice(interpolate_near(t, signals[:, channel], at), SMOOTH_S)
-        for channel in (S.AX, S.AY)
-    )
+    along = smooth_twice(interpolate_near(t, signals[:, S.AX], at), SMOOTH_S)
+    across = smooth_twice(interpolate_near(t, signals[:, S.AY], at), SMOOTH_S)
     used = np.hypot(along, across)[np.interp(at, t, moving.astype(float)) > 0.5] / GRAVITY
     used = used[np.isfinite(used)]
     used_friction = float(np.percentile(used, USED_SHARE)) if len(used) else 0.0

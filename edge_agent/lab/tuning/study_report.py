@@ -222,9 +222,8 @@ def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
         prefix = f"tuning.convergence.{way}."
         names = [name for name in values if name.startswith(prefix) and not name.endswith(".sd")]
         evaluations = per_iteration * np.arange(1, len(names) + 1)
-        best, sd = (
-            np.array([values.get(name + end, 0.0) for name in names]) for end in ("", ".sd")
-        )
+        best = np.array([values.get(name, 0.0) for name in names])
+        sd = np.array([values.get(name + ".sd", 0.0) for name in names])
         line = axis.plot(evaluations, best, "o-", ms=3, label=way)[0]
         axis.fill_between(
             evaluations, best - sd, best + sd, color=line.get_color(), alpha=0.2, lw=0

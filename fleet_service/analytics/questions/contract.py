@@ -115,7 +115,9 @@ def slot_intervals(found: pa.Table) -> dict[str, FloatArray]:
     The error of a mean is the larger of two estimates: from the spread between vehicles, and from
     the intervals that they reported.
     """
-    y, variance, key = (found[name].to_numpy() for name in ("y", "variance", "key"))
+    y = found["y"].to_numpy()
+    variance = found["variance"].to_numpy()
+    key = found["key"].to_numpy()
     first, which, n = np.unique(key, return_index=True, return_inverse=True, return_counts=True)[1:]
     mean = np.bincount(which, y) / n
     spread = np.bincount(which, (y - mean[which]) ** 2) / np.maximum(n - 1, 1)
@@ -257,10 +259,13 @@ def _judge_link(
     breaches = []
     for of_piece in own.pieces.values():
         slot = np.array([keys[k][3] for k in of_piece], np.int64)
-        lower, mu, upper = (each[name][of_piece] for name in ("lower", "mu", "upper"))
+        lower = each["lower"][of_piece]
+        mu = each["mu"][of_piece]
+        upper = each["upper"][of_piece]
         breaches.append(longest_breach(slot, lower, mu, upper, level, span))
     by_mean, begin = max((one[0], one[3]) for one in breaches)
-    least, most = (max(one[k] for one in breaches) for k in (1, 2))
+    least = max(one[1] for one in breaches)
+    most = max(one[2] for one in breaches)
     worst = min(
         (k for of_piece in own.pieces.values() for k in of_piece),
         key=lambda k: float(each["mu"][k]),

@@ -254,9 +254,8 @@ def _convert_column(table: pa.Table, field: pa.Field[Any]) -> pa.ChunkedArray[An
             )
         # Files before format 1.2 lack this column.
         if field.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):
-            mu, used = (
-                np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised")
-            )
+            mu = np.asarray(table["mu"].to_numpy(), np.float32)
+            used = np.asarray(table["mu_utilised"].to_numpy(), np.float32)
             return pa.chunked_array([pa.array(is_value(mu, used))])
         return pa.chunked_array([pa.nulls(table.num_rows, field.type)])
     column = table.column(field.name)

@@ -145,7 +145,8 @@ def _undamaged_lines(data: bytes) -> Iterator[tuple[int, int]]:
     with permanent vehicle numbers.
     """
     for at in range(0, len(data) - _LINE + 1, _LINE):
-        pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
+        pseudonym = int.from_bytes(data[at : at + 8], signed=True)
+        number = int.from_bytes(data[at + 8 : at + 16], signed=True)
         if data[at : at + _LINE] == _encode_line(pseudonym, number):
             yield pseudonym, number
 
