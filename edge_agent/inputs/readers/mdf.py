@@ -10,6 +10,8 @@ from __future__ import annotations
 import resource
 import struct
 from concurrent.futures import ProcessPoolExecutor
+from datetime import UTC
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -17,14 +19,17 @@ from typing import Any, BinaryIO, Final, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.memory import MOST_BYTES, limit_memory
-from edge_agent.inputs.readers.can_log import Frames, Log, no_database
+from edge_agent.inputs.readers.can_log import Frames, Log, no_database, require_steady_clock
 from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
 from schemas.errors import InputError
+from schemas.numeric import FloatArray
 from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mf4", ".mdf")
 MOST_BLOCKS: Final = 1_000_000
 MOST_CPU_S: Final = 600  # [s] processor time; a file of 10 GB takes less
+TIME: Final = 1  # synchronisation type of a master channel that contains time
+MOST_NAMES: Final = 6  # maximum number of channel names in a note
 HEADER: Final = 64  # [byte] size of the identification block
 # Numbers of the followed links in each kind of block: first the next block, then its subordinate
 # blocks.
@@ -138,7 +143,7 @@ def _read_content(path: Path, identifiers: set[int] | None, names: set[str] | No
             return MdfContent(None, read_mdf(file, path, names))
         if identifiers is None:
             raise no_database(path)
-        return MdfContent(mdf_frames(file, identifiers), None)
+        return MdfContent(mdf_frames(file, path, identifiers), None)
 
 
 def has_frames(mdf: Any) -> bool:  # noqa: ANN401
@@ -146,13 +151,17 @@ def has_frames(mdf: Any) -> bool:  # noqa: ANN401
     return any("CAN_DataFrame" in name for name in mdf.channels_db)
 
 
-def mdf_frames(mdf: Any, needed_identifiers: set[int]) -> tuple[Log, float]:  # noqa: ANN401
+def mdf_frames(
+    mdf: Any,  # noqa: ANN401
+    path: Path,
+    needed_identifiers: set[int],
+) -> tuple[Log, float]:
     """Return the CAN frames of an MDF file whose identifier is in `needed_identifiers`, and
-    the start of the log [s since 1970 UTC].
+    the time of the log's first frame [s since 1970 UTC].
     """
     log: Log = {}
     first = np.inf
-    start = float(mdf.header.start_time.timestamp())
+    start, _ = start_of(mdf)
     for group, index in mdf.channels_db["CAN_DataFrame"]:
         channel = mdf.get("CAN_DataFrame", group=group, index=index, raw=True)
         if not len(channel.timestamps):
@@ -171,33 +180,116 @@ def mdf_frames(mdf: Any, needed_identifiers: set[int]) -> tuple[Log, float]:  # 
             key = int(buses[row]), int(identifiers[row]), bool(extended[row])
             frame = bytes(data[row][: lengths[row]])
             log.setdefault(key, Frames()).add(float(channel.timestamps[row]), frame)
-    first = first if np.isfinite(first) else 0.0
+    if not np.isfinite(first):
+        return log, start
     for frames in log.values():
-        frames.times = [start + (time - first) for time in frames.times]
-    return log, start
+        frames.times = [start + time for time in frames.times]
+    return require_steady_clock(path, log), start + first
 
 
 def read_mdf(mdf: Any, path: Path, requested: set[str] | None) -> Recording:  # noqa: ANN401
     """Return the channels `requested` of a measurement in an MDF file, by name; all
     channels if `requested` is None.
 
-    If several channels have the same name, the first one with samples is used.
+    Parts of a channel in several groups are joined if they are one after the other. If they
+    overlap in time, the first one with samples is used, and a note names the channel.
     """
-    start = mdf.header.start_time.timestamp()
-    recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)
+    seconds, has_zone = start_of(mdf)
+    dated = round(seconds * NS) if seconds > 0 else None
+    recording = Recording(path.name, {}, dated, has_zone=has_zone)
+    if dated is not None and not has_zone:
+        recording.notes.append(f"{path.name}: its date has no time zone; taken as UTC")
+    overlapping: list[str] = []
     with foreign_errors(path, "MDF 4"):
+        timed = {group for group in mdf.masters_db if _has_time(mdf, group)}
         for name, places in mdf.channels_db.items():
             if requested is not None and name not in requested:
                 continue
-            for group, index in places:
-                if index == mdf.masters_db.get(group):
-                    continue
-                channel = mdf.get(name, group=group, index=index)
-                values = np.asarray(channel.samples)
-                if values.ndim == 1 and values.dtype.kind in "fiub" and len(values):
-                    t = np.asarray(channel.timestamps, dtype=np.float64)
-                    recording.signals[name] = Series(
-                        t, values.astype(np.float64), str(channel.unit or "")
-                    )
-                    break
+            parts = [
+                part
+                for group, index in places
+                if group in timed and index != mdf.masters_db[group]
+                if (part := _read_channel(mdf, name, group, index)) is not None
+            ]
+            if parts:
+                recording.signals[name], are_joined = _join_parts(parts)
+                overlapping += [] if are_joined else [name]
+    _note_left_out(recording, len(mdf.groups) - len(timed), overlapping)
     return recording
+
+
+def start_of(mdf: Any) -> tuple[float, bool]:  # noqa: ANN401
+    """Return the start of a measurement [s since 1970], and True if it is known to be UTC.
+
+    A file may state local time without a zone. This time is returned as if it were UTC, so that
+    the result does not depend on the time zone of this machine.
+    """
+    start = mdf.header.start_time
+    has_zone = start.tzinfo is not None
+    return (start if has_zone else start.replace(tzinfo=UTC)).timestamp(), has_zone
+
+
+def _has_time(mdf: Any, group: int) -> bool:  # noqa: ANN401
+    """Return True if the master channel of a group contains time, and not an angle, a distance or
+    an index.
+    """
+    return bool(mdf.groups[group].channels[mdf.masters_db[group]].sync_type == TIME)
+
+
+def _read_channel(mdf: Any, name: str, group: int, index: int) -> Series | None:  # noqa: ANN401
+    """Return the valid readings of a channel; None if it has none, or they are not numbers."""
+    signal = mdf.get(name, group=group, index=index, raw=True)
+    values = np.asarray(signal.samples)
+    if values.ndim != 1 or values.dtype.kind not in "fiub" or not len(values):
+        return None
+    rule = signal.conversion
+    if rule is not None:
+        values = _convert_samples(rule, values)
+    # The channel's unit takes precedence over that of its conversion; many programs write only
+    # the latter.
+    unit = str(mdf.groups[group].channels[index].unit or (rule and rule.unit) or "")
+    t = np.asarray(signal.timestamps, dtype=np.float64)
+    order = np.argsort(t, kind="stable")
+    return Series(t[order], values[order].astype(np.float64), unit)
+
+
+def _convert_samples(rule: Any, raw: FloatArray) -> FloatArray:  # noqa: ANN401
+    """Return raw samples (n,) as physical values.
+
+    If a rule gives text for some values, for example "not available", these values are NaN. If it
+    gives only texts, for example the states of a controller, the raw numbers are returned.
+    """
+    values = np.asarray(rule.convert(raw))
+    if values.dtype.kind in "fiub":
+        return values
+    referenced = (rule.referenced_blocks or {}).values()
+    has_numbers = any(hasattr(block, "conversion_type") for block in referenced)
+    return np.full(len(raw), np.nan) if has_numbers else raw
+
+
+def _join_parts(parts: list[Series]) -> tuple[Series, bool]:
+    """Return the parts of a channel as one series, and True if no two of them overlap in time;
+    otherwise the first part.
+    """
+    if len(parts) == 1:
+        return parts[0], True
+    in_order = sorted(parts, key=lambda part: part.t[0])
+    if any(later.t[0] <= part.t[-1] for part, later in pairwise(in_order)):
+        return parts[0], False
+    t = np.concatenate([part.t for part in in_order])
+    return Series(t, np.concatenate([part.values for part in in_order]), parts[0].unit), True
+
+
+def _note_left_out(recording: Recording, untimed: int, overlapping: list[str]) -> None:
+    """Add notes about the number of groups without time, and the channels that are in several
+    groups at once, to a recording.
+    """
+    if untimed:
+        recording.notes.append(f"{recording.name}: {untimed} groups without time left out")
+    if overlapping:
+        names = ", ".join(sorted(overlapping)[:MOST_NAMES])
+        more = len(overlapping) - MOST_NAMES
+        recording.notes.append(
+            f"{recording.name}: in several groups at the same time, the first is used: {names}"
+            + (f" and {more} more" if more > 0 else "")
+        )
