@@ -18,6 +18,7 @@ from edge_agent.inputs.channel_readings import make_channel, select_signals
 from edge_agent.inputs.clock_alignment import align_clocks
 from edge_agent.inputs.context import held_readings
 from edge_agent.inputs.log_columns import GROUND
+from edge_agent.inputs.parts import join_parts
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
 from edge_agent.inputs.units import QUANTITY, unit_of_channel
@@ -63,7 +64,7 @@ def merge_recordings(
     """Merge all recordings into one signal log by a profile.
 
     Args:
-        recordings: recordings of the sources.
+        recordings: recordings of the sources; parts of one drive are joined.
         profile: profile to apply.
         wheel_radius: radius of the vehicle file [m]; takes precedence over that of the profile.
         steering_ratio: ratio of the vehicle file; takes precedence over that of the profile.
@@ -73,6 +74,7 @@ def merge_recordings(
         InputError: no recording has a signal of the profile, dates do not overlap, or a radius or
             ratio is missing.
     """
+    recordings = join_parts(recordings, profile, shifts or {})
     selected = select_signals(recordings, profile)
     if not selected:
         names = ", ".join(sorted(profile.needed_signals())[:6])
@@ -81,6 +83,12 @@ def merge_recordings(
         )
     alignment = align_clocks(recordings, _reference_of(selected), shifts or {})
     notes = [note for recording in recordings for note in recording.notes] + alignment.notes
+    used = {place for place, _ in selected.values()}
+    notes += [
+        f"{recording.name}: no channel is taken from it"
+        for place, recording in enumerate(recordings)
+        if place not in used
+    ]
     radius = wheel_radius or profile.wheel_radius
     ratio = steering_ratio or profile.steering_ratio
     series: dict[str, Series] = {}

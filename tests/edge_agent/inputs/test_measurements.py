@@ -39,7 +39,7 @@ def read_mdf(path: Path, fill: Callable[[Library], None]) -> Recording:
     return read_source(write_mdf(path, fill), None, None)
 
 
-def signal(
+def make_signal(
     values: NDArray[Any], t: NDArray[Any] = T, name: str = "ax", unit: str = "g", **more: Library
 ) -> Library:
     return asammdf.Signal(np.asarray(values), t, name=name, unit=unit, **more)
@@ -47,8 +47,8 @@ def signal(
 
 def test_parts_of_a_channel_in_several_groups_are_joined(tmp_path: Path) -> None:
     def fill(mdf: Library) -> None:
-        mdf.append([signal(T + 9.0, T + 9.0)])
-        mdf.append([signal(T, T)])
+        mdf.append([make_signal(T + 9.0, T + 9.0)])
+        mdf.append([make_signal(T, T)])
 
     recording = read_mdf(tmp_path / "a.mf4", fill)
     assert np.allclose(recording.signals["ax"].t, np.concatenate([T, T + 9.0]))
@@ -58,8 +58,8 @@ def test_parts_of_a_channel_in_several_groups_are_joined(tmp_path: Path) -> None
 
 def test_channel_in_two_groups_at_the_same_time_is_noted(tmp_path: Path) -> None:
     def fill(mdf: Library) -> None:
-        mdf.append([signal(T)])
-        mdf.append([signal(T + 1.0, T + 0.1)])
+        mdf.append([make_signal(T)])
+        mdf.append([make_signal(T + 1.0, T + 0.1)])
 
     recording = read_mdf(tmp_path / "a.mf4", fill)
     assert np.allclose(recording.signals["ax"].values, T)
@@ -75,11 +75,11 @@ def test_text_between_numbers_is_missing_and_states_are_numbers(tmp_path: Path) 
     def fill(mdf: Library) -> None:
         raw = np.full(50, 7000, "u2")
         raw[10:20] = 65535
-        mdf.append([signal(raw, name="wheel", unit="km/h", conversion=rule(dict(absent)))])
+        mdf.append([make_signal(raw, name="wheel", unit="km/h", conversion=rule(dict(absent)))])
         gone = np.full(50, 65535, "u2")
-        mdf.append([signal(gone, name="gone", unit="km/h", conversion=rule(dict(absent)))])
+        mdf.append([make_signal(gone, name="gone", unit="km/h", conversion=rule(dict(absent)))])
         flag = (np.arange(50) >= 25).astype("u1")
-        mdf.append([signal(flag, name="ABS_Active", unit="", conversion=rule(dict(states)))])
+        mdf.append([make_signal(flag, name="ABS_Active", unit="", conversion=rule(dict(states)))])
 
     signals = read_mdf(tmp_path / "a.mf4", fill).signals
     wheel = signals["wheel"].values
@@ -95,7 +95,7 @@ def test_unit_of_the_conversion_is_used_where_the_channel_has_none(
 ) -> None:
     def fill(mdf: Library) -> None:
         rule = asammdf.blocks.conversion_utils.from_dict({"a": 0.01, "b": 0.0})
-        mdf.append([signal(np.full(50, 7000, "u2"), name="wheel", unit="", conversion=rule)])
+        mdf.append([make_signal(np.full(50, 7000, "u2"), name="wheel", unit="", conversion=rule)])
         channel = mdf.groups[0].channels[1]
         channel.unit = own
         channel.conversion.unit = "km/h"
@@ -107,7 +107,7 @@ def test_unit_of_the_conversion_is_used_where_the_channel_has_none(
 
 def test_invalid_samples_are_left_out(tmp_path: Path) -> None:
     def fill(mdf: Library) -> None:
-        mdf.append([signal(T, invalidation_bits=(T > 0.1) & (T < 0.2))])
+        mdf.append([make_signal(T, invalidation_bits=(T > 0.1) & (T < 0.2))])
 
     values = read_mdf(tmp_path / "a.mf4", fill).signals["ax"].values
     assert not np.any((values > 0.1) & (values < 0.2))
@@ -116,9 +116,9 @@ def test_invalid_samples_are_left_out(tmp_path: Path) -> None:
 
 def test_group_over_an_angle_is_left_out_with_a_note(tmp_path: Path) -> None:
     def fill(mdf: Library) -> None:
-        mdf.append([signal(T, name="pressure")])
+        mdf.append([make_signal(T, name="pressure")])
         mdf.groups[0].channels[0].sync_type = 2
-        mdf.append([signal(T)])
+        mdf.append([make_signal(T)])
 
     recording = read_mdf(tmp_path / "a.mf4", fill)
     assert recording.signals.keys() == {"ax"}
@@ -130,7 +130,7 @@ def test_local_time_does_not_depend_on_the_zone_of_this_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zone: str
 ) -> None:
     def fill(mdf: Library) -> None:
-        mdf.append([signal(T)])
+        mdf.append([make_signal(T)])
         mdf.header.time_flags = 1
         mdf.header.abs_time = START_NS
 
