@@ -111,10 +111,13 @@ def _frame_reader(path: Path) -> can_log.Taker | None:
 
 
 def _read_bag(path: Path, profile: Profile | None, database: Database | None) -> Recording:
+    requested_signals = None if profile is None else profile.needed_signals()
     with rosbag.open_bag(path) as reader:
-        if rosbag.has_frames(reader):
-            return _decode_frames(partial(rosbag.bag_frames, reader, path), path, profile, database)
-        return rosbag.read_bag(reader, path, None if profile is None else profile.needed_signals())
+        if not rosbag.has_frames(reader):
+            return rosbag.read_bag(reader, path, requested_signals)
+        frames = partial(rosbag.bag_frames, reader, path)
+        decoded = _decode_frames(frames, path, profile, database)
+        return rosbag.add_topics(decoded, rosbag.read_bag(reader, path, requested_signals))
 
 
 def _read_mdf(path: Path, profile: Profile | None, database: Database | None) -> Recording:

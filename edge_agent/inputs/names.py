@@ -74,6 +74,8 @@ STEERING: Final[Rule] = (
         r"|fraction|crc|qual|override|driver|cal|^sensor"
     ),
 )
+FIXES: Final = [0.0, 1.0, 2.0]  # values of NavSatStatus.status of a message with a position
+JOINT: Final = re.compile(r"\b(left|right)\b.*\bjoint\b")  # a steered wheel in a ROS model
 COURSE: Final = re.compile(r"heading|course|track")
 
 
@@ -109,6 +111,11 @@ def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
         plain = split_words(signal if field in ("", "data") else field)
         if (channel := _channel_of(plain, signal)) and channel not in channels:
             channels[channel] = _make_channel(channel, signal, unit, plain)
+            # A ROS message of a receiver states whether it has a fix (NavSatStatus: -1 is none).
+            status = f"{signal.rpartition('.')[0]}.status.status"
+            if channel in ("latitude", "longitude") and status in signals:
+                valid = {status: FIXES}
+                channels[channel] = channels[channel].model_copy(update={"valid": valid})
     about = (
         "Drafted from names: check every signal, unit and sign by hand, then with `edge-agent "
         "check`."
@@ -129,6 +136,8 @@ def _channel_of(plain: str, signal: str) -> str | None:
         if _fits_rule(plain, rule):
             return channel
     if _fits_rule(plain, STEERING):
+        if joint := JOINT.search(plain):
+            return "delta_fl" if joint[1] == "left" else "delta_fr"
         return f"delta_{place}" if place in WHEELS else "delta_fl"
     return None
 
@@ -144,6 +153,7 @@ def _make_channel(channel: str, signal: str, unit: str, plain: str) -> Channel:
         channel.startswith("delta")
         and place_of(plain) is None
         and not re.search(r"^delta|road|front", plain)
+        and not JOINT.search(plain)
     )
     return Channel(
         signal=short if bus else signal,

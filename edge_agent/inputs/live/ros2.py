@@ -20,7 +20,7 @@ import numpy as np
 
 from edge_agent.inputs.live.can_bus import Decoder
 from edge_agent.inputs.live.feed import Feed, HostClock, Received
-from edge_agent.inputs.readers.rosbag import FRAME, Leaf, leaves_of, stamp_of
+from edge_agent.inputs.readers.rosbag import FRAME, RequestedNumbers, stamp_of
 from edge_agent.inputs.recording import Series, import_optional
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -95,8 +95,8 @@ class Ros2Feed(Feed):
         self._settings = settings
         self._domain = topics.domain
         self._decoder = topics.decoder
-        self._requested_signals = {signal for signal in topics.signals if signal.startswith("/")}
-        named_topics = {signal.partition(".")[0] for signal in self._requested_signals}
+        requested = {signal for signal in topics.signals if signal.startswith("/")}
+        named_topics = {signal.partition(".")[0] for signal in requested}
         self._topics = sorted(named_topics | set(topics.buses))
         if not self._topics:
             raise InputError(
@@ -105,7 +105,7 @@ class Ros2Feed(Feed):
                 "call its signals /topic.field, as import drafts them from a bag",
             )
         self._store = _load_typestore(topics.types)
-        self._leaves: dict[str, list[Leaf]] = {}
+        self._numbers = RequestedNumbers(requested)
         self._next_numbers: dict[bytes, int] = {}  # publisher -> next expected sequence number
 
     def listen(self) -> None:
@@ -169,10 +169,8 @@ class Ros2Feed(Feed):
                 data = bytes(message.data)[: message.dlc]
                 self.store_message(at, (int(message.id), bool(message.is_extended), data))
             return
-        if topic not in self._leaves:
-            leaves = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
-            self._leaves[topic] = [leaf for leaf in leaves if leaf[0] in self._requested_signals]
-        self.store_message(at, {name: float(take(message)) for name, take in self._leaves[topic]})
+        leaves = self._numbers.find_leaves(topic, message)
+        self.store_message(at, {name: float(take(message)) for name, take in leaves})
 
     def _publication_time(self, attachment: bytes) -> int:
         """Return the time of publication [ns] that a message's attachment contains; 0 if it is

@@ -3,27 +3,32 @@ without a ROS installation.
 
 A signal is called `/topic.field.field`; elements of short arrays are `/topic.field[0]`, and joints
 `/topic.velocity[NAME]`. The time of a reading is the time stamp in the message if there is one,
-else the recorder's. Topics with the type can_msgs/Frame are read as a CAN log.
+else the recorder's; see `align_stamps`. Topics with the type can_msgs/Frame are read as a CAN log.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.inputs.readers.can_log import Frames, Log
+from edge_agent.inputs.readers.can_log import DATED_S, Frames, Log
 from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
+from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 FRAME: Final = "can_msgs/msg/Frame"
 LONGEST_ARRAY: Final = 36  # longer arrays are images and scans, and their elements are not read
 DEEPEST: Final = 5
+MOST_KINDS: Final = 1000  # combinations of topic and joint names that are remembered
+OWN_CLOCK_NS: Final = 10 * NS  # a larger delay is the difference of two clocks
+DATED_NS: Final = round(DATED_S * NS)
 SKIPPED: Final = ("header", "covariance")
 Leaf = tuple[str, Callable[[Any], Any]]
 
@@ -78,7 +83,8 @@ def bag_frames(reader: Any, path: Path, identifiers: set[int]) -> tuple[Log, flo
     first = np.inf
     topics = [connection for connection in reader.connections if connection.msgtype == FRAME]
     with foreign_errors(path, "ROS bag"):
-        for connection, _, time, message in _read_messages(reader, topics):
+        for connection, stored, stamp, message in _read_messages(reader, topics):
+            time = stamp or stored
             first = min(first, time)
             if message.id in identifiers and not message.is_error and not message.is_rtr:
                 key = topics.index(connection), int(message.id), bool(message.is_extended)
@@ -87,48 +93,141 @@ def bag_frames(reader: Any, path: Path, identifiers: set[int]) -> tuple[Log, flo
 
 
 def read_bag(reader: Any, path: Path, requested: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals `requested` of a ROS bag by name; all signals if it is None."""
+    """Return the signals `requested` of a ROS bag by name; all signals if it is None. CAN frames
+    are not signals.
+    """
     topics = [
         c
         for c in reader.connections
-        if requested is None or any(name.startswith(f"{c.topic}.") for name in requested)
+        if c.msgtype != FRAME
+        and (requested is None or any(name.startswith(f"{c.topic}.") for name in requested))
     ]
-    times: dict[str, list[int]] = {}
-    values: dict[str, list[float]] = {}
-    first: int | None = None
+    stamps: dict[str, list[tuple[int, int]]] = {}
+    readings: dict[str, _Readings] = {}
+    numbers = RequestedNumbers(requested)
     with foreign_errors(path, "ROS bag"):
-        leaves: dict[str, list[Leaf]] = {}
-        for connection, stored, time, message in _read_messages(reader, topics):
-            first = stored if first is None else min(first, stored)
+        for connection, stored, stamp, message in _read_messages(reader, topics):
             topic = connection.topic
-            if topic not in leaves:
-                found = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
-                leaves[topic] = [
-                    leaf for leaf in found if requested is None or leaf[0] in requested
-                ]
-            for name, take in leaves[topic]:
-                times.setdefault(name, []).append(time)
-                values.setdefault(name, []).append(float(take(message)))
-    recording = Recording(path.name, {}, first)
-    for name, stamps in times.items():
-        t = (np.array(stamps, dtype=np.int64) - (first or 0)) / NS
+            leaves = numbers.find_leaves(topic, message)
+            if not leaves:
+                continue
+            times = stamps.setdefault(topic, [])
+            for name, take in leaves:
+                one = readings.setdefault(name, _Readings(topic))
+                one.rows.append(len(times))
+                one.values.append(float(take(message)))
+            times.append((stored, stamp))
+    clocks, notes = align_stamps({topic: np.array(pairs) for topic, pairs in stamps.items()})
+    first = min((int(pairs[0][0]) for pairs in stamps.values()), default=None)
+    recording = Recording(path.name, {}, first, notes=[f"{path.name}: {note}" for note in notes])
+    for name, one in readings.items():
+        t = (clocks[one.topic][one.rows] - (first or 0)) / NS
         order = np.argsort(t, kind="stable")
-        recording.signals[name] = Series(t[order], np.array(values[name])[order])
+        recording.signals[name] = Series(t[order], np.array(one.values)[order])
     return recording
+
+
+@dataclass
+class _Readings:
+    """Readings of one signal: its topic, the numbers of the messages, and the values."""
+
+    topic: str
+    rows: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+
+def align_stamps(stamps: Mapping[str, IntArray]) -> tuple[dict[str, IntArray], list[str]]:
+    """Return the times [ns] of the messages of each topic on one clock, and notes.
+
+    The time of a message is its stamp, or the recorder's time if it has none. Stamps of another
+    clock, for example of a sensor that counts from its start, are shifted by the smallest delay.
+    Topics whose clocks agree have a common shift. If all stamps of a bag are dates that agree, the
+    bag was recorded from a replay: then the stamps are right, and the recorder's time is shifted.
+
+    Args:
+        stamps: topic -> pairs (recorder's time, stamp) (n, 2) [ns]; a missing stamp is 0.
+    """
+    delays = {
+        topic: int(np.min(pairs[has_stamp, 0] - pairs[has_stamp, 1]))
+        for topic, pairs in stamps.items()
+        if (has_stamp := pairs[:, 1] > 0).any()
+    }
+    is_replay = (
+        bool(delays)
+        and min(abs(delay) for delay in delays.values()) > OWN_CLOCK_NS
+        and max(delays.values()) - min(delays.values()) <= OWN_CLOCK_NS
+        and min(int(stamps[topic][:, 1].max()) for topic in delays) > DATED_NS
+    )
+    recorder_shift = -min(delays.values()) if is_replay else 0
+    times = {}
+    notes = []
+    for topic, pairs in stamps.items():
+        near = [d for d in delays.values() if abs(d - delays.get(topic, 0)) <= OWN_CLOCK_NS]
+        is_own_clock = not is_replay and abs(delays.get(topic, 0)) > OWN_CLOCK_NS
+        shift = min(near) if is_own_clock else 0
+        times[topic] = np.where(pairs[:, 1] > 0, pairs[:, 1] + shift, pairs[:, 0] + recorder_shift)
+        if is_own_clock:
+            notes.append(f"{topic} has a clock of its own; {shift / NS:.3f} s added")
+    if is_replay:
+        notes.append(f"recorded {-recorder_shift / NS:.0f} s after the date of its messages")
+    return times, notes
+
+
+def add_topics(decoded: Recording, topics: Recording) -> Recording:
+    """Return the signals of CAN frames (`decoded`) together with the signals of other topics of
+    the same bag, on the clock of the frames. Without frames, return the topics.
+    """
+    if not decoded.signals or not topics.signals:
+        return decoded if decoded.signals else topics
+    if decoded.start_ns is None or topics.start_ns is None:
+        note = f"{decoded.name}: only CAN frames are read, because they have no date"
+        return replace(decoded, notes=[*decoded.notes, note])
+    lead = (topics.start_ns - decoded.start_ns) / NS
+    others = {
+        name: replace(series, t=series.t + lead)
+        for name, series in topics.signals.items()
+        if name not in decoded.signals
+    }
+    return replace(decoded, signals=decoded.signals | others, notes=[*decoded.notes, *topics.notes])
 
 
 def _read_messages(
     reader: Any,  # noqa: ANN401
     connections: list[Any],
 ) -> Iterator[tuple[Any, int, int, Any]]:
-    """Yield (connection, time of the recorder [ns], time of the message [ns], message) for each
-    message in a ROS bag; a connection is a recorded topic.
+    """Yield (connection, time of the recorder [ns], stamp of the message [ns], message) for each
+    message in a ROS bag; a connection is a recorded topic, and a missing stamp is 0.
     """
     if not connections:
         return
     for connection, stored, raw in reader.messages(connections=connections):
         message = reader.deserialize(raw, connection.msgtype)
-        yield connection, stored, stamp_of(message) or stored, message
+        yield connection, stored, stamp_of(message), message
+
+
+class RequestedNumbers:
+    """The requested numbers in messages of each topic.
+
+    Messages of one topic may name different joints, or the same ones in another order, because
+    several programs publish them. Each combination of names has its own list of numbers.
+    """
+
+    def __init__(self, requested: set[str] | None) -> None:
+        """Request the signals with these names; all if it is None."""
+        self._requested = requested
+        self._leaves: dict[tuple[str, tuple[str, ...]], list[Leaf]] = {}
+
+    def find_leaves(self, topic: str, message: Any) -> list[Leaf]:  # noqa: ANN401
+        """Return signal name and function for each requested number in a message of a topic."""
+        key = topic, tuple(_labels_of(message) or ())
+        if key not in self._leaves:
+            if len(self._leaves) >= MOST_KINDS:
+                self._leaves.clear()
+            found = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
+            self._leaves[key] = [
+                leaf for leaf in found if self._requested is None or leaf[0] in self._requested
+            ]
+        return self._leaves[key]
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401
@@ -166,12 +265,20 @@ def _array_leaves(
         isinstance(v, int | float | np.number) for v in value
     ):
         return
-    labels = getattr(message, "name", None) if not prefix else None
-    has_labels = isinstance(labels, list) and len(labels) == len(value)
+    labels = None if prefix else _labels_of(message)
+    if labels is None or len(labels) != len(value):
+        labels = [str(index) for index in range(len(value))]
     take = attrgetter(path[1:])
-    for index in range(len(value)):
-        label = labels[index] if has_labels else index  # type: ignore[index]
+    for index, label in enumerate(labels):
         yield f"{path}[{label}]", _element_at(take, index)
+
+
+def _labels_of(message: Any) -> list[str] | None:  # noqa: ANN401
+    """Return the names of the elements of a message's arrays, such as joints; None if it states
+    no names.
+    """
+    labels = getattr(message, "name", None)
+    return labels if isinstance(labels, list) else None
 
 
 def _element_at(take: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
