@@ -118,6 +118,7 @@ def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
         InputError: the route is longer than ROUTE_MOST_M.
     """
     points = np.array(route)
+    points[:, 0] = np.unwrap(points[:, 0], period=360.0)  # the short way over the 180° meridian
     scale = np.cos(np.radians(points[:-1, 1].mean()))
     steps = np.diff(points, axis=0) * [METRES_PER_DEGREE * scale, METRES_PER_DEGREE]
     lengths = np.hypot(*steps.T)

@@ -52,14 +52,14 @@ class FeatureQuestion(NamedTuple):
     """Query for features.
 
     Attributes:
-        bbox: west, south, east, north [deg]; None for everywhere.
+        boxes: west, south, east, north [deg] of each part of the area; None for everywhere.
         since: minimum time of the newest observation [ns]; 0 for no limit.
         at: time of the map [ns]; None for now.
         limit: maximum number of features.
         after: key (cell · 4 + sector) after which to continue.
     """
 
-    bbox: Box | None = None
+    boxes: tuple[Box | None, ...] = (None,)
     since: int = 0
     at: int | None = None
     limit: int = FEW
@@ -168,7 +168,8 @@ def api_definition(base: str) -> dict[str, Any]:
         describe_parameter(
             "bbox",
             "query",
-            "west, south, east, north [deg]; with heights six numbers, of which they are ignored",
+            "west, south, east, north [deg]; west > east crosses the 180° meridian; with heights "
+            "six numbers, of which they are ignored",
             type="array",
             items={"type": "number"},
             minItems=4,

@@ -135,7 +135,7 @@ class FeatureRoutes:
         """
         place = request_params.parse_feature_id(request.path_params["feature"])
         table = await run_in_threadpool(
-            self._cells, FeatureQuestion(_place_box(place), after=place - 1, limit=1)
+            self._cells, FeatureQuestion((_place_box(place),), after=place - 1, limit=1)
         )
         cell, sector = divmod(place, grid.SECTORS)
         table = table.filter(
@@ -164,7 +164,7 @@ class FeatureRoutes:
         for table in self._tiles(question):
             place = table["cell"].to_numpy() * grid.SECTORS + table["sector"].to_numpy()
             newest = table["last_time"].cast(pa.int64()).to_numpy()
-            order = np.argsort(place, kind="stable")
+            _, order = np.unique(place, return_index=True)  # two boxes may share cells
             order = order[(place[order] > question.after) & (newest[order] >= question.since)]
             found.append(table.take(order))
             rows += len(order)
@@ -174,20 +174,27 @@ class FeatureRoutes:
 
     def _tiles(self, question: FeatureQuestion) -> Iterator[pa.Table]:
         """Yield the requested map cells as tables, one tile at a time, ordered by tile."""
-        parameters = {}
-        if question.bbox is not None:
-            parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)
         if question.at is not None:  # one query for all tiles, so a past map is rebuilt only once
-            parameters["at"] = datetime.fromtimestamp(question.at / NS, UTC).isoformat()
-            tables = dict(self._reader.ask(map_client.EVERYWHERE, parameters))
-            yield from (tables[tile] for tile in sorted(tables))
+            at = {"at": datetime.fromtimestamp(question.at / NS, UTC).isoformat()}
+            parts: dict[int, list[pa.Table]] = {}
+            for box in question.boxes:
+                for tile, table in self._reader.ask(
+                    map_client.EVERYWHERE, at | _box_parameter(box)
+                ):
+                    parts.setdefault(tile, []).append(table)
+            yield from (pa.concat_tables(parts[tile]) for tile in sorted(parts))
             return
         first = int(grid.tile_of(question.after // grid.SECTORS)) if question.after >= 0 else 0
-        for tile in sorted(self._world.tiles()):
+        for tile in sorted(tile for tile in self._world.tiles() if tile >= first):
             area = grid.bounds(tile, grid.TILE_ZOOM)
-            if tile >= first and (question.bbox is None or bool(grid.touches(question.bbox, area))):
-                for _, table in self._reader.ask(keys.map_key(tile), parameters):
-                    yield table
+            tables = [
+                table
+                for box in question.boxes
+                if box is None or bool(grid.touches(box, area))
+                for _, table in self._reader.ask(keys.map_key(tile), _box_parameter(box))
+            ]
+            if tables:
+                yield pa.concat_tables(tables)
 
     def _extent(self) -> features.Box | None:
         return features.extent_of(self._world.tiles())
@@ -202,6 +209,11 @@ def wants_json(request: Request) -> bool:
         return form == "json"
     accepted = request.headers.get("accept", "*/*")
     return "json" in accepted and "text/html" not in accepted
+
+
+def _box_parameter(box: features.Box | None) -> dict[str, str]:
+    """Return the parameter `bbox` of a map query for a box; without a box, no parameter."""
+    return {} if box is None else {"bbox": ",".join(f"{side:.9f}" for side in box)}
 
 
 def _base_address(request: Request) -> str:

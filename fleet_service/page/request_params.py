@@ -65,19 +65,34 @@ def parse_features(request: Request, now: int) -> FeatureQuestion:
     parameters = request.query_params
     if unknown := [name for name in parameters if name not in _OF_FEATURES]:
         raise InputError(unknown[0][:40], "is not a parameter", f"use {', '.join(_OF_FEATURES)}")
-    box = _parse_box(parameters["bbox"]) if "bbox" in parameters else None
+    boxes = _parse_boxes(parameters["bbox"]) if "bbox" in parameters else (None,)
     since, at = _parse_interval(parameters.get("datetime", "../.."), now)
     limit = _parse_whole("limit", parameters["limit"], 1, 1 << 31) if "limit" in parameters else FEW
     after = parse_feature_id(parameters["after"]) if "after" in parameters else -1
-    return FeatureQuestion(box, since, at, min(limit, MOST), after)
+    return FeatureQuestion(boxes, since, at, min(limit, MOST), after)
 
 
-def _parse_box(text: str) -> Box | None:
-    """Return the box in the parameter `bbox` of a query for features: west, south, east, north
-    [deg]. Heights, the third and the sixth of six numbers, are ignored.
+def _parse_boxes(text: str) -> tuple[Box, ...]:
+    """Return the boxes that the parameter `bbox` of a query for features covers: west, south, east,
+    north [deg]. Heights, the third and the sixth of six numbers, are ignored.
+
+    A box whose west is larger than its east crosses the 180° meridian (OGC 17-069r4, 7.15.3). It is
+    divided there into two boxes.
     """
     sides = text.split(",")
-    return query.parse({"bbox": ",".join(sides[:2] + sides[3:5]) if len(sides) == 6 else text}).bbox
+    if len(sides) == 6:
+        sides = sides[:2] + sides[3:5]
+    try:
+        crosses = len(sides) == 4 and float(sides[0]) > float(sides[2])
+    except ValueError:
+        crosses = False  # the parser below states the error
+    if not crosses:
+        box = query.parse({"bbox": ",".join(sides)}).bbox
+        return () if box is None else (box,)
+    west, south, east, north = sides
+    halves = ((west, south, "180", north), ("-180", south, east, north))
+    wide = [half for half in halves if float(half[0]) != float(half[2])]
+    return tuple(box for half in wide if (box := query.parse({"bbox": ",".join(half)}).bbox))
 
 
 def parse_feature_id(text: str) -> int:

@@ -106,6 +106,7 @@ def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
     corners = np.array(points)
     if corners.ndim != 2 or len(corners) < 2:
         raise InputError("route", "needs two points", "click two or more")
+    corners[:, 0] = np.unwrap(corners[:, 0], period=360.0)  # the short way over the 180° meridian
     scale = METRES_PER_DEGREE * math.cos(math.radians(float(corners[:, 1].mean())))
     legs = np.diff(corners, axis=0) * [scale, METRES_PER_DEGREE]
     lengths = np.hypot(*legs.T)
@@ -122,4 +123,4 @@ def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
     place = corners[leg] + share[:, None] * np.diff(corners, axis=0)[leg]
     along = (np.cumsum(lengths) - lengths)[leg] + share * lengths[leg]
     heading = grid.sector_of(np.arctan2(legs[:, 1], legs[:, 0]))[leg].astype(np.int64)
-    return place[:, 0], place[:, 1], along, heading
+    return (place[:, 0] + 180.0) % 360.0 - 180.0, place[:, 1], along, heading

@@ -140,6 +140,28 @@ def test_bbox_returns_every_cell_that_touches_it(page: RunningPage, drive: Drive
     )
 
 
+def test_a_box_across_the_180_degree_meridian_has_both_sides(
+    page: RunningPage, drive: Drive
+) -> None:
+    drive_parts(page, drive, "ice", "avenue")
+    chosen = int(street.cells(street.PARTS["ice"])[2])
+    west, south, east, north = (float(v) for v in grid.bounds(chosen))
+
+    def fetch_cells(box: str, more: str = "") -> set[int]:
+        found = fetch_document(page, f"{ITEMS}?limit=10000&bbox={box}{more}")["features"]
+        return {one["properties"]["cell"] for one in found}
+
+    assert fetch_cells(f"{west + 1e-7},{south + 1e-7},-179,{north - 1e-7}") >= {chosen}
+    assert fetch_cells(f"{east + 9},-80,-179,80") == set()
+    everything = fetch_cells("-180,-80,180,80")
+    (_, _, easts, _) = grid.bounds(np.array(sorted(everything)))
+    elsewhere = {cell for cell, one in zip(sorted(everything), easts, strict=True) if one != east}
+    both_sides = f"{east + 1e-9},-80,{west - 1e-9},80"
+    assert fetch_cells(both_sides) == elsewhere
+    then = f"&datetime={_text(time.time())}"
+    assert fetch_cells(both_sides, then) == elsewhere
+
+
 def test_time_gives_the_map_then_and_an_interval_its_observations(
     page: RunningPage, drive: Drive
 ) -> None:
@@ -191,7 +213,9 @@ def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> 
     [
         "?bbox=1,2",
         "?bbox=1,2,x,3,4",
-        "?bbox=9,2,1,3",
+        "?bbox=9,2,9,3",
+        "?bbox=9,2,1,x",
+        "?bbox=190,2,1,3",
         "?limit=0",
         "?limit=x",
         "?datetime=yesterday",

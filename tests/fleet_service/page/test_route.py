@@ -14,9 +14,10 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.page.route import grip_profile
 from fleet_service.serve.encode import cell_table
-from schemas import grid
+from schemas import grid, regions
 from schemas.errors import InputError
 from schemas.tables import MAP_SCHEMA
+from schemas.thresholds import METRES_PER_DEGREE
 from tests.fleet_service.examples import START, at_least, observations, value
 from tests.fleet_service.page import street
 
@@ -86,3 +87,17 @@ def test_a_point_or_a_continent_is_refused() -> None:
     for points in ([(11.0, 57.0)], [(11.0, 57.0), (11.0, 57.0)], [(11.0, 57.0), (11.0, 67.0)]):
         with pytest.raises(InputError, match="route"):
             grip_profile(points, MAP_SCHEMA.empty_table())
+
+
+def test_route_over_the_180_degree_meridian_takes_the_short_way() -> None:
+    points = [(179.999, -17.0), (-179.999, -17.0)]
+    found = grip_profile(points, MAP_SCHEMA.empty_table())
+    assert found["length_m"] == pytest.approx(0.002 * METRES_PER_DEGREE * np.cos(np.radians(17)))
+    assert all(abs(one["longitude"]) > 179.99 for one in found["stretches"])
+    keys = regions.keys_along(points)
+    cells = keys // grid.SECTORS
+    assert cells[0] == grid.cell_of(-17.0, 179.999)
+    assert cells[-1] == grid.cell_of(-17.0, -179.999)
+    assert set(keys % grid.SECTORS) == {0}
+    back = regions.keys_along(points[::-1])
+    assert set(back % grid.SECTORS) == {2}
