@@ -272,6 +272,13 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
         refuse(nowhere, WireError(name, "has values that are not positions", "send finite degrees"))
         needs_place &= ~nowhere
     if kind is Kind.OBSERVATION:
+        # A visit without a heading, or with degrees taken for radians, would count for an arbitrary
+        # direction. A sender that gives the sector may count turns, or leave out the yaw.
+        without_sector = ~sent.records("sector")
+        fix = "send radians from east, or give the sector"
+        refuse(without_sector & ~np.isfinite(columns["yaw"]), WireError("yaw", "is missing", fix))
+        is_turned = np.abs(columns["yaw"]) > 2.0 * np.pi
+        refuse(without_sector & is_turned, WireError("yaw", "is more than a turn", fix))
         _derive_columns(columns, sent, needs_place)
     heads = _with_regions(found, columns)
     if not bad:
@@ -303,9 +310,7 @@ def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray)
         columns["cell"][at] = grid.cell_of(columns["latitude"][at], columns["longitude"][at])
     sector_missing = ~sent.columns["sector"]
     if sector_missing.any():
-        starts = np.cumsum(sent.sizes) - sent.sizes
-        with_yaw = np.logical_and.reduceat(np.isfinite(columns["yaw"]), starts)
-        rows = np.repeat(sector_missing & with_yaw, sent.sizes)
+        rows = np.repeat(sector_missing, sent.sizes) & np.isfinite(columns["yaw"])
         columns["sector"][rows] = grid.sector_of(columns["yaw"][rows])
 
 

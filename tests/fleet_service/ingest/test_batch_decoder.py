@@ -119,6 +119,7 @@ def _make_example() -> Any:  # noqa: ANN401
     message.latitude.extend([57.0, 57.0])
     message.longitude.extend([12.0, 12.0])
     message.health.extend([-1, 2])
+    message.sector.extend([0, 1])
     return message
 
 

@@ -133,6 +133,23 @@ def test_a_person_can_publish_with_one_line() -> None:
     assert got.columns["log_likelihood"].shape == (1, 0)
 
 
+def test_heading_in_degrees_is_refused_unless_the_sector_is_given() -> None:
+    report = {"enter_time": [1], "latitude": [57.7], "longitude": [11.97], "yaw": [90.0]}
+    with pytest.raises(WireError, match="^yaw: is more than a turn; send radians"):
+        decode(json.dumps(report).encode(), wire.JSON, Kind.OBSERVATION)
+    with_sector = json.dumps(report | {"sector": [1]}).encode()
+    assert decode(with_sector, wire.JSON, Kind.OBSERVATION).columns["yaw"][0] == 90.0
+
+
+def test_report_without_heading_is_refused_unless_the_sector_is_given() -> None:
+    report = {"enter_time": [1, 2], "latitude": [57.7] * 2, "longitude": [11.97] * 2}
+    for yaw in ({}, {"yaw": [1.6, "NaN"]}):
+        with pytest.raises(WireError, match="^yaw: is missing; send radians"):
+            decode(json.dumps(report | yaw).encode(), wire.JSON, Kind.OBSERVATION)
+    with_sector = json.dumps(report | {"sector": [1, 3]}).encode()
+    assert decode(with_sector, wire.JSON, Kind.OBSERVATION).columns["sector"].tolist() == [1, 3]
+
+
 def test_columns_of_unequal_length_are_refused_by_name() -> None:
     message = pb.ObservationBatch.FromString(wire.encode(batch(Kind.OBSERVATION)))
     del message.speed[-1]
