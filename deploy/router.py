@@ -12,6 +12,7 @@ import json
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ import zenoh
 
 from schemas.errors import InputError
 from schemas.runtime import commandline
+from schemas.runtime.certificates import find_certificate_faults
 from schemas.runtime.link_watch import router_metrics
 from schemas.runtime.metrics import serve_metrics
 from schemas.runtime.process import force_exit
@@ -131,6 +133,8 @@ def run(args: argparse.Namespace) -> int:
                 args.metrics_host, args.metrics_port, lambda: router_metrics(session), lambda: ()
             ) as address:
                 print(f"router: {' '.join(endpoints)}", flush=True)
+                for fault in find_certificate_faults(load_configuration(args.config), time.time()):
+                    print(f"warning: {fault}", file=sys.stderr, flush=True)
                 if address:
                     print(f"metrics: {address}/metrics", flush=True)
                 signals.recv(1)

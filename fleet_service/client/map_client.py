@@ -240,7 +240,10 @@ def open_connected(connection: ZenohSettings) -> zenoh.Session:
     except zenoh.ZError as error:
         where = ", ".join(connection.connect)
         fix = "start one with `gripmap router`, or name its endpoint with --connect"
-        raise UnreachableError("connect", f"no router at {where}", fix) from error
+        if where.startswith(("tls/", "quic/")):
+            fix += "; its log names an expired certificate"
+        faults = zenoh_session.explain_faults(connection)
+        raise UnreachableError("connect", f"no router at {where}", faults or fix) from error
 
 
 def _join_replies(map_query: query.MapQuery, payloads: list[bytes]) -> Answer:

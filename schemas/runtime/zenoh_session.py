@@ -15,6 +15,7 @@ import json
 import logging
 import re
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +25,7 @@ import zenoh
 from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
+from schemas.runtime.certificates import TLS, find_certificate_faults
 
 CLIENT: Final[Mapping[str, Any]] = {
     "mode": "client",
@@ -41,7 +43,6 @@ _TIMEOUT: Final = "connect/timeout_ms"
 _OPEN: Final = "transport/unicast/open_timeout"
 NAME: Final = "{name}"
 ENDPOINTS: Final = "connect/endpoints"
-_TLS: Final = "transport/link/tls"
 # Zenoh tries an endpoint without a port, or of another protocol, again and again without success.
 _ENDPOINT: Final = re.compile(
     r"(tcp|udp|tls|quic|quic_datagram|ws)/\S+:\d{1,5}([?#].*)?"
@@ -93,14 +94,19 @@ def check_certificates(config: zenoh.Config, section: str = "") -> None:
     """Raise InputError if a certificate or private key in a configuration does not exist. `section`
     stands before the name of the setting in the message.
     """
-    for key, value in json.loads(config.get_json(_TLS)).items():
+    for key, value in json.loads(config.get_json(TLS)).items():
         if (
             key.endswith(("certificate", "private_key"))
             and value is not None
             and not Path(value).is_file()
         ):
             fix = "make it with `fleet-service certs`, or correct the path"
-            raise InputError(f"{section}{_TLS}/{key}", f"there is no file {value}", fix)
+            raise InputError(f"{section}{TLS}/{key}", f"there is no file {value}", fix)
+
+
+def explain_faults(settings: ZenohSettings) -> str:
+    """Return the faults of the certificates of a session as one line; "" if none is visible."""
+    return "; ".join(find_certificate_faults(configuration(settings), time.time()))
 
 
 def _check_endpoints(endpoints: Sequence[str]) -> None:
@@ -175,10 +181,12 @@ def open_session(
     open_ms = settings.config.get(_OPEN, CLIENT[_OPEN])
     while not stop.is_set():
         patient = settings.model_copy(update={"config": {**settings.config, _OPEN: open_ms}})
+        config = configuration(patient, name)
         try:
-            return zenoh.open(configuration(patient, name))
+            return zenoh.open(config)
         except zenoh.ZError as error:
-            reasons.log_once(settings, error_reason(error))
+            faults = "; ".join(find_certificate_faults(config, time.time()))
+            reasons.log_once(settings, faults or error_reason(error))
             open_ms = max(open_ms, min(2 * open_ms, LONGEST_OPEN_MS))
             stop.wait(RETRY_S)
     return None
