@@ -97,6 +97,8 @@ def run(args: argparse.Namespace) -> int:
         write_durably(draft_path, draft.to_json())
         drafted = f"drafted from names, {len(draft.channels)} channels; check it before use"
         print(f"{draft_path}: {drafted}")
+    if merged.start_ns is None:
+        merged.notes.append("no source has a date; replay --publish needs --start")
     lacking = _lacking_channels(merged.columns)
     for note in [*merged.notes, *_missing_signals(lacking, profile, recordings)]:
         print(f"note: {note}")

@@ -221,6 +221,8 @@ def _replay_and_publish(
     notes = []
     if not batches.drafts:
         notes.append(_explain_no_record(config))
+    if start and args.start is None:
+        notes.append("note: the log has no date: published as if it ended now (see --start)")
     if start:
         notes.append(f"note: repeated{start}, this drive counts once; otherwise it is another")
     return code, notes

@@ -250,6 +250,7 @@ def test_replay_reports_unsent_records_and_how_to_continue(
     again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", said)
     assert again is not None
     assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in said
+    assert "note: the log has no date: published as if it ended now" in said
 
 
 def test_records_lost_by_a_damaged_outbox_are_reported(

@@ -328,7 +328,9 @@ def test_a_unit_that_is_not_known_is_noted(
     text = "t,ax [mg],air_temperature [F]\n0.0,100,23\n0.1,100,23\n"
     out = tmp_path / "o.parquet"
     main(["import", str(write(tmp_path / "a.csv", text)), "--out", str(out)])
-    assert "note: ax: its unit 'mg' is unknown; taken as m/s^2" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "note: ax: its unit 'mg' is unknown; taken as m/s^2" in told
+    assert "note: no source has a date; replay --publish needs --start" in told
     assert pq.read_table(out)["air_temperature"][0].as_py() == pytest.approx(-5.0)
 
 
