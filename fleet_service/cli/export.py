@@ -173,6 +173,8 @@ def _route_costs(arguments: argparse.Namespace) -> int:
     with commandline.report_write_errors(arguments.out):
         arguments.out.write_text(json.dumps(costs), encoding="utf-8")
     print(f"{len(lines)} stretches of low grip in {arguments.out}", flush=True)
+    if not lines:
+        print(f"note: {routing.explain_no_line(table, str(arguments.roads))}", flush=True)
     return 0
 
 

@@ -87,6 +87,26 @@ def cost_lines(table: pa.Table, roads: Iterable[RoadLine]) -> list[CostLine]:
     return out
 
 
+def explain_no_line(table: pa.Table, roads: str) -> str:
+    """Return the reason why no road has a cost, for a user. `table` contains the cells of the map,
+    and `roads` is the file of the road network.
+    """
+    _, factor = _sorted_factors(table)
+    low = int(np.sum(factor > 1.0))
+    if not table.num_rows:
+        return "the map has no cells there, so nothing is known about the roads"
+    if not low:
+        return f"no cell of {table.num_rows} is known to have low grip, so nothing is avoided"
+    west, south, east, north = (
+        float(pick(_float_column(table, side)))
+        for side, pick in (("west", np.min), ("south", np.min), ("east", np.max), ("north", np.max))
+    )
+    return (
+        f"{low} cells have low grip, but none is on a road of {roads}; the map covers "
+        f"{west:.3f},{south:.3f},{east:.3f},{north:.3f} (longitude first)"
+    )
+
+
 def ice_cells(table: pa.Table) -> list[list[tuple[float, float]]]:
     """Return the outlines (rings of (longitude, latitude) [deg]) of the cells that are almost
     certainly icy.
