@@ -59,4 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
         f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"
         + (f"; {licence}" if licence else "")
     )
+    for note in network.notes:
+        print(f"note: {note}")
     return 0

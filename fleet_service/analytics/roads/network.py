@@ -4,6 +4,8 @@ with ids.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -32,6 +34,7 @@ CLASSES: Final = (
     "living_street",
     "service",
 )  # values of OpenStreetMap's tag `highway` on which cars may drive
+MOST_NAMES: Final = 5  # maximum number of ids in a note
 FORWARD = "forward"
 BACKWARD = "backward"
 _ONLY_FORWARD: Final = frozenset({"yes", "true", "1", FORWARD})
@@ -57,12 +60,13 @@ class DirectedLink(NamedTuple):
 
 
 class RoadNetwork(NamedTuple):
-    """Road links that were read from a file, and information about the file: name, digest, date and
-    licence.
+    """Road links that were read from a file, information about the file (name, digest, date and
+    licence), and remarks for the user.
     """
 
     links: list[DirectedLink]
     source: dict[str, str]
+    notes: tuple[str, ...] = ()
 
 
 def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNetwork:
@@ -86,8 +90,9 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
     source = {"extract": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
     if path.name.endswith(EXTRACT):
         links, about = _read_openstreetmap(path)
+        notes: tuple[str, ...] = ()
     elif path.name.endswith(LINES):
-        links = _read_lines(path, identity, name)
+        links, notes = _read_lines(path, identity, name)
         about = {}
     else:
         known = ", ".join((*EXTRACT, *LINES))
@@ -96,7 +101,7 @@ def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNe
         raise InputError(
             "extract", f"{path.name} contains no road for cars", "name another extract"
         )
-    return RoadNetwork(links, source | about)
+    return RoadNetwork(links, source | about, notes)
 
 
 def _read_openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
@@ -132,7 +137,7 @@ def _read_openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]
     return links, {"date": date, "licence": "ODbL 1.0, © OpenStreetMap contributors"}
 
 
-def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
+def _read_lines(path: Path, identity: str, name: str) -> tuple[list[DirectedLink], tuple[str, ...]]:
     try:
         import geopandas
     except ImportError as error:
@@ -175,7 +180,16 @@ def _read_lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
             raise InputError("id", problem, fix)
         called, kind, oneway = (_text_of(about.get(column)) for column in (name, "kind", "oneway"))
         links += _driven_directions(own, called, kind, oneway, points)
-    return links
+    return links, _note_repeated_ids([_text_of(value) for value in frame[identity]], identity)
+
+
+def _note_repeated_ids(ids: Sequence[str], identity: str) -> tuple[str, ...]:
+    """Return a note if several roads have the same id, because each id gets one answer."""
+    repeated = [own for own, count in Counter(ids).items() if count > 1]
+    if not repeated:
+        return ()
+    names = ", ".join(repeated[:MOST_NAMES]) + (", …" if len(repeated) > MOST_NAMES else "")
+    return (f"lines with the same {identity!r} count as one road ({names}); see --id",)
 
 
 def _text_of(value: object) -> str:

@@ -81,6 +81,15 @@ def test_lines_with_ids_come_from_any_file_in_any_coordinates(tmp_path: Path, en
     ]
     assert network.links[0].name == "E6"
     assert network.links[0].latitude == pytest.approx([57.70, 57.70], abs=1e-7)
+    assert network.notes == ()
+
+
+def test_roads_with_the_same_id_are_noted(tmp_path: Path) -> None:
+    lines = [LineString([(11.97, 57.70), (11.98, 57.70 + 0.01 * k)]) for k in range(3)]
+    frame = geopandas.GeoDataFrame({"id": ["a", "b", "a"]}, geometry=lines, crs=4326)
+    frame.to_parquet(tmp_path / "roads.parquet")
+    network = read_network(tmp_path / "roads.parquet")
+    assert network.notes == ("lines with the same 'id' count as one road (a); see --id",)
 
 
 @pytest.mark.parametrize(
