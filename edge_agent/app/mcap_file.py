@@ -11,6 +11,7 @@ from typing import BinaryIO, Final, Self
 import pyarrow as pa
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 from schemas.thresholds import NS
 
 TOPIC: Final = "/gripmap/estimates"
@@ -36,7 +37,7 @@ class McapTableWriter:
             from mcap.writer import Writer
         except ImportError as error:
             raise InputError(
-                "out", "the package mcap is missing", "pip install 'gripmap[mcap]'"
+                "out", "the package mcap is missing", install_command("mcap")
             ) from error
         self._writer = Writer(file)
         self._count = 0

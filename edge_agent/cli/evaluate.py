@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 if TYPE_CHECKING:
     from schemas.runtime.figures import Figure
@@ -85,7 +86,9 @@ def run(args: argparse.Namespace) -> int:
     draws = args.only in (None, "detection") and not args.no_plots
     if draws and importlib.util.find_spec("matplotlib") is None:
         raise InputError(
-            "plots", "matplotlib is not installed", "install gripmap[analytics], or give --no-plots"
+            "plots",
+            "matplotlib is not installed",
+            f"{install_command('analytics')}, or give --no-plots",
         )
     try:
         args.out.mkdir(parents=True, exist_ok=True)

@@ -49,6 +49,7 @@ from edge_agent.lab.tuning.search import Iteration, Objective, Problem, Progress
 from edge_agent.lab.tuning.study import run_search
 from schemas.errors import InputError
 from schemas.runtime import figures
+from schemas.runtime.installing import install_command
 from schemas.vehicle import load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
@@ -261,7 +262,7 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     from edge_agent.lab.tuning import study_report
 
     if importlib.util.find_spec("matplotlib") is None:
-        raise InputError("study", "its plot needs matplotlib", "install gripmap[analytics]")
+        raise InputError("study", "its plot needs matplotlib", install_command("analytics"))
     try:
         args.study.mkdir(parents=True, exist_ok=True)
     except OSError as error:

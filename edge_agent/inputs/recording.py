@@ -13,6 +13,7 @@ from typing import Any
 
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.runtime.installing import install_command
 
 
 @dataclass(frozen=True)
@@ -82,5 +83,5 @@ def import_optional(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            "source", f"needs {name}, which is not installed", f"install gripmap[{extra}]"
+            "source", f"needs {name}, which is not installed", install_command(extra)
         ) from error

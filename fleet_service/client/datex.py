@@ -91,9 +91,9 @@ def make_publication(
             longitude). Situations at other places are not ended.
 
     Raises:
-        InputError: `before` is not a publication.
+        InputError: `before` is not a publication, or that of another supplier.
     """
-    old = {} if before is None else _parse_records(before)
+    old = {} if before is None else _parse_records(before, supplier)
     root = _make_payload(supplier, now)
     written: set[str] = set()
     for alert in standing:
@@ -306,8 +306,8 @@ def _cell_coordinates(record: ET.Element) -> set[str]:
     }
 
 
-def _parse_records(document: bytes) -> dict[str, ET.Element]:
-    """Return the situation records (hazards) of a DATEX II publication by id."""
+def _parse_records(document: bytes, supplier: Supplier) -> dict[str, ET.Element]:
+    """Return the situation records (hazards) of a supplier's DATEX II publication by id."""
     problem = InputError("out", "is not a publication of this command", "name another file")
     try:
         root = ET.fromstring(document)
@@ -318,6 +318,17 @@ def _parse_records(document: bytes) -> dict[str, ET.Element]:
         or root.get(_qualified_name("xsi:type")) != "sit:SituationPublication"
     ):
         raise problem
+    creator = root.find("com:publicationCreator", _SPACES)
+    names = ("com:country", "com:nationalIdentifier")
+    former = (
+        tuple(creator.findtext(name, "", _SPACES) for name in names) if creator is not None else ()
+    )
+    if former not in ((), (supplier.country, supplier.name)):
+        raise InputError(
+            "supplier",
+            f"the file is the publication of {' '.join(former)}",
+            "give each supplier a file of its own (--out)",
+        )
     return {
         record.get("id", ""): record for record in root.iterfind(".//sit:situationRecord", _SPACES)
     }

@@ -25,6 +25,7 @@ from urllib.parse import urlsplit
 from fleet_service.client.alert_queue import AlertQueue
 from fleet_service.client.stretches import StretchAlert, format_time
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 from schemas.runtime.metrics import Metric, counter, gauge
 from schemas.thresholds import SLIPPERY_MU
 
@@ -286,7 +287,7 @@ def check_url(url: str) -> None:
         import httpx  # noqa: F401
     except ImportError as error:
         raise InputError(
-            "webhook", "the package httpx is missing", "pip install 'gripmap[webhook]'"
+            "webhook", "the package httpx is missing", install_command("webhook")
         ) from error
 
 

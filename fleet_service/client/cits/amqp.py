@@ -12,14 +12,15 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 
 try:
     import proton
     from proton.handlers import MessagingHandler
     from proton.reactor import ApplicationEvent, Container, EventInjector, Selector
 except ImportError as _missing:
-    _fix = "pip install 'gripmap[cits]'"
-    raise InputError("cits", "the package python-qpid-proton is missing", _fix) from _missing
+    _problem = "the package python-qpid-proton is missing"
+    raise InputError("cits", _problem, install_command("cits")) from _missing
 
 CREDIT: Final = 200  # messages that the other side may send in advance
 HEARTBEAT_S: Final = 10.0

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 from fleet_service.client.cits.uper import BitWriter
 from schemas.errors import InputError
+from schemas.runtime.installing import install_command
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 PROTOCOL_VERSION: Final = 2
@@ -161,7 +162,7 @@ def compiled_denm() -> Any:  # noqa: ANN401 the library has no types
         import asn1tools
     except ImportError as error:
         raise InputError(
-            "cits", "the package asn1tools is missing", "pip install 'gripmap[cits]'"
+            "cits", "the package asn1tools is missing", install_command("cits")
         ) from error
     return asn1tools.compile_files(str(Path(__file__).with_name("denm.asn")), "uper")
 

@@ -172,6 +172,14 @@ def test_a_file_of_others_is_not_written_over(foreign: bytes) -> None:
         make_publication(OURS, [], NOW, foreign)
 
 
+def test_publication_of_another_supplier_is_not_continued() -> None:
+    document = make_publication(OURS, [], NOW)
+    make_publication(OURS, [], NOW, document)
+    for other in (Supplier("se", "Other"), Supplier("no", OURS.name)):
+        with pytest.raises(InputError, match="supplier: .* publication of se GripMap test; give"):
+            make_publication(other, [], NOW, document)
+
+
 @pytest.mark.parametrize(("country", "name"), [("SE", "x"), ("sweden", "x"), ("se", " ")])
 def test_supplier_must_be_valid(country: str, name: str) -> None:
     with pytest.raises(InputError):
