@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -322,18 +324,37 @@ def load(path: Path | str | None, model: type[Model], field: str = "config") -> 
     If `path` is None, return the default settings. Error messages about the file call it `field`.
 
     Raises:
-        InputError: the file cannot be read, or a setting is unknown or out of range.
+        InputError: the file cannot be read, or a setting is unknown, out of range or given twice.
     """
     if path is None:
         return model()
     try:
-        return model.model_validate_json(Path(path).read_bytes())
+        text = Path(path).read_bytes()
+        require_unique_names(text, f"configuration {path}")
+        return model.model_validate_json(text)
     except OSError as error:
         raise InputError(
             field, f"cannot read {path} ({error.strerror})", "give the path of a JSON file"
         ) from error
     except ValidationError as error:
         raise explain(error, f"configuration {path}", model) from error
+
+
+def require_unique_names(text: bytes, where: str) -> None:
+    """Raise InputError if an object in a JSON text has a name twice, because a parser silently
+    takes the last value. `where` is the source of the text. Invalid JSON is left to the parser.
+    """
+
+    repeated: list[str] = []
+
+    def collect_names(pairs: list[tuple[str, object]]) -> None:
+        counts = Counter(name for name, _ in pairs)
+        repeated.extend(name for name, count in counts.items() if count > 1)
+
+    with contextlib.suppress(ValueError, RecursionError):
+        json.loads(text, object_pairs_hook=collect_names)
+    if repeated:
+        raise InputError(repeated[0][:60], "is given more than once", f"keep one in the {where}")
 
 
 def explain(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:

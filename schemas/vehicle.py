@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from schemas.config import explain
+from schemas.config import explain, require_unique_names
 from schemas.errors import InputError
 from schemas.thresholds import GRAVITY
 from schemas.vehicle_classes import PREFIX, fields_of_class
@@ -229,6 +229,7 @@ def _drop_foreign_names(path: Path) -> bytes:
     for each of them.
     """
     content = path.read_bytes()
+    require_unique_names(content, f"vehicle file {path}")
     try:
         given = json.loads(content)
     except ValueError:

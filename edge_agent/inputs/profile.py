@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from edge_agent.inputs.log_columns import FRONT_STEERING
 from edge_agent.inputs.units import QUANTITY
-from schemas.config import explain
+from schemas.config import explain, require_unique_names
 from schemas.errors import InputError
 from schemas.signals import CONTEXT, FLAGS
 
@@ -190,7 +190,9 @@ def load_profile(name: str) -> tuple[Profile, Path]:
     """
     path = FOLDER / f"{name}.json" if name in shipped_profiles() else Path(name)
     try:
-        return Profile.model_validate_json(path.read_bytes()), path.parent
+        text = path.read_bytes()
+        require_unique_names(text, f"profile {path}")
+        return Profile.model_validate_json(text), path.parent
     except OSError as error:
         known = ", ".join(shipped_profiles())
         raise InputError(

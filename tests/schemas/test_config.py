@@ -13,6 +13,7 @@ from fleet_service.enrolment.fleet import Enrolment
 from schemas import tables
 from schemas.config import LEAST_RAW_DAYS, AgentConfig, ServiceConfig, load
 from schemas.errors import InputError
+from schemas.vehicle import load_vehicle
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,16 @@ def test_a_misspelt_setting_is_reported_with_the_known_name(
     with pytest.raises(InputError) as error:
         load(path, model)
     assert re.search(message, str(error.value)), str(error.value)
+
+
+def test_a_setting_that_is_given_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text('{"archive": {"path": "a"}, "zenoh": {}, "archive": {"copy": "file:///b"}}')
+    with pytest.raises(InputError, match="^archive: is given more than once; keep one in the conf"):
+        load(path, ServiceConfig)
+    path.write_text('{"mass": 1500, "mass": 1600}')
+    with pytest.raises(InputError, match="^mass: is given more than once; keep one in the vehicle"):
+        load_vehicle(path)
 
 
 def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path) -> None:
