@@ -33,6 +33,7 @@ from edge_agent.inputs.doctor.places import (
     position_findings,
     yaw_findings,
 )
+from edge_agent.inputs.doctor.ranges import find_impossible_values
 from edge_agent.inputs.doctor.scale_faults import CHANNELS_OF, find_receiver_scale, find_scales
 from edge_agent.inputs.doctor.scales import Verdict, explain_fits
 from edge_agent.inputs.doctor.slip import (
@@ -93,6 +94,7 @@ def diagnose(
         diagnosis.findings += find_radii(drive, vehicle, diagnosis.doubts)
         diagnosis.findings += find_offsets(drive, diagnosis.fits)
         _find_exchanged_ends(t, signals, vehicle, diagnosis)
+    find_impossible_values(signals, diagnosis)
     _list_sound_channels(verdict, diagnosis)
     _judge_receiver(signals, ground, verdict, diagnosis)
     return diagnosis

@@ -189,6 +189,26 @@ def test_speed_over_ground_in_another_unit_is_a_fault(rough: Recorded) -> None:
     assert [(one.channel, one.kind) for one in said.findings] == [("gnss_speed", "scale")]
 
 
+@pytest.mark.parametrize(
+    ("column", "channel", "factor"),
+    [
+        (slice(S.DELTA, S.DELTA + 4), "delta", 57.3),
+        (S.YAW_RATE, "yaw_rate", 57.3),
+        (S.AY, "ay", 9.81),
+    ],
+)
+def test_values_that_no_car_reaches_are_a_fault_in_a_short_drive(
+    column: int | slice, channel: str, factor: float
+) -> None:
+    log, vehicle = simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
+    t = log["t"].to_numpy()
+    signals = np.column_stack([log[name].to_numpy().astype(float) for name in CHANNELS])
+    assert diagnose(t, signals, vehicle).findings == []
+    signals[:, column] *= factor
+    found = diagnose(t, signals, vehicle).findings
+    assert channel in {one.channel for one in found}
+
+
 def test_wheels_that_send_a_constant_code_are_a_fault(rough: Recorded) -> None:
     signals = rough.signals.copy()
     signals[:, S.OMEGA] = -1.0
