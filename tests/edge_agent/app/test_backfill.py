@@ -158,6 +158,15 @@ def test_ctrl_c_ends_a_replay_of_many_logs_with_one_word(
     assert not logs(tmp_path)
 
 
+def test_missing_log_is_reported_before_its_vehicle_file(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    none = tmp_path / "none.parquet"
+    words = ["replay", str(none), str(drives / "d0.parquet"), "--estimator", "ckf"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert f"error: {none}: log: {none} does not exist" in capsys.readouterr().err
+
+
 def test_bad_log_is_reported_and_the_others_are_estimated(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
