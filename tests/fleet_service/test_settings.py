@@ -151,6 +151,7 @@ def count_far_moves(config: ServiceConfig, root: Path) -> int:
                 "boot": "1",
                 "seq": str(seq),
                 "enter_time": [str(now)],
+                "yaw": [0.1],
             }
             report |= {"latitude": [latitude], "longitude": [11.97], "mu_utilised": [0.2]}
             region = int(grid.region_of(int(grid.cell_of(latitude, 11.97))))

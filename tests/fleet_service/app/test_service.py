@@ -347,6 +347,7 @@ def test_a_person_can_publish_with_one_line_of_json(fleet: Fleet, service: Runni
         "enterTime": [str(now())],
         "latitude": [LATITUDE],
         "longitude": [LONGITUDE],
+        "yaw": [0.1],
         "mu": [0.3],
         "muUtilised": [0.29],
     }
