@@ -16,7 +16,7 @@ from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.likelihoods import at_least, bound_by_used, level_above_used
 from fleet_service.fusion.reported import as_reported
-from fleet_service.fusion.space import cell_shares
+from fleet_service.fusion.space import own_share
 from fleet_service.fusion.witnesses import stretch_sources
 from fleet_service.ingest.batch_decoder import decode_many
 from fleet_service.ingest.grouping import group_rows, largest_of
@@ -69,7 +69,7 @@ def exercise_map() -> None:
     group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
     VehiclePaths().find_implausible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
-    cell_shares(np.ones(1), np.ones(1))
+    own_share(np.ones(1), np.ones(1))
     stretch_sources(fusion, np.arange(2), np.zeros(2, np.int64))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
     for kind in wire.Kind:
@@ -100,6 +100,5 @@ def _make_visits(time: int, cells: int) -> Observations:
         used=np.full(cells, 0.9, np.float32),
         manoeuvre=np.full(cells, -1, np.int8),
         limited=np.zeros(cells, np.int8),
-        other=np.full((cells, 1), -1),
-        other_share=np.zeros((cells, 1), np.float32),
+        share=np.ones(cells, np.float32),
     )

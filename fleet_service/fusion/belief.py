@@ -11,7 +11,7 @@ Legend
     s    strength of a vote: a × b × c                                          [-]
          a    share of the visit's information that earlier visits of the vehicle did not give
          b    trust in the vehicle, its weight among all vehicles
-         c    P(the visit was in this cell), because positions are inaccurate
+         c    weight of the position, below 1 if it is inaccurate (`space`)
     h    P(the road changed within Δt), 1 - exp(-Δt / CHANGE_S)                 [-]
          CHANGE_S    mean time between sudden changes of the road               [s]
 

@@ -180,11 +180,6 @@ EVIDENCE_NATS: Final = VALUE_NATS
 VALUE_DROP_STEPS: Final = int(EVIDENCE_NATS * mugrid.STEPS_PER_NAT)  # the same in encoded steps
 # Largest fall of a bound's log-likelihood towards the highest friction that is noise, in steps.
 NOISE_DROP_STEPS: Final = VALUE_DROP_STEPS // 2
-# Number of cells on each side that may get a part. A position that is less accurate has no use.
-SPREAD_CELLS: Final = 2
-# A vote counts as a visit to a cell only if the vehicle was in this cell with at least this
-# probability.
-HERE_SHARE: Final = 0.5
 
 # --- Trust: comparison of values of different vehicles in the same cell ---
 
@@ -281,11 +276,6 @@ FORGOTTEN_EVERY_S: Final = int(VOTE_RENEWAL_S) // 4
 
 # --- From a report to a likelihood ---
 
-# Smallest probability that a vehicle was in another cell for which that cell gets a part of its
-# vote; smaller parts stay in the reported cell. Receivers with an error of 1.5 m have 6 % on each
-# side, which CONTAMINATION covers. Spreading these too would cost three times as many votes and add
-# nothing.
-SPREAD_LEAST: Final = 0.08
 # Largest grip used that is believed. Of the reports above it, 29 % were too high by more than .05.
 UTILISED_MOST: Final = 0.9
 

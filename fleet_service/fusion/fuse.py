@@ -118,7 +118,7 @@ class Fusion(BeliefMap):
     def waiting(self) -> int:
         """Return the number of observations in the lateness windows: the recent observations, which
         are not final because late ones may still be sorted in before them. An observation that
-        affects several cells counts once per cell.
+        affects two sectors counts twice.
         """
         return self.store.waiting
 
@@ -270,11 +270,11 @@ class Fusion(BeliefMap):
         """
         # Sort by time, so that no row of the batch makes the belief after another one stale.
         rows = rows[np.argsort(observations.time[rows], kind="stable")]
-        at, keys, share, is_own = _spread_votes(observations, rows)
+        at, keys = _place_votes(observations, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
         return slots, absorb_votes(
-            self.store.state, self._weather, arrivals, Votes(at, slots, share, is_own, most_waiting)
+            self.store.state, self._weather, arrivals, Votes(at, slots, most_waiting)
         )
 
 
@@ -305,6 +305,7 @@ def _make_arrivals(observations: Observations, vehicle: IntArray, late_by: IntAr
         sequence=observations.sequence,
         vehicle=vehicle,
         weight=np.zeros(n, np.float32),
+        share=observations.share,
         evidence=observations.evidence,
         reported=observations.reported,
         used=(np.clip(observations.used, 0.0, 2.5) * USED).astype(np.uint8),
@@ -319,46 +320,25 @@ def voted_keys(observations: Observations) -> IntArray:
     """Return the keys (cell · 4 + sector) of all cells and sectors that the observations affect, as
     one array. A key occurs once for each observation that affects it.
     """
-    return _spread_votes(observations, np.arange(len(observations.time)))[1]
+    return _place_votes(observations, np.arange(len(observations.time)))[1]
 
 
-def _spread_votes(
-    observations: Observations, rows: IntArray
-) -> tuple[IntArray, IntArray, Float32Array, BoolArray]:
-    """Return the votes of the selected observations, sorted by time. A vote is the effect of one
-    observation on one cell and heading sector. The four arrays contain the row of the observation,
-    the key (cell · 4 + sector), P(the vehicle was in this cell), and True for the reported cell.
+def _place_votes(observations: Observations, rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the votes of the selected observations, which are sorted by time, in the same order. A
+    vote is the effect of one observation on one cell and heading sector. The two arrays contain the
+    row of the observation, and the key (cell · 4 + sector).
 
-    Besides its own cell and sector, an observation may affect a second sector and neighbouring
-    cells.
+    An observation with a heading near the edge of its sector also affects the second sector.
     """
-    own = 1.0 - observations.other_share[rows].sum(axis=1)
     key = observations.cell[rows] * grid.SECTORS
-    at = [rows]
-    keys = [key + observations.sector[rows]]
-    share = [own]
+    keys = key + observations.sector[rows]
     second = np.flatnonzero(observations.second[rows] >= 0)
-    if len(second):
-        at.append(rows[second])
-        keys.append(key[second] + observations.second[rows[second]])
-        share.append(own[second])
-    elsewhere, which = np.nonzero(observations.other[rows] >= 0)
-    if len(elsewhere):
-        at.append(rows[elsewhere])
-        keys.append(
-            observations.other[rows[elsewhere], which] * grid.SECTORS
-            + observations.sector[rows[elsewhere]]
-        )
-        share.append(observations.other_share[rows[elsewhere], which])
-    whole = np.concatenate(at)
-    is_own = np.arange(len(whole)) < len(rows) + len(second)
-    order = np.argsort(observations.time[whole], kind="stable") if len(at) > 1 else slice(None)
-    return (
-        whole[order],
-        np.concatenate(keys)[order],
-        np.concatenate(share)[order].astype(np.float32),
-        is_own[order],
-    )
+    if not len(second):
+        return rows, keys
+    whole = np.concatenate([rows, rows[second]])
+    keys = np.concatenate([keys, key[second] + observations.second[rows[second]]])
+    order = np.argsort(observations.time[whole], kind="stable")
+    return whole[order], keys[order]
 
 
 def _drop_old_reports(reports: Reports, oldest: int) -> Reports:

@@ -24,9 +24,7 @@ of m is 1 - w, which is .1 next to ice. So a cell in which its own visitors foun
 with grip. A neighbour with grip stops the messages of cells beyond it, because the stretch has
 ended there. So does a border: two vehicles reported grip in one cell after two had reported ice in
 the other (`sources.is_border`). Otherwise a single report from the wrong cell, which makes the
-cell doubtful, would be confirmed by the ice on the other side of the border. A cell sends no
-message if no vehicle was in it with a probability of at least HERE_SHARE (positions are inaccurate,
-see `space`).
+cell doubtful, would be confirmed by the ice on the other side of the border.
 
 The factor q weakens a message if few visits to the cell itself gave a friction value. On the same
 slippery surface, about as many visits would give a value as in the neighbouring cell: v_n, or

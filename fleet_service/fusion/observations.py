@@ -18,7 +18,7 @@ from fleet_service.fusion.likelihoods import (
     states_more_grip,
 )
 from fleet_service.fusion.shared import manoeuvre_of
-from fleet_service.fusion.space import other_cells
+from fleet_service.fusion.space import position_weights
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 from schemas.thresholds import MU_RANGE, SLIPPERY_MU, US_STEP
@@ -49,9 +49,7 @@ class Observations:
         limited: (n,) 1 if a slip controller intervened at so little grip used that only slippery
             road explains it; -1 if the likelihood states that the road has more grip than was used;
             else 0.
-        other: (n, k) other cells in which the vehicle may have been instead; -1 for none.
-        other_share: (n, k) probability that the vehicle was in the other cell; the rest belongs to
-            `cell`.
+        share: (n,) weight of the visit in `cell`, below 1 if the position is inaccurate.
     """
 
     time: IntArray
@@ -67,8 +65,7 @@ class Observations:
     used: Float32Array
     manoeuvre: SmallArray
     limited: SmallArray
-    other: IntArray
-    other_share: Float32Array
+    share: Float32Array
 
     def take(self, rows: IntArray | BoolArray | slice) -> Observations:
         """Return the observations that the indices or mask `rows` selects."""
@@ -94,9 +91,6 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     )
     # A sliding vehicle used all of the grip, so the error of the tyre curve does not apply.
     used = np.where(find_slides(columns, columns["with_likelihood"], limited), SLIPPERY_MU, used)
-    other, share = other_cells(
-        columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"]
-    )
     used = np.clip(np.nan_to_num(used), *MU_RANGE).astype(np.float32)
     return Observations(
         time=columns["leave_time"] // US_STEP * US_STEP,
@@ -112,6 +106,5 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         used=used,
         manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
         limited=np.where(limited, 1, -1 * states_more_grip(columns, used)).astype(np.int8),
-        other=other,
-        other_share=share,
+        share=position_weights(columns["latitude"], columns["yaw"], columns["position_std"]),
     )

@@ -74,8 +74,7 @@ def compare_reports(
 ) -> None:
     """Compare a vehicle's friction value with the recent values of other vehicles in the cell, and
     record how well each pair of vehicles agrees. Then store the value in the place of the vehicle's
-    earlier value, or else of the oldest value. Do nothing if the value is late, or if the vehicle
-    reported another cell: a vehicle with inaccurate positions is compared where it says it was.
+    earlier value, or else of the oldest value. Do nothing if the value is late.
 
     Args:
         reporters: recent values of each cell (`ReportersRecord`).
@@ -86,7 +85,7 @@ def compare_reports(
         entries: observations (`EntryRecord`).
         entry: row of the new value in `entries`.
     """
-    if not entries[entry].own or entries[entry].late:
+    if entries[entry].late:
         return
     here = reporters[row]
     vehicle = int(entries[entry].vehicle)
@@ -188,7 +187,7 @@ def judge_flag(
     from SLIPPERY. The vehicle's own value of the same visit is not a confirmation, because the flag
     and the value come from the same slip.
     """
-    if not entries[entry].own or entries[entry].late:
+    if entries[entry].late:
         return
     here = reporters[row]
     vehicle = int(entries[entry].vehicle)

@@ -295,7 +295,7 @@ def update_cell(
         cells[row].values += np.float32(strength)
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
-    if entries[entry].weight >= constants.SOURCE_TRUST and entries[entry].own:
+    if entries[entry].weight >= constants.SOURCE_TRUST:
         _note_source(rows, sources, entries, entry, time)
 
 
@@ -483,11 +483,7 @@ def needs_reporters(entries: RecordArray, entry: int) -> bool:
 
 @refcount_free_inlined
 def _count_visit(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
-    """Count one visit of a vehicle to a cell, and the vehicle if it is new there. A visit that was
-    probably in another cell is not counted.
-    """
-    if entries[entry].share < constants.HERE_SHARE:
-        return
+    """Count one visit of a vehicle to a cell, and the vehicle if it is new there."""
     cells[row].visits += np.uint32(1)
     if entries[entry].fresh and not cells[row].returned & returning_bit(entries[entry].number):
         cells[row].vehicles += np.uint32(1)

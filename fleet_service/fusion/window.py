@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import PADDED, Bins, ReportKind
 from fleet_service.fusion.store.cells import copy_row, copy_sources
 from fleet_service.fusion.store.pairs import comes_before, commit_pair, link_pair, pair_of
@@ -64,6 +63,7 @@ class Arrivals(NamedTuple):
     sequence: IntArray
     vehicle: IntArray
     weight: Float32Array
+    share: Float32Array
     evidence: ByteArray
     reported: Float32Array
     used: ByteArray
@@ -75,17 +75,14 @@ class Arrivals(NamedTuple):
 
 class Votes(NamedTuple):
     """Votes of a batch, arrays of shape (k,). A vote is the effect of one observation on one cell:
-    row of the observation, slot (cell and heading sector), P(the vehicle was in this cell), and
-    True for the reported cell.
+    row of the observation, and slot (cell and heading sector).
 
-    Among the votes of one observation, the vote for its own cell comes first. At most `most`
+    Among the votes of one observation, the vote for its own sector comes first. At most `most`
     observations of a vehicle may wait in one cell.
     """
 
     row: IntArray
     slot: IntArray
-    share: Float32Array
-    is_own: BoolArray
     most: int
 
 
@@ -107,8 +104,7 @@ def absorb_votes(state: State, weather: Weather, arrivals: Arrivals, votes: Vote
     Every memory pool must have as many free rows as the batch has votes.
 
     Return a mask (n,) of the observations that were left out. An observation is left out if
-    `votes.most` observations of its vehicle already wait in the cell in which it was made. Its
-    votes for neighbouring cells are not limited.
+    `votes.most` observations of its vehicle already wait in its own sector of the cell.
     """
     n = len(arrivals.time)
     k = len(votes.row)
@@ -154,8 +150,6 @@ def _absorb_votes(
         marks.seen[row] = True
         entry = _fill_entry(state, arrivals, row)
         new = entries[entry]
-        new.share = votes.share[k]
-        new.own = votes.is_own[k] and new.share >= c.SPREAD_LEAST
         describe_vote(entries, entry, arrivals.reported[row], scratch)
         window = int(cells[slot].window)
         if window == NONE:
@@ -198,6 +192,7 @@ def _fill_entry(state: State, arrivals: Arrivals, row: int) -> int:
     new.manoeuvre = arrivals.manoeuvre[row]
     new.late = arrivals.late[row]
     new.limited = arrivals.limited[row]
+    new.share = arrivals.share[row]
     return entry
 
 

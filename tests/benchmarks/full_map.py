@@ -62,8 +62,7 @@ def make_visits(
         used=np.full(rows, 0.9, np.float32),
         manoeuvre=np.full(rows, -1, np.int8),
         limited=np.zeros(rows, np.int8),
-        other=np.full((rows, 1), -1),
-        other_share=np.zeros((rows, 1), np.float32),
+        share=np.ones(rows, np.float32),
     )
 
 

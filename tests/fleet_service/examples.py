@@ -68,8 +68,7 @@ def observations(
         used=np.full(n, 0.9, np.float32),
         manoeuvre=np.full(n, -1, np.int8),
         limited=np.zeros(n, np.int8),
-        other=np.full((n, 4), -1),
-        other_share=np.zeros((n, 4), np.float32),
+        share=np.ones(n, np.float32),
     )
 
 

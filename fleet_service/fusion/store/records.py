@@ -145,7 +145,7 @@ class EntryRecord:
             vehicle has at most VOTES.
         time: end of the visit [ns]; for a late observation, a time directly after the checkpoint.
         weight: trust in the vehicle, see `vote_weights`; about 0 to 1.
-        share: P(the vehicle was in this cell), 0 to 1; below 1 if its position is inaccurate.
+        share: weight of the position, 0 to 1; below 1 if it is inaccurate (`space`).
         power: share, 0 to 1, of the observation that is new information after the vehicle's earlier
             reports in this cell, see `votes.discount_vote`.
         mean, std, slippery: mean and standard deviation of μ, and P(slippery), according to this
@@ -165,7 +165,6 @@ class EntryRecord:
             slippery limit; HEEDED if in addition the vehicle's earlier interventions agreed with
             other vehicles; UNLIMITED if the vehicle states that it did not use all of the road's
             grip (`likelihoods.states_more_grip`); else 0.
-        own: 1 in the cell that the vehicle reported, 0 in other cells in which it may have been.
     """
 
     previous: np.int32
@@ -195,7 +194,6 @@ class EntryRecord:
     manoeuvre: np.int8
     late: np.uint8
     limited: np.int8
-    own: np.int8
 
 
 class WindowRecord:

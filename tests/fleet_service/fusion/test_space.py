@@ -1,5 +1,5 @@
-"""Tests of visits (passages of a cell) with an uncertain position: the report is divided among the
-cells that the vehicle may have visited, and counts only once in all.
+"""Tests of visits (passages of a cell) with an uncertain position: the report counts less in the
+reported cell, and in no other.
 """
 
 from __future__ import annotations
@@ -11,20 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_service.fusion import Fusion, space
+from fleet_service.fusion import Fusion, constants, space
 from fleet_service.serve.alerts import Alerts
 from schemas import grid, mugrid
-from schemas.numeric import FloatArray, IntArray
-from tests.fleet_service.examples import CELL, LATITUDE, observations, value
+from schemas.numeric import FloatArray
+from tests.fleet_service.examples import CELL, LATITUDE, at_least, belief, observations, value
 
 WIDTH_M = 10.2  # [m] width of a cell at LATITUDE
 
 
-def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, FloatArray]:
-    found = space.other_cells(
-        np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std])
-    )
-    return found[0][0], found[1][0].astype(float)
+def weight(std: float, yaw: float = 0.0) -> float:
+    return float(space.position_weights(np.array([LATITUDE]), np.array([yaw]), np.array([std]))[0])
 
 
 def information(p: FloatArray) -> float:
@@ -32,87 +29,74 @@ def information(p: FloatArray) -> float:
     return float(np.sum(p * np.log(np.maximum(p, 1e-300) * mugrid.BINS)))
 
 
-def read_beliefs(fusion: Fusion) -> FloatArray:
-    """Return the belief (32 probabilities of friction) of each cell, from reports of this cell
-    alone, without its neighbours.
-    """
-    kept = fusion.live.belief[: fusion.size].astype(float)
-    return np.asarray(kept / kept.sum(axis=1, keepdims=True))
-
-
 @given(st.floats(0.01, 100.0), st.floats(1.0, 40.0))
-def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(
+def test_share_of_the_cell_is_a_probability_and_falls_with_the_error(
     std: float, length: float
 ) -> None:
-    share = space.cell_shares(np.array([std]), np.array([length]))[0]
-    assert (share >= -1e-9).all()
-    assert share.sum() <= 1.0 + 1e-9
-    np.testing.assert_allclose(share, share[::-1], atol=1e-9)
+    better, worse = space.own_share(np.array([std, 1.5 * std]), np.full(2, length))
+    assert 0.0 <= worse < better <= 1.0
 
 
-def test_shares_match_simulated_visits_with_normal_position_error() -> None:
+def test_share_matches_simulated_visits_with_normal_position_error() -> None:
     rng = np.random.default_rng(1)
-    for std in (3.0, 8.0):
+    for std in (3.0, 8.0, 40.0):
         at = np.floor(
             (rng.uniform(0.0, WIDTH_M, 200_000) + std * rng.normal(size=200_000)) / WIDTH_M
         )
-        drawn = [np.mean(at == k) for k in (-2, -1, 1, 2)]
-        assert space.cell_shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(
-            drawn, abs=0.005
-        )
+        found = space.own_share(np.array([std]), np.array([WIDTH_M]))[0]
+        assert found == pytest.approx(np.mean(at == 0), abs=0.005)
 
 
-def test_good_fix_stays_in_its_cell_and_poor_one_spreads_along_heading() -> None:
-    assert not spread(1.5)[1].any()
-    x, y = grid.deinterleave(CELL)
-    for yaw, ahead in ((0.0, (1, 0)), (np.pi / 2, (0, -1)), (np.pi, (-1, 0))):
-        cells, share = spread(5.0, yaw)
-        assert cells.tolist() == [
-            -1,
-            grid.interleave(x - ahead[0], y - ahead[1]),
-            grid.interleave(x + ahead[0], y + ahead[1]),
-            -1,
-        ]
-        assert 0.1 < share[1] == share[2] < 0.25
-    assert not spread(np.nan)[1].any()
-    assert not spread(5.0, np.nan)[1].any()
+def test_good_or_unknown_position_has_full_weight_and_a_poor_one_less() -> None:
+    assert weight(1.5) == weight(np.nan) == weight(0.0) == 1.0
+    here = space.own_share(np.array([20.0]), np.array([WIDTH_M]))[0]
+    assert weight(20.0) == pytest.approx(here / (1.0 - constants.CONTAMINATION), rel=0.01)
+    assert weight(20.0, np.nan) == weight(20.0)
+    # A cell is longer along its diagonal.
+    assert weight(20.0, np.pi / 4) > weight(20.0)
 
 
-def test_a_visit_is_not_spread_into_another_region() -> None:
-    border = grid.cell_of(LATITUDE, 0.0)  # a cell where two regions meet
-    cells, share = spread(6.0, 0.0, int(border))
-    assert (cells >= 0).sum() == 1
-    assert share.sum() < 0.3
-
-
-@given(st.floats(0.1, 60.0), st.floats(0.1, 1.1), st.floats(0.03, 0.3), st.floats(-3.1, 3.1))
-def test_all_cells_together_learn_no_more_than_one_would(
-    std: float, mu: float, width: float, yaw: float
-) -> None:
+@given(st.floats(0.1, 60.0), st.floats(0.1, 1.1), st.floats(0.03, 0.3))
+def test_poor_position_teaches_no_more_than_a_good_one(std: float, mu: float, width: float) -> None:
     sure = Fusion(120.0)
     unsure = Fusion(120.0)
     o = observations([0.0], [1], value([mu], width))
-    cells, share = space.other_cells(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
     sure.update(o)
-    unsure.update(dataclasses.replace(o, other=cells, other_share=share))
-    total = sum(information(kept) for kept in read_beliefs(unsure))
+    unsure.update(dataclasses.replace(o, share=np.full(1, weight(std), np.float32)))
     # Tolerance: probabilities are rounded to 16 bits.
-    assert total <= information(read_beliefs(sure)[0]) + 2e-3
+    assert information(belief(unsure)) <= information(belief(sure)) + 2e-3
 
 
-def test_possibly_visited_cell_learns_a_little_but_is_not_visited() -> None:
+def test_only_the_reported_cell_learns_and_is_visited() -> None:
     fusion = Fusion(120.0)
-    cells, share = spread(5.0)
     o = observations([0.0], [1], value([0.2]))
-    fusion.update(
-        dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32))
-    )
-    slots = fusion.slots_of(np.array([CELL, cells[2]]), np.zeros(2, np.int64))
-    own, beside = read_beliefs(fusion)[slots]
-    assert information(own) > 3 * information(beside) > 0.0
-    assert fusion.live.vehicles[slots].tolist() == fusion.live.visits[slots].tolist() == [1, 0]
+    fusion.update(dataclasses.replace(o, share=np.full(1, 0.5, np.float32)))
+    assert fusion.cell.tolist() == [CELL]
+    assert fusion.live.vehicles[:1].tolist() == fusion.live.visits[:1].tolist() == [1]
     # A new vehicle's weight is 0.75.
-    assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)
+    assert fusion.live.values[0] == pytest.approx(0.75 * 0.5, rel=1e-5)
+
+
+def test_ice_is_not_blurred_over_road_where_vehicles_gave_no_values() -> None:
+    rng = np.random.default_rng(7)
+    place = rng.permutation(np.repeat(np.arange(12), 60))
+    n = len(place)
+    icy = place < 6
+    std = 6.0
+    reports = np.where(icy[:, None], value(np.full(n, 0.15), 0.03), at_least(np.full(n, 0.15)))
+    found = place + np.floor(rng.random(n) + std / WIDTH_M * rng.normal(size=n)).astype(int)
+    x, y = grid.deinterleave(CELL)
+    o = dataclasses.replace(
+        observations(30.0 * np.arange(n), np.arange(n) % 40, reports),
+        cell=grid.interleave(x + found, y),
+        share=np.full(n, weight(std), np.float32),
+    )
+    fusion = Fusion(120.0)
+    fusion.update(o)
+    slots = fusion.slots_of(grid.interleave(x + np.arange(12), y), np.zeros(12, np.int64))
+    p = fusion.beliefs(slots, int(o.time.max())) @ mugrid.SLIPPERY_SHARE
+    assert (p[:6] > 0.9).all()
+    assert (p[7:] < 0.5).all()
 
 
 def drive_inaccurately(mu: dict[int, float]) -> tuple[Fusion, bool]:
@@ -126,9 +110,8 @@ def drive_inaccurately(mu: dict[int, float]) -> tuple[Fusion, bool]:
     x, y = grid.deinterleave(CELL)
     for k in range(36):
         row = int(grid.interleave(x + k % 3, y))
-        cells, share = spread(15.0, 0.0, row)
         o = observations([40.0 * k], [k // 3], value([mu[k // 3]]), cell=row)
-        o = dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32))
+        o = dataclasses.replace(o, share=np.full(1, weight(15.0), np.float32))
         was_raised |= any(alert.raised for alert in alerts.update(fusion.update(o).slots))
     fusion.update(observations([2000.0, 2100.0], [50, 50], value([0.8, 0.8]), cell=CELL + 4000))
     return fusion, was_raised
