@@ -33,16 +33,17 @@ def estimate(t: FloatArray, signals: FloatArray, known: Vehicle) -> Estimates:
     return bank_of("aco-fckf", [known]).advance(t[:, None], signals[:, None])
 
 
-def spoil(signals: FloatArray, wheel: int, fault: str) -> FloatArray:
-    """Return the signals with a failed sensor: "frozen" at its last reading, "dead" (zero from
-    FAILS on), or "always dead".
+def spoil(signals: FloatArray, fault: str, *wheels: int) -> FloatArray:
+    """Return the signals with failed sensors: "frozen" at the last reading, "dead" (zero from FAILS
+    on), or "always dead".
     """
     spoilt = signals.copy()
-    speed = spoilt[:, OMEGA][:, wheel]
-    if fault == "frozen":
-        speed[FAILS:] = speed[FAILS]
-    else:
-        speed[FAILS if fault == "dead" else 0 :] = 0.0
+    for wheel in wheels:
+        speed = spoilt[:, OMEGA][:, wheel]
+        if fault == "frozen":
+            speed[FAILS:] = speed[FAILS]
+        else:
+            speed[FAILS if fault == "dead" else 0 :] = 0.0
     return spoilt
 
 
@@ -51,7 +52,7 @@ def spoil(signals: FloatArray, wheel: int, fault: str) -> FloatArray:
 @pytest.mark.parametrize("name", ["pulses", "double-lane-change"])
 def test_a_failed_wheel_sensor_does_not_look_like_ice(name: str, fault: str, wheel: int) -> None:
     t, signals, known = record(name, DRY)
-    estimates = estimate(t, spoil(signals, wheel, fault), known)
+    estimates = estimate(t, spoil(signals, fault, wheel), known)
     after = slice(FAILS, None)
     assert np.mean(estimates.p_slippery[after] > CALLED_SHARE) == 0.0
     assert np.mean(estimates.mu_upper[after] < DRY) < 0.05
@@ -59,10 +60,24 @@ def test_a_failed_wheel_sensor_does_not_look_like_ice(name: str, fault: str, whe
         assert np.mean(estimates.health[after] & int(Health.NO_WHEEL_SPEED) != 0) > 0.5
 
 
+@pytest.mark.parametrize("wheels", [(0, 1), (2, 3), (0, 3)])
+@pytest.mark.parametrize("fault", ["frozen", "dead"])
+def test_two_sensors_that_fail_at_once_do_not_look_like_ice(
+    fault: str, wheels: tuple[int, int]
+) -> None:
+    t, signals, known = record("pulses", DRY)
+    estimates = estimate(t, spoil(signals, fault, *wheels), known)
+    assert np.mean(estimates.p_slippery[FAILS:] > CALLED_SHARE) == 0.0
+    assert np.mean(estimates.mu_upper[FAILS:] < DRY) < 0.05
+    t, signals, known = record("pulses", ICE)
+    estimates = estimate(t, spoil(signals, fault, *wheels), known)
+    assert np.mean(estimates.mu_upper[FAILS + 200 :] < 0.4) > 0.8
+
+
 @pytest.mark.parametrize("fault", ["frozen", "dead", "always dead"])
 def test_ice_is_found_with_a_failed_wheel_sensor(fault: str) -> None:
     t, signals, known = record("pulses", ICE)
-    estimates = estimate(t, spoil(signals, 1, fault), known)
+    estimates = estimate(t, spoil(signals, fault, 1), known)
     assert np.mean(estimates.mu_upper[FAILS + 200 :] < 0.4) > 0.9
     assert np.mean(estimates.mu_lower[FAILS:] > ICE + 0.05) < 0.05
 
@@ -79,15 +94,17 @@ def test_wheels_that_lock_or_spin_are_not_left_out(name: str, brakes: bool) -> N
     assert np.mean(estimates.mu_upper[FAILS:] < 0.4) > 0.95
 
 
-def test_a_coarse_or_slow_wheel_speed_has_not_failed() -> None:
-    t, signals, known = record("pulses", DRY)
-    wheels = signals[:, OMEGA]
-    for hold, step in ((10, 0.0), (20, 0.0), (5, 0.9), (1, 0.9)):
-        slow = signals.copy()
-        for wheel in range(4):  # the bus sends the wheels one after the other
-            rows = np.maximum((np.arange(len(t)) + wheel) // hold * hold - wheel, 0)
-            slow[:, OMEGA.start + wheel] = wheels[rows, wheel]
-        if step:
-            slow[:, OMEGA] = np.round(slow[:, OMEGA] / step) * step
-        estimates = estimate(t, slow, known)
-        assert np.mean(estimates.health & int(Health.NO_WHEEL_SPEED) != 0) < 0.01
+@pytest.mark.parametrize(("hold", "step"), [(10, 0.0), (20, 0.0), (5, 0.9), (1, 0.9)])
+@pytest.mark.parametrize(("name", "mu"), [("pulses", DRY), ("acceleration", ICE)])
+def test_coarse_or_slow_wheel_speed_has_not_failed(
+    name: str, mu: float, hold: int, step: float
+) -> None:
+    t, signals, known = record(name, mu, "van")
+    slow = signals.copy()
+    for wheel in range(4):  # the bus sends the wheels one after the other
+        rows = np.maximum((np.arange(len(t)) + wheel) // hold * hold - wheel, 0)
+        slow[:, OMEGA.start + wheel] = signals[rows, OMEGA.start + wheel]
+    if step:
+        slow[:, OMEGA] = np.round(slow[:, OMEGA] / step) * step
+    estimates = estimate(t, slow, known)
+    assert np.mean(estimates.health & int(Health.NO_WHEEL_SPEED) != 0) < 0.01

@@ -4,6 +4,9 @@ speed, or fall to zero at once.
 A wheel with a failed sensor looks like one that slides on ice. Its readings are therefore left out
 until they change again. A locked wheel reads zero too. Zero means a failed sensor only if no brake
 could have stopped the wheel so fast, or if the wheel has not turned since the drive began.
+
+Two sensors may fail at once, because a bus sends the wheels of an axle together. At least two other
+wheels must show that the car drives.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.block.wheel_readings import STEP_LEAST
+from edge_agent.estimators.friction_mixture.block.wheel_readings import STEP_LEAST, STEP_MOST
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S, SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.state.memory import LastInputs, WheelSensors
 from schemas.numeric import FloatArray
@@ -21,14 +24,18 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
 # A reading may stay the same for INTERVALS usual intervals between changes, at most UNCHANGED_S
-# [s], while all other wheels change their speed by more than FOLLOWS resolution steps.
+# [s], while the other wheels change their speed by more than FOLLOWS times its last change.
 INTERVALS = 3.0
 UNCHANGED_S = 0.3
 FOLLOWS = 2.0
-FINEST = 0.25  # [rad/s] smallest resolution that is assumed
+FINEST = 0.25  # [rad/s] smallest resolution step that is assumed
+FEWEST = 2  # number of other wheels that must show that the car drives
 # [1] largest force of a brake over a quarter of the car's weight. While the car brakes on dry road,
 # a front wheel carries this load, and its brake is just able to lock it.
 STRONGEST_BRAKE = 1.5
+# States of a wheel; 0 means that it has not turned since the drive began.
+TURNS = 1
+STOPPED = 2  # reads zero, but no brake could have stopped it so fast
 
 
 @compiled
@@ -44,8 +51,7 @@ def leave_out_failed(row: FloatArray, last: LastInputs, time: float) -> int:
         if not math.isnan(last.now[S.OMEGA + wheel]):
             note_reading(row, last.now, sensors, wheel, time)
     for wheel in range(4):
-        change = FOLLOWS * max(last.omega_step[wheel], FINEST)
-        if is_frozen(row, sensors, wheel, change, time) or is_dead(row, sensors, wheel):
+        if is_frozen(row, sensors, wheel, time) or is_dead(row, sensors, wheel):
             last.now[S.OMEGA + wheel] = math.nan
             health = flags.NO_WHEEL_SPEED
     return health
@@ -65,12 +71,13 @@ def note_reading(
         kept = sensors.interval[wheel] * math.exp(-age / UTILISED_WINDOW_S)
         sensors.interval[wheel] = max(min(age, UNCHANGED_S), kept)
         sensors.changed[wheel] = time
+        sensors.step[wheel] = min(max(abs(omega - before), FINEST), STEP_MOST)
         for other in range(4):
             sensors.others[wheel, other] = now[S.OMEGA + other]
     if omega * row[Parameter.RADIUS] > SLOWEST_M_S:
-        sensors.turned[wheel] = 1
+        sensors.state[wheel] = TURNS
     elif before - omega > strongest_fall(row) * (time - sensors.time[wheel]):
-        sensors.turned[wheel] = 0
+        sensors.state[wheel] = STOPPED
     sensors.reading[wheel] = omega
     sensors.time[wheel] = time
 
@@ -85,42 +92,52 @@ def strongest_fall(row: FloatArray) -> float:
 
 
 @compiled
-def is_frozen(
-    row: FloatArray, sensors: WheelSensors, wheel: int, change: float, time: float
-) -> bool:
-    """Return True if a wheel's readings have stayed the same for too long at `time` [s], while all
-    other wheels have changed their speed by more than `change` [rad/s]. `row` contains the
+def is_frozen(row: FloatArray, sensors: WheelSensors, wheel: int, time: float) -> bool:
+    """Return True if a wheel's readings have stayed the same for too long at `time` [s], while the
+    other wheels have changed their speed by FOLLOWS steps of this wheel. `row` contains the
     vehicle's parameters.
 
     The other wheels of a car with a locked wheel may slow down and recover. If this wheel reads
-    zero, the car must therefore have gained speed.
+    zero, the car must therefore have gained speed. Wheels whose fine readings stopped changing at
+    the same time as this wheel's do not count.
     """
-    age = time - sensors.changed[wheel]
-    if age <= min(INTERVALS * sensors.interval[wheel], UNCHANGED_S):
+    usual = sensors.interval[wheel]
+    if time - sensors.changed[wheel] <= min(INTERVALS * usual, UNCHANGED_S):
         return False
     turns = sensors.reading[wheel] * row[Parameter.RADIUS] > SLOWEST_M_S
-    smallest_change = slowest = math.inf
+    fine = sensors.step[wheel] <= FINEST
+    smallest_change = math.inf
+    slowest = math.inf
     fastest_before = 0.0
+    count = 0
     for other in range(4):
-        if other != wheel:
-            now = sensors.reading[other]
-            before = sensors.others[wheel, other]
-            if math.isnan(before):
-                return False
-            smallest_change = min(smallest_change, abs(now - before))
-            slowest = min(slowest, now)
-            fastest_before = max(fastest_before, before)
-    return bool(smallest_change > change if turns else slowest > fastest_before + change)
+        together = abs(sensors.changed[other] - sensors.changed[wheel]) <= usual
+        if other == wheel or (turns and fine and together):
+            continue
+        now = sensors.reading[other]
+        before = sensors.others[wheel, other]
+        if math.isnan(before):
+            return False
+        count += 1
+        smallest_change = min(smallest_change, abs(now - before))
+        slowest = min(slowest, now)
+        fastest_before = max(fastest_before, before)
+    change = FOLLOWS * sensors.step[wheel]
+    follows = smallest_change > change if turns else slowest > fastest_before + change
+    return bool(count >= FEWEST and follows)
 
 
 @compiled
 def is_dead(row: FloatArray, sensors: WheelSensors, wheel: int) -> bool:
-    """Return True if a wheel that cannot have been stopped by its brake reads zero, while all other
-    wheels turn. `row` contains the vehicle's parameters.
+    """Return True if a wheel that cannot have been stopped by its brake reads zero, while at least
+    two other wheels turn. If the wheel has not turned since the drive began, all others must turn,
+    because the driven wheels may spin on ice. `row` contains the vehicle's parameters.
     """
-    if sensors.turned[wheel] or abs(sensors.reading[wheel]) > STEP_LEAST:
+    state = sensors.state[wheel]
+    if state == TURNS or abs(sensors.reading[wheel]) > STEP_LEAST:
         return False
+    count = 0
     for other in range(4):
-        if other != wheel and not sensors.reading[other] * row[Parameter.RADIUS] > SLOW_M_S:
-            return False
-    return True
+        if sensors.reading[other] * row[Parameter.RADIUS] > SLOW_M_S:
+            count += 1
+    return bool(count >= (FEWEST if state == STOPPED else 3))

@@ -69,12 +69,14 @@ class WheelSensors:
     reading: Annotated[FloatArray, 4]  # [rad/s] last reading
     time: Annotated[FloatArray, 4]  # [s] time of the last reading
     changed: Annotated[FloatArray, 4]  # [s] time at which the reading last changed
+    # [rad/s] size of that change, at least the finest and at most the coarsest resolution
+    step: Annotated[FloatArray, 4]
     # [s] longest time between two changes in the last second
     interval: Annotated[FloatArray, 4]
     # [rad/s] readings of the other wheels when the reading of a wheel last changed
     others: Annotated[FloatArray, 4, 4]
-    # 1 if the wheel has turned since the start, or since it stopped too suddenly
-    turned: Annotated[IntArray, 4]
+    # 0, TURNS or STOPPED (`failed_sensors.py`)
+    state: Annotated[IntArray, 4]
 
 
 class LastInputs:
