@@ -159,11 +159,13 @@ def align_stamps(stamps: Mapping[str, IntArray]) -> tuple[dict[str, IntArray], l
         and min(int(stamps[topic][:, 1].max()) for topic in delays) > DATED_NS
     )
     recorder_shift = -min(delays.values()) if is_replay else 0
+    foreign = [delay for delay in delays.values() if abs(delay) > OWN_CLOCK_NS]
     times = {}
     notes = []
     for topic, pairs in stamps.items():
-        near = [d for d in delays.values() if abs(d - delays.get(topic, 0)) <= OWN_CLOCK_NS]
-        is_own_clock = not is_replay and abs(delays.get(topic, 0)) > OWN_CLOCK_NS
+        delay = delays.get(topic, 0)
+        is_own_clock = not is_replay and abs(delay) > OWN_CLOCK_NS
+        near = [other for other in foreign if abs(other - delay) <= OWN_CLOCK_NS]
         shift = min(near) if is_own_clock else 0
         times[topic] = np.where(pairs[:, 1] > 0, pairs[:, 1] + shift, pairs[:, 0] + recorder_shift)
         if is_own_clock:

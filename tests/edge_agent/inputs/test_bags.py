@@ -144,6 +144,18 @@ def test_simulated_time_has_one_shift_for_all_topics() -> None:
     assert np.array_equal(times["/a"], times["/b"])
 
 
+def test_late_topic_on_the_clock_of_the_bag_does_not_change_the_shift_of_another() -> None:
+    clock = DATE + np.arange(5) * 10 * MS
+    stamps = {
+        "/late": np.column_stack([clock + 5 * NS, clock]),
+        "/own": np.column_stack([clock + 11 * NS, clock]),
+    }
+    times, notes = align_stamps(stamps)
+    assert np.array_equal(times["/late"], clock)
+    assert np.array_equal(times["/own"], clock + 11 * NS)
+    assert notes == ["/own has a clock of its own; 11.000 s added"]
+
+
 def test_draft_requires_a_fix_for_the_position_of_a_receiver(tmp_path: Path) -> None:
     messages = [(DATE + k * NS, "/fix", make_fix(DATE + k * NS, -(k % 2))) for k in range(10)]
     recording = read_source(write_bag(tmp_path / "bag", messages), None, None)
