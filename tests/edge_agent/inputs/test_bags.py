@@ -12,6 +12,7 @@ import pytest
 from edge_agent.inputs.bring_in import read_source
 from edge_agent.inputs.live.ros2 import CAN_FRAME
 from edge_agent.inputs.names import draft_profile
+from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.readers.dbc import parse_dbc
 from edge_agent.inputs.readers.rosbag import FRAME, align_stamps
 from schemas.thresholds import NS
@@ -179,7 +180,10 @@ def test_other_topics_of_a_bag_with_frames_are_read(tmp_path: Path) -> None:
         at = DATE + k * 10 * MS
         messages.append((at, "/can", make_frame(at + MS, k)))
         messages.append((at, "/fix", make_fix(at + 4 * MS, 0)))
-    recording = read_source(write_bag(tmp_path / "bag", messages), None, database)
+    bag = write_bag(tmp_path / "bag", messages)
+    recording = read_source(bag, None, database)
     assert recording.start_ns == pytest.approx(DATE + MS, abs=1000)
     assert recording.signals["M.S"].values.tolist() == list(range(10))
     assert recording.signals["/fix.latitude"].t[0] == pytest.approx(0.003, abs=1e-6)
+    topics = Profile(name="own", channels={"latitude": Channel(signal="/fix.latitude")})
+    assert read_source(bag, topics, None).signals.keys() == {"/fix.latitude"}
