@@ -26,7 +26,7 @@ SUFFIXES: Final = (".mcap", ".db3", ".bag")
 FRAME: Final = "can_msgs/msg/Frame"
 LONGEST_ARRAY: Final = 36  # longer arrays are images and scans, and their elements are not read
 DEEPEST: Final = 5
-MOST_KINDS: Final = 1000  # combinations of topic and joint names that are remembered
+MOST_KINDS: Final = 1000  # combinations of topic, names and lengths that are remembered
 OWN_CLOCK_NS: Final = 10 * NS  # a larger delay is the difference of two clocks
 DATED_NS: Final = round(DATED_S * NS)
 SKIPPED: Final = ("header", "covariance")
@@ -210,18 +210,19 @@ def _read_messages(
 class RequestedNumbers:
     """The requested numbers in messages of each topic.
 
-    Messages of one topic may name different joints, or the same ones in another order, because
-    several programs publish them. Each combination of names has its own list of numbers.
+    Messages of one topic may name different joints, or the same ones in another order, or give no
+    velocities, because several programs publish them. Each combination of names and array lengths
+    has its own list of numbers.
     """
 
     def __init__(self, requested: set[str] | None) -> None:
         """Request the signals with these names; all if it is None."""
         self._requested = requested
-        self._leaves: dict[tuple[str, tuple[str, ...]], list[Leaf]] = {}
+        self._leaves: dict[tuple[str, tuple[str, ...], tuple[int, ...]], list[Leaf]] = {}
 
     def find_leaves(self, topic: str, message: Any) -> list[Leaf]:  # noqa: ANN401
         """Return signal name and function for each requested number in a message of a topic."""
-        key = topic, tuple(_labels_of(message) or ())
+        key = topic, tuple(_labels_of(message) or ()), _array_lengths(message)
         if key not in self._leaves:
             if len(self._leaves) >= MOST_KINDS:
                 self._leaves.clear()
@@ -230,6 +231,15 @@ class RequestedNumbers:
                 leaf for leaf in found if self._requested is None or leaf[0] in self._requested
             ]
         return self._leaves[key]
+
+
+def _array_lengths(message: Any) -> tuple[int, ...]:  # noqa: ANN401
+    """Return the lengths of a message's own arrays. Lengths above LONGEST_ARRAY count as one."""
+    return tuple(
+        min(len(value), LONGEST_ARRAY + 1)
+        for value in vars(message).values()
+        if isinstance(value, np.ndarray | list | tuple)
+    )
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401

@@ -11,7 +11,7 @@ import pytest
 
 from edge_agent.inputs.bring_in import read_source
 from edge_agent.inputs.live.ros2 import CAN_FRAME
-from edge_agent.inputs.names import draft_profile
+from edge_agent.inputs.names import FIXES, draft_profile
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.readers.dbc import parse_dbc
 from edge_agent.inputs.readers.rosbag import FRAME, align_stamps
@@ -105,6 +105,19 @@ def test_joints_are_read_by_name_from_messages_of_several_publishers(tmp_path: P
     assert len(signals["/joint_states.velocity[left]"].t) == 20
 
 
+def test_velocities_are_read_if_the_first_message_has_none(tmp_path: Path) -> None:
+    messages = []
+    for k in range(10):
+        at = DATE + k * 10 * MS
+        joints = make_joints(at, left=1.0)
+        if k % 2 == 0:
+            joints.velocity = np.empty(0)
+        messages.append((at, "/joint_states", joints))
+    signals = read_source(write_bag(tmp_path / "bag", messages), None, None).signals
+    assert len(signals["/joint_states.position[left]"].t) == 10
+    assert signals["/joint_states.velocity[left]"].values.tolist() == [1.0] * 5
+
+
 def test_sensor_that_counts_from_its_start_is_put_on_the_clock_of_the_bag(tmp_path: Path) -> None:
     messages = []
     for k in range(20):
@@ -162,7 +175,7 @@ def test_draft_requires_a_fix_for_the_position_of_a_receiver(tmp_path: Path) -> 
     recording = read_source(write_bag(tmp_path / "bag", messages), None, None)
     profile = draft_profile(dict.fromkeys(recording.signals, ""), "bag")
     for name in ("latitude", "longitude"):
-        assert profile.channels[name].gates == {"/fix.status.status": [0.0, 1.0, 2.0]}
+        assert profile.channels[name].gates == {"/fix.status.status": FIXES}
 
 
 def test_steered_joints_are_road_wheels() -> None:
