@@ -158,7 +158,7 @@ def test_simulated_time_has_one_shift_for_all_topics() -> None:
     assert np.array_equal(times["/a"], times["/b"])
 
 
-def test_late_topic_on_the_clock_of_the_bag_does_not_change_the_shift_of_another() -> None:
+def test_late_topic_does_not_change_the_shift_of_another_clock() -> None:
     clock = DATE + np.arange(5) * 10 * MS
     stamps = {
         "/late": np.column_stack([clock + 5 * NS, clock]),
