@@ -76,12 +76,8 @@ def join_parts(
 
 def _locate_part(recording: Recording, shift: float) -> _Part:
     """Return a recording with its first and last time, after `shift` [s] was added."""
-    times = [series.t for series in recording.signals.values() if len(series.t)]
     start = shift + (recording.start_ns or 0) / NS
-    if not times:
-        return _Part(recording, start, start)
-    first = min(float(t[0]) for t in times)
-    last = max(float(t[-1]) for t in times)
+    first, last = recording.time_span
     return _Part(recording, start + first, start + last)
 
 
