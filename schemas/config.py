@@ -344,7 +344,6 @@ def require_unique_names(text: bytes, where: str) -> None:
     """Raise InputError if an object in a JSON text has a name twice, because a parser silently
     takes the last value. `where` is the source of the text. Invalid JSON is left to the parser.
     """
-
     repeated: list[str] = []
 
     def collect_names(pairs: list[tuple[str, object]]) -> None:

@@ -27,7 +27,7 @@ from edge_agent.app.output_path import prepare_path
 from edge_agent.app.plausible import Plausibility
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.inputs.doctor.adopt import prepare_log
-from edge_agent.inputs.signal_log import read_log, require_log
+from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError
 from schemas.runtime import spark
 from schemas.runtime.durable import own_drafts, sweep_drafts, sync_directory
@@ -256,9 +256,8 @@ def estimate_drive(task: Task, estimator: str, memberships: Memberships | None =
     samples, or the error).
     """
     try:
-        require_log(task.log)
-        vehicle = load_vehicle(task.vehicle)
-        log, vehicle, diagnosis, _ = prepare_log(read_log(task.log), vehicle)
+        recorded = read_log(task.log)  # before the vehicle file, whose place depends on it
+        log, vehicle, diagnosis, _ = prepare_log(recorded, load_vehicle(task.vehicle))
         bank = bank_of(estimator, [vehicle], memberships)
         plausibility = Plausibility(vehicle.wheel_radius)
         with EstimatesFile(task.out) as file:

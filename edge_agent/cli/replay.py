@@ -221,9 +221,9 @@ def _replay_and_publish(
     notes = []
     if not batches.drafts:
         notes.append(_explain_no_record(config))
-    if start and args.start is None:
-        notes.append("note: the log has no date: published as if it ended now (see --start)")
     if start:
+        if args.start is None:
+            notes.append("note: the log has no date: published as if it ended now (see --start)")
         notes.append(f"note: repeated{start}, this drive counts once; otherwise it is another")
     return code, notes
 

@@ -112,8 +112,12 @@ def _frame_reader(path: Path) -> can_log.Taker | None:
 
 def _read_bag(path: Path, profile: Profile | None, database: Database | None) -> Recording:
     requested_signals = None if profile is None else profile.needed_signals()
+    # A profile may need only signals of topics, which begin with "/".
+    needs_frames = requested_signals is None or any(
+        not signal.startswith("/") for signal in requested_signals
+    )
     with rosbag.open_bag(path) as reader:
-        if not rosbag.has_frames(reader):
+        if not needs_frames or not rosbag.has_frames(reader):
             return rosbag.read_bag(reader, path, requested_signals)
         frames = partial(rosbag.bag_frames, reader, path)
         decoded = _decode_frames(frames, path, profile, database)

@@ -50,7 +50,7 @@ def align_clocks(
         if index == reference:
             offsets.append(shift)
         elif main.start_ns is None or recording.start_ns is None:
-            later = _time_span(main)[0] - _time_span(recording)[0]
+            later = main.time_span[0] - recording.time_span[0]
             if recording.start_ns is not None:
                 start_ns = recording.start_ns - round(later * NS)
             offsets.append(shift + later)
@@ -85,8 +85,8 @@ def _find_zone(recording: Recording, main: Recording, lead: float, shift: float)
     """Return the smallest difference of time zones [ZONE_S] with which a recording overlaps the
     recording `main`; 0 if no difference is needed. `lead` is the difference of their starts [s].
     """
-    span = _time_span(recording)
-    main_span = _time_span(main)
+    span = recording.time_span
+    main_span = main.time_span
     for zone in sorted(range(-LARGEST_ZONE, LARGEST_ZONE + 1), key=abs):
         if _spans_overlap(span, lead + shift + zone * ZONE_S, main_span):
             return zone
@@ -95,14 +95,6 @@ def _find_zone(recording: Recording, main: Recording, lead: float, shift: float)
         f"its clock is {lead + shift:.0f} s later than that of {main.name}",
         f"give --clock {recording.name}={-lead:.0f}, or another number of seconds to add to it",
     )
-
-
-def _time_span(recording: Recording) -> tuple[float, float]:
-    """Return the times [s] of a recording's first and last reading."""
-    times = [series.t for series in recording.signals.values() if len(series.t)]
-    if not times:
-        return 0.0, 0.0
-    return min(t[0] for t in times), max(t[-1] for t in times)
 
 
 def _spans_overlap(span: tuple[float, float], shift: float, other: tuple[float, float]) -> bool:

@@ -74,7 +74,8 @@ STEERING: Final[Rule] = (
         r"|fraction|crc|qual|override|driver|cal|^sensor"
     ),
 )
-FIXES: Final = [0.0, 1.0, 2.0]  # values of NavSatStatus.status of a message with a position
+# Values of NavSatStatus.status and GPSStatus.status of a message with a position.
+FIXES: Final = [0.0, 1.0, 2.0, 18.0, 33.0]
 JOINT: Final = re.compile(r"\b(left|right)\b.*\bjoint\b")  # a steered wheel in a ROS model
 COURSE: Final = re.compile(r"heading|course|track")
 
@@ -111,7 +112,7 @@ def draft_profile(signals: Mapping[str, str], name: str) -> Profile:
         plain = split_words(signal if field in ("", "data") else field)
         if (channel := _channel_of(plain, signal)) and channel not in channels:
             channels[channel] = _make_channel(channel, signal, unit, plain)
-            # A ROS message of a receiver states whether it has a fix (NavSatStatus: -1 is none).
+            # A ROS message of a receiver states whether it has a fix (-1 is none).
             status = f"{signal.rpartition('.')[0]}.status.status"
             if channel in ("latitude", "longitude") and status in signals:
                 valid = {status: FIXES}

@@ -55,7 +55,6 @@ def join_parts(
             they have different units.
     """
     named = {channel.source for channel in profile.channels.values()}
-    whole = [one for one in recordings if one.name in named or not one.signals]
     parts = [
         _locate_part(one, shifts.get(one.name, 0.0))
         for one in recordings
@@ -63,25 +62,22 @@ def join_parts(
     ]
     chains: list[list[_Part]] = []
     for part in sorted(parts, key=lambda part: part.first):
-        chain = next((chain for chain in chains if _continues(chain[-1], part)), None)
+        # With several similar sources, a part continues the one whose end is nearest.
+        nearest = sorted(chains, key=lambda chain: abs(part.first - chain[-1].last))
+        chain = next((chain for chain in nearest if _continues(chain[-1], part)), None)
         if chain is None:
             chains.append([part])
         else:
             chain.append(part)
     joined = {id(chain[0].recording): _join_chain(chain, shifts) for chain in chains}
-    kept = [*whole, *(chain[0].recording for chain in chains)]
-    order = [one for one in recordings if any(one is other for other in kept)]
-    return [joined.get(id(one), one) for one in order]
+    later = {id(part.recording) for chain in chains for part in chain[1:]}
+    return [joined.get(id(one), one) for one in recordings if id(one) not in later]
 
 
 def _locate_part(recording: Recording, shift: float) -> _Part:
     """Return a recording with its first and last time, after `shift` [s] was added."""
-    times = [series.t for series in recording.signals.values() if len(series.t)]
     start = shift + (recording.start_ns or 0) / NS
-    if not times:
-        return _Part(recording, start, start)
-    first = min(float(t[0]) for t in times)
-    last = max(float(t[-1]) for t in times)
+    first, last = recording.time_span
     return _Part(recording, start + first, start + last)
 
 

@@ -47,6 +47,14 @@ class Recording:
     notes: list[str] = field(default_factory=list)
     has_zone: bool = False
 
+    @property
+    def time_span(self) -> tuple[float, float]:
+        """Return the times [s] of the first and the last reading; zeros without readings."""
+        times = [series.t for series in self.signals.values() if len(series.t)]
+        if not times:
+            return 0.0, 0.0
+        return min(float(t[0]) for t in times), max(float(t[-1]) for t in times)
+
 
 @contextmanager
 def foreign_errors(path: Path, kind: str) -> Iterator[None]:

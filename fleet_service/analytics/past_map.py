@@ -32,7 +32,6 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
     """Return a table of the visited cells that touch a box [deg], with their beliefs (probability
     of each friction value) at the time `at` [ns].
     """
-    # Inaccurate positions create neighbouring cells that no vehicle has certainly visited.
     slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
     if box is not None:
         slots = slots[grid.touches(box, grid.bounds(fusion.cell[slots]))]

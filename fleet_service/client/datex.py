@@ -91,7 +91,7 @@ def make_publication(
             longitude). Situations at other places are not ended.
 
     Raises:
-        InputError: `before` is not a publication, or that of another supplier.
+        InputError: `before` is not a publication, or is that of another supplier.
     """
     old = {} if before is None else _parse_records(before, supplier)
     root = _make_payload(supplier, now)

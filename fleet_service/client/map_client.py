@@ -235,14 +235,15 @@ def open_connected(connection: ZenohSettings) -> zenoh.Session:
     Raises:
         UnreachableError: no router answers.
     """
+    config = zenoh_session.configuration(connection)
     try:
-        return zenoh.open(zenoh_session.configuration(connection))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join(connection.connect)
         fix = "start one with `gripmap router`, or name its endpoint with --connect"
         if where.startswith(("tls/", "quic/")):
             fix += "; its log names an expired certificate"
-        faults = zenoh_session.explain_faults(connection)
+        faults = zenoh_session.explain_faults(config)
         raise UnreachableError("connect", f"no router at {where}", faults or fix) from error
 
 

@@ -97,10 +97,10 @@ def explain_no_line(table: pa.Table, roads: str) -> str:
         return "the map has no cells there, so nothing is known about the roads"
     if not low:
         return f"no cell of {table.num_rows} is known to have low grip, so nothing is avoided"
-    west, south, east, north = (
-        float(pick(_float_column(table, side)))
-        for side, pick in (("west", np.min), ("south", np.min), ("east", np.max), ("north", np.max))
-    )
+    west = _float_column(table, "west").min()
+    south = _float_column(table, "south").min()
+    east = _float_column(table, "east").max()
+    north = _float_column(table, "north").max()
     return (
         f"{low} cells have low grip, but none is on a road of {roads}; the map covers "
         f"{west:.3f},{south:.3f},{east:.3f},{north:.3f} (longitude first)"

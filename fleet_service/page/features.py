@@ -147,37 +147,20 @@ def feature_schema(base: str) -> dict[str, Any]:
 
 def api_definition(base: str) -> dict[str, Any]:
     """Return the definition of the OGC API in the format OpenAPI 3.0."""
-
-    def describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
-        answers = {
-            "200": {"description": "the document"},
-            "400": {"description": "the problem and how to correct it"},
-        }
-        return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
-
-    def describe_parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
-        return {
-            "name": name,
-            "in": where,
-            "required": where == "path",
-            "description": about,
-            "schema": form,
-        }
-
     query_parameters = (
-        describe_parameter(
+        _describe_parameter(
             "bbox",
             "query",
-            "west, south, east, north [deg]; west > east crosses the 180° meridian; with heights "
-            "six numbers, of which they are ignored",
+            "west, south, east, north [deg]; west > east crosses the 180° meridian; heights, the "
+            "third and the sixth of six numbers, are ignored",
             type="array",
             items={"type": "number"},
             minItems=4,
             maxItems=6,
         )
         | {"style": "form", "explode": False},
-        describe_parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
-        describe_parameter(
+        _describe_parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
+        _describe_parameter(
             "limit",
             "query",
             "maximum number of features in one answer",
@@ -186,28 +169,46 @@ def api_definition(base: str) -> dict[str, Any]:
             maximum=MOST,
             default=FEW,
         ),
-        describe_parameter(
+        _describe_parameter(
             "after",
             "query",
             "id after which the page of results begins; taken from a link",
             type="string",
         ),
     )
-    one = describe_parameter("featureId", "path", "CELL-SECTOR", type="string")
+    one = _describe_parameter("featureId", "path", "CELL-SECTOR", type="string")
     collection_path = f"/collections/{COLLECTION}"
     return {
         "openapi": "3.0.3",
         "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
         "servers": [{"url": base}],
         "paths": {
-            "/": describe_route("landing page"),
-            "/conformance": describe_route("conformance classes"),
-            "/collections": describe_route("the collections"),
-            collection_path: describe_route("the collection"),
-            f"{collection_path}/schema": describe_route("the columns"),
-            f"{collection_path}/items": describe_route("features", *query_parameters),
-            f"{collection_path}/items/{{featureId}}": describe_route("one feature", one),
+            "/": _describe_route("landing page"),
+            "/conformance": _describe_route("conformance classes"),
+            "/collections": _describe_route("the collections"),
+            collection_path: _describe_route("the collection"),
+            f"{collection_path}/schema": _describe_route("the columns"),
+            f"{collection_path}/items": _describe_route("features", *query_parameters),
+            f"{collection_path}/items/{{featureId}}": _describe_route("one feature", one),
         },
+    }
+
+
+def _describe_route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
+    answers = {
+        "200": {"description": "the document"},
+        "400": {"description": "the problem and how to correct it"},
+    }
+    return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
+
+
+def _describe_parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
+    return {
+        "name": name,
+        "in": where,
+        "required": where == "path",
+        "description": about,
+        "schema": form,
     }
 
 

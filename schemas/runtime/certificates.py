@@ -62,7 +62,7 @@ def _find_faults(certificate: Path, key: Path | None, now: float) -> Iterator[st
     try:
         text = certificate.read_text(encoding="ascii", errors="replace")
         if key is None:
-            context.load_verify_locations(cadata=text)
+            context.load_verify_locations(certificate)
         else:
             key.read_bytes()  # an error of the next line does not name the file
             context.load_cert_chain(certificate, key, password="")  # an encrypted key is refused
@@ -70,11 +70,14 @@ def _find_faults(certificate: Path, key: Path | None, now: float) -> Iterator[st
         if error.reason == "KEY_VALUES_MISMATCH":
             yield f"{key} is not the private key of {certificate}"
         else:
-            files = f"{certificate}" if key is None else f"{certificate} or {key}"
-            yield f"{files} is not valid PEM: make it with `fleet-service certs`"
+            problem = f"{certificate} is not valid PEM"
+            if key is not None:
+                problem = f"{certificate} or {key} is not valid PEM, or has a password"
+            yield f"{problem}: make it with `fleet-service certs`"
         return
     except OSError as error:
-        yield f"cannot read {error.filename or certificate} ({error.strerror})"
+        file = error.filename or certificate
+        yield f"cannot read {file} ({error.strerror}): correct the path or the permissions"
         return
     for block in _PEM.findall(text):
         try:

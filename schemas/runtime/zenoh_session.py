@@ -104,9 +104,9 @@ def check_certificates(config: zenoh.Config, section: str = "") -> None:
             raise InputError(f"{section}{TLS}/{key}", f"there is no file {value}", fix)
 
 
-def explain_faults(settings: ZenohSettings) -> str:
+def explain_faults(config: zenoh.Config) -> str:
     """Return the faults of the certificates of a session as one line; "" if none is visible."""
-    return "; ".join(find_certificate_faults(configuration(settings), time.time()))
+    return "; ".join(find_certificate_faults(config, time.time()))
 
 
 def _check_endpoints(endpoints: Sequence[str]) -> None:
@@ -185,8 +185,7 @@ def open_session(
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            faults = "; ".join(find_certificate_faults(config, time.time()))
-            reasons.log_once(settings, faults or error_reason(error))
+            reasons.log_once(settings, explain_faults(config) or error_reason(error))
             open_ms = max(open_ms, min(2 * open_ms, LONGEST_OPEN_MS))
             stop.wait(RETRY_S)
     return None

@@ -9,6 +9,7 @@ batches at once.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import compress
 from typing import Any, Final, NamedTuple
 
@@ -236,8 +237,8 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     region in the head of a batch. Return the batches.
 
     Some batches are refused: they are removed from the result, and an error is added to its
-    `errors`. A batch is refused if it needs a position but has none, or if a number does not fit
-    its column.
+    `errors`. A batch is refused if it needs a position or a heading but has none, or if a number
+    does not fit its column.
 
     Args:
         found: decoded batches; columns that were not sent contain default values.
@@ -272,13 +273,8 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
         refuse(nowhere, WireError(name, "has values that are not positions", "send finite degrees"))
         needs_place &= ~nowhere
     if kind is Kind.OBSERVATION:
-        # A visit without a heading, or with degrees taken for radians, would count for an arbitrary
-        # direction. A sender that gives the sector may count turns, or leave out the yaw.
-        without_sector = ~sent.records("sector")
-        fix = "send radians from east, or give the sector"
-        refuse(without_sector & ~np.isfinite(columns["yaw"]), WireError("yaw", "is missing", fix))
-        is_turned = np.abs(columns["yaw"]) > 2.0 * np.pi
-        refuse(without_sector & is_turned, WireError("yaw", "is more than a turn", fix))
+        for rows, error in _heading_errors(columns["yaw"], sent.records("sector")):
+            refuse(rows, error)
         _derive_columns(columns, sent, needs_place)
     heads = _with_regions(found, columns)
     if not bad:
@@ -293,6 +289,21 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
         found.with_likelihood[rows],
         found.errors + [(found.indices[at], error) for at, error in bad.items()],
     )
+
+
+def _heading_errors(
+    yaw: NDArray[np.floating[Any]], with_sector: BoolArray
+) -> Iterator[tuple[BoolArray, WireError]]:
+    """Yield each error of the yaw angles (n,) [rad] of visits, with a mask of the visits that have
+    it. `with_sector` is True for visits whose heading sector was sent.
+
+    A visit without a heading, or with degrees taken for radians, would count for an arbitrary
+    direction. A sender that gives the sector may count turns, or leave out the yaw.
+    """
+    fix = "send radians from east, or give the sector"
+    yield ~with_sector & ~np.isfinite(yaw), WireError("yaw", "is missing", fix)
+    is_turned = np.abs(yaw) > 2.0 * np.pi
+    yield ~with_sector & is_turned, WireError("yaw", "is more than a turn", fix)
 
 
 def _derive_columns(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:

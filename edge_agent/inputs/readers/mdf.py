@@ -191,15 +191,15 @@ def read_mdf(mdf: Any, path: Path, requested: set[str] | None) -> Recording:  # 
     """Return the channels `requested` of a measurement in an MDF file, by name; all
     channels if `requested` is None.
 
-    Parts of a channel in several groups are joined if they are one after the other. If they
-    overlap in time, the first one with samples is used, and a note names the channel.
+    Parts of a channel in several groups are joined if they are one after the other, in the same
+    unit. Else the first one with samples is used, and a note names the channel.
     """
     seconds, has_zone = start_of(mdf)
     dated = round(seconds * NS) if seconds > 0 else None
     recording = Recording(path.name, {}, dated, has_zone=has_zone)
     if dated is not None and not has_zone:
         recording.notes.append(f"{path.name}: its date has no time zone; taken as UTC")
-    overlapping: list[str] = []
+    separate: list[str] = []
     with foreign_errors(path, "MDF 4"):
         timed = {group for group in mdf.masters_db if _has_time(mdf, group)}
         for name, places in mdf.channels_db.items():
@@ -213,8 +213,8 @@ def read_mdf(mdf: Any, path: Path, requested: set[str] | None) -> Recording:  # 
             ]
             if parts:
                 recording.signals[name], are_joined = _join_parts(parts)
-                overlapping += [] if are_joined else [name]
-    _note_left_out(recording, len(mdf.groups) - len(timed), overlapping)
+                separate += [] if are_joined else [name]
+    _note_left_out(recording, len(mdf.groups) - len(timed), separate)
     return recording
 
 
@@ -268,28 +268,29 @@ def _convert_samples(rule: Any, raw: FloatArray) -> FloatArray:  # noqa: ANN401
 
 
 def _join_parts(parts: list[Series]) -> tuple[Series, bool]:
-    """Return the parts of a channel as one series, and True if no two of them overlap in time;
-    otherwise the first part.
+    """Return the parts of a channel as one series and True. If two of them overlap in time or have
+    different units, return the first part and False.
     """
     if len(parts) == 1:
         return parts[0], True
     in_order = sorted(parts, key=lambda part: part.t[0])
-    if any(later.t[0] <= part.t[-1] for part, later in pairwise(in_order)):
+    have_one_unit = len({part.unit for part in parts}) == 1
+    if not have_one_unit or any(later.t[0] <= part.t[-1] for part, later in pairwise(in_order)):
         return parts[0], False
     t = np.concatenate([part.t for part in in_order])
     return Series(t, np.concatenate([part.values for part in in_order]), parts[0].unit), True
 
 
-def _note_left_out(recording: Recording, untimed: int, overlapping: list[str]) -> None:
-    """Add notes about the number of groups without time, and the channels that are in several
-    groups at once, to a recording.
+def _note_left_out(recording: Recording, untimed: int, separate: list[str]) -> None:
+    """Add notes about the number of groups without time, and the channels whose parts in several
+    groups are not joined, to a recording.
     """
     if untimed:
         recording.notes.append(f"{recording.name}: {untimed} groups without time left out")
-    if overlapping:
-        names = ", ".join(sorted(overlapping)[:MOST_NAMES])
-        more = len(overlapping) - MOST_NAMES
+    if separate:
+        names = ", ".join(sorted(separate)[:MOST_NAMES])
+        more = len(separate) - MOST_NAMES
         recording.notes.append(
-            f"{recording.name}: in several groups at the same time, the first is used: {names}"
-            + (f" and {more} more" if more > 0 else "")
+            f"{recording.name}: in several groups at the same time or in other units, the first is "
+            f"used: {names}" + (f" and {more} more" if more > 0 else "")
         )

@@ -26,7 +26,7 @@ SUFFIXES: Final = (".mcap", ".db3", ".bag")
 FRAME: Final = "can_msgs/msg/Frame"
 LONGEST_ARRAY: Final = 36  # longer arrays are images and scans, and their elements are not read
 DEEPEST: Final = 5
-MOST_KINDS: Final = 1000  # combinations of topic and joint names that are remembered
+MOST_KINDS: Final = 1000  # combinations of topic, names and lengths that are remembered
 OWN_CLOCK_NS: Final = 10 * NS  # a larger delay is the difference of two clocks
 DATED_NS: Final = round(DATED_S * NS)
 SKIPPED: Final = ("header", "covariance")
@@ -159,11 +159,13 @@ def align_stamps(stamps: Mapping[str, IntArray]) -> tuple[dict[str, IntArray], l
         and min(int(stamps[topic][:, 1].max()) for topic in delays) > DATED_NS
     )
     recorder_shift = -min(delays.values()) if is_replay else 0
+    foreign = [delay for delay in delays.values() if abs(delay) > OWN_CLOCK_NS]
     times = {}
     notes = []
     for topic, pairs in stamps.items():
-        near = [d for d in delays.values() if abs(d - delays.get(topic, 0)) <= OWN_CLOCK_NS]
-        is_own_clock = not is_replay and abs(delays.get(topic, 0)) > OWN_CLOCK_NS
+        delay = delays.get(topic, 0)
+        is_own_clock = not is_replay and abs(delay) > OWN_CLOCK_NS
+        near = [other for other in foreign if abs(other - delay) <= OWN_CLOCK_NS]
         shift = min(near) if is_own_clock else 0
         times[topic] = np.where(pairs[:, 1] > 0, pairs[:, 1] + shift, pairs[:, 0] + recorder_shift)
         if is_own_clock:
@@ -208,18 +210,19 @@ def _read_messages(
 class RequestedNumbers:
     """The requested numbers in messages of each topic.
 
-    Messages of one topic may name different joints, or the same ones in another order, because
-    several programs publish them. Each combination of names has its own list of numbers.
+    Messages of one topic may name different joints, or the same ones in another order, or give no
+    velocities, because several programs publish them. Each combination of names and array lengths
+    has its own list of numbers.
     """
 
     def __init__(self, requested: set[str] | None) -> None:
         """Request the signals with these names; all if it is None."""
         self._requested = requested
-        self._leaves: dict[tuple[str, tuple[str, ...]], list[Leaf]] = {}
+        self._leaves: dict[tuple[str, tuple[str, ...], tuple[int, ...]], list[Leaf]] = {}
 
     def find_leaves(self, topic: str, message: Any) -> list[Leaf]:  # noqa: ANN401
         """Return signal name and function for each requested number in a message of a topic."""
-        key = topic, tuple(_labels_of(message) or ())
+        key = topic, tuple(_labels_of(message) or ()), _array_lengths(message)
         if key not in self._leaves:
             if len(self._leaves) >= MOST_KINDS:
                 self._leaves.clear()
@@ -228,6 +231,15 @@ class RequestedNumbers:
                 leaf for leaf in found if self._requested is None or leaf[0] in self._requested
             ]
         return self._leaves[key]
+
+
+def _array_lengths(message: Any) -> tuple[int, ...]:  # noqa: ANN401
+    """Return the lengths of a message's own arrays. Lengths above LONGEST_ARRAY count as one."""
+    return tuple(
+        min(len(value), LONGEST_ARRAY + 1)
+        for value in vars(message).values()
+        if isinstance(value, np.ndarray | list | tuple)
+    )
 
 
 def stamp_of(message: Any) -> int:  # noqa: ANN401

@@ -11,7 +11,8 @@ import pytest
 
 from edge_agent.inputs.bring_in import read_source
 from edge_agent.inputs.live.ros2 import CAN_FRAME
-from edge_agent.inputs.names import draft_profile
+from edge_agent.inputs.names import FIXES, draft_profile
+from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.readers.dbc import parse_dbc
 from edge_agent.inputs.readers.rosbag import FRAME, align_stamps
 from schemas.thresholds import NS
@@ -104,6 +105,19 @@ def test_joints_are_read_by_name_from_messages_of_several_publishers(tmp_path: P
     assert len(signals["/joint_states.velocity[left]"].t) == 20
 
 
+def test_velocities_are_read_if_the_first_message_has_none(tmp_path: Path) -> None:
+    messages = []
+    for k in range(10):
+        at = DATE + k * 10 * MS
+        joints = make_joints(at, left=1.0)
+        if k % 2 == 0:
+            joints.velocity = np.empty(0)
+        messages.append((at, "/joint_states", joints))
+    signals = read_source(write_bag(tmp_path / "bag", messages), None, None).signals
+    assert len(signals["/joint_states.position[left]"].t) == 10
+    assert signals["/joint_states.velocity[left]"].values.tolist() == [1.0] * 5
+
+
 def test_sensor_that_counts_from_its_start_is_put_on_the_clock_of_the_bag(tmp_path: Path) -> None:
     messages = []
     for k in range(20):
@@ -144,12 +158,24 @@ def test_simulated_time_has_one_shift_for_all_topics() -> None:
     assert np.array_equal(times["/a"], times["/b"])
 
 
+def test_late_topic_does_not_change_the_shift_of_another_clock() -> None:
+    clock = DATE + np.arange(5) * 10 * MS
+    stamps = {
+        "/late": np.column_stack([clock + 5 * NS, clock]),
+        "/own": np.column_stack([clock + 11 * NS, clock]),
+    }
+    times, notes = align_stamps(stamps)
+    assert np.array_equal(times["/late"], clock)
+    assert np.array_equal(times["/own"], clock + 11 * NS)
+    assert notes == ["/own has a clock of its own; 11.000 s added"]
+
+
 def test_draft_requires_a_fix_for_the_position_of_a_receiver(tmp_path: Path) -> None:
     messages = [(DATE + k * NS, "/fix", make_fix(DATE + k * NS, -(k % 2))) for k in range(10)]
     recording = read_source(write_bag(tmp_path / "bag", messages), None, None)
     profile = draft_profile(dict.fromkeys(recording.signals, ""), "bag")
     for name in ("latitude", "longitude"):
-        assert profile.channels[name].gates == {"/fix.status.status": [0.0, 1.0, 2.0]}
+        assert profile.channels[name].gates == {"/fix.status.status": FIXES}
 
 
 def test_steered_joints_are_road_wheels() -> None:
@@ -167,7 +193,10 @@ def test_other_topics_of_a_bag_with_frames_are_read(tmp_path: Path) -> None:
         at = DATE + k * 10 * MS
         messages.append((at, "/can", make_frame(at + MS, k)))
         messages.append((at, "/fix", make_fix(at + 4 * MS, 0)))
-    recording = read_source(write_bag(tmp_path / "bag", messages), None, database)
+    bag = write_bag(tmp_path / "bag", messages)
+    recording = read_source(bag, None, database)
     assert recording.start_ns == pytest.approx(DATE + MS, abs=1000)
     assert recording.signals["M.S"].values.tolist() == list(range(10))
     assert recording.signals["/fix.latitude"].t[0] == pytest.approx(0.003, abs=1e-6)
+    topics = Profile(name="own", channels={"latitude": Channel(signal="/fix.latitude")})
+    assert read_source(bag, topics, None).signals.keys() == {"/fix.latitude"}

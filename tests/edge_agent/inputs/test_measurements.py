@@ -23,6 +23,7 @@ asammdf = pytest.importorskip("asammdf")
 Library: TypeAlias = Any  # objects of asammdf, which has no types
 T = np.arange(50) * 0.01
 START = datetime.datetime(2026, 1, 15, 7, 30, tzinfo=datetime.UTC)
+NOT_JOINED = "a.mf4: in several groups at the same time or in other units, the first is used: ax"
 START_NS = int(START.timestamp()) * 1_000_000_000
 
 
@@ -63,7 +64,18 @@ def test_channel_in_two_groups_at_the_same_time_is_noted(tmp_path: Path) -> None
 
     recording = read_mdf(tmp_path / "a.mf4", fill)
     assert np.allclose(recording.signals["ax"].values, T)
-    assert recording.notes == ["a.mf4: in several groups at the same time, the first is used: ax"]
+    assert recording.notes == [NOT_JOINED]
+
+
+def test_parts_of_a_channel_in_different_units_are_not_joined(tmp_path: Path) -> None:
+    def fill(mdf: Library) -> None:
+        mdf.append([make_signal(T)])
+        mdf.append([make_signal(9.81 * T, T + 9.0, unit="m/s^2")])
+
+    recording = read_mdf(tmp_path / "a.mf4", fill)
+    assert np.allclose(recording.signals["ax"].values, T)
+    assert recording.signals["ax"].unit == "g"
+    assert recording.notes == [NOT_JOINED]
 
 
 def test_text_between_numbers_is_missing_and_states_are_numbers(tmp_path: Path) -> None:

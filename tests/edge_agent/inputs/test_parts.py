@@ -91,6 +91,13 @@ def test_files_of_two_drives_are_refused() -> None:
         merge_parts(make_part("a.csv", 0.0), make_part("b.csv", 0.0, start=3600.0))
 
 
+def test_part_continues_the_nearest_of_two_sources() -> None:
+    short = make_part("short.csv", 0.0)
+    long = make_part("long.csv", 0.0, seconds=800.0, start=1.0)
+    merged = merge_parts(short, long, make_part("next.csv", 0.0, start=801.0))
+    assert "next.csv: continues long.csv after 0.10 s" in merged.notes
+
+
 def test_parts_with_different_units_are_refused() -> None:
     second = make_part("b.csv", 0.0, start=10.0)
     second.signals["ax"] = dataclasses.replace(second.signals["ax"], unit="g")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import ssl
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -45,11 +46,19 @@ def make_settings(folder: Path, **more: str) -> ZenohSettings:
     return ZenohSettings(connect=["tls/127.0.0.1:1"], config=config)
 
 
+def explain_faults(settings: ZenohSettings) -> str:
+    return zenoh_session.explain_faults(zenoh_session.configuration(settings))
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     for name in ("trust", "car", "other"):
         write_pair(tmp_path, name)
     (tmp_path / "junk.pem").write_text("junk")
+    (tmp_path / "empty.pem").write_text("")
+    pem = (tmp_path / "trust.pem").read_text()
+    (tmp_path / "der.pem").write_bytes(ssl.PEM_cert_to_DER_cert(pem))
+    (tmp_path / "commented.pem").write_text(f"# für den Router\n{pem}", encoding="utf-8")
     return tmp_path
 
 
@@ -60,9 +69,12 @@ def folder(tmp_path: Path) -> Path:
         ({}, END.timestamp() + 1, "car.pem expired on 2026-06-01: renew it"),
         ({}, BEGIN.timestamp() - 1, "car.pem is valid from 2026-01-01: set the clock"),
         ({"connect_private_key": "other.key"}, DURING, "other.key is not the private key of"),
+        ({"root_ca_certificate": "commented.pem"}, DURING, ""),
         ({"root_ca_certificate": "junk.pem"}, DURING, "junk.pem is not valid PEM: make it with"),
-        ({"connect_certificate": "junk.pem"}, DURING, "car.key is not valid PEM: make it with"),
-        ({"connect_private_key": "junk.pem"}, DURING, "junk.pem is not valid PEM: make it with"),
+        ({"root_ca_certificate": "empty.pem"}, DURING, "empty.pem is not valid PEM: make it with"),
+        ({"root_ca_certificate": "der.pem"}, DURING, "der.pem is not valid PEM: make it with"),
+        ({"connect_certificate": "junk.pem"}, DURING, "car.key is not valid PEM, or has a"),
+        ({"connect_private_key": "junk.pem"}, DURING, "junk.pem is not valid PEM, or has a"),
     ],
 )
 def test_each_fault_of_a_certificate_is_named(
@@ -76,9 +88,10 @@ def test_each_fault_of_a_certificate_is_named(
 
 @pytest.mark.parametrize("endpoint", ["tls/map.example:7447", "quic/map.example:7447"])
 def test_encryption_without_certificates_says_where_to_name_them(endpoint: str) -> None:
+    plain = ZenohSettings(connect=["tcp/127.0.0.1:1"])
     with_tls = ZenohSettings(connect=["tcp/127.0.0.1:1", endpoint])
-    assert "name them in the settings" in zenoh_session.explain_faults(with_tls)
-    assert not zenoh_session.explain_faults(ZenohSettings(connect=["tcp/127.0.0.1:1"]))
+    assert "name them in the settings" in explain_faults(with_tls)
+    assert not explain_faults(plain)
 
 
 def test_validity_is_that_of_the_certificate(tmp_path: Path) -> None:
@@ -92,4 +105,4 @@ def test_settings_of_a_reader_name_certificates() -> None:
     text = (Path(__file__).parents[3] / "deploy/secure/reader.json").read_text()
     text = re.sub(r'"/etc/\S+"', json.dumps(__file__), text)
     settings = ZenohSettings.model_validate(json.loads(text)["zenoh"])
-    assert "name them in the settings" not in zenoh_session.explain_faults(settings)
+    assert "name them in the settings" not in explain_faults(settings)
