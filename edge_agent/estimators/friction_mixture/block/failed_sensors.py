@@ -15,6 +15,7 @@ import math
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
+from edge_agent.estimators.common.readings import GAP_S
 from edge_agent.estimators.friction_mixture.block.wheel_readings import STEP_LEAST, STEP_MOST
 from edge_agent.estimators.friction_mixture.state.gap import SLOW_M_S, SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.state.memory import LastInputs, WheelSensors
@@ -23,19 +24,14 @@ from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
-# A reading may stay the same for INTERVALS usual intervals between changes, at most UNCHANGED_S
-# [s], while the other wheels change their speed by more than FOLLOWS times its last change.
+# A reading may stay the same for INTERVALS usual intervals between changes, at most GAP_S, while
+# the other wheels change their speed by more than FOLLOWS times its last change.
 INTERVALS = 3.0
-UNCHANGED_S = 0.3
 FOLLOWS = 2.0
 FINEST = 0.25  # [rad/s] smallest resolution step that is assumed
-FEWEST = 2  # number of other wheels that must show that the car drives
 # [1] largest force of a brake over a quarter of the car's weight. While the car brakes on dry road,
 # a front wheel carries this load, and its brake is just able to lock it.
 STRONGEST_BRAKE = 1.5
-# States of a wheel; 0 means that it has not turned since the drive began.
-TURNS = 1
-STOPPED = 2  # reads zero, but no brake could have stopped it so fast
 
 
 @compiled
@@ -69,15 +65,16 @@ def note_reading(
     if omega != before:
         age = time - sensors.changed[wheel]
         kept = sensors.interval[wheel] * math.exp(-age / UTILISED_WINDOW_S)
-        sensors.interval[wheel] = max(min(age, UNCHANGED_S), kept)
+        sensors.interval[wheel] = max(min(age, GAP_S), kept)
         sensors.changed[wheel] = time
         sensors.step[wheel] = min(max(abs(omega - before), FINEST), STEP_MOST)
         for other in range(4):
             sensors.others[wheel, other] = now[S.OMEGA + other]
     if omega * row[Parameter.RADIUS] > SLOWEST_M_S:
-        sensors.state[wheel] = TURNS
+        sensors.turned[wheel] = 1
+        sensors.fell[wheel] = 0
     elif before - omega > strongest_fall(row) * (time - sensors.time[wheel]):
-        sensors.state[wheel] = STOPPED
+        sensors.fell[wheel] = 1
     sensors.reading[wheel] = omega
     sensors.time[wheel] = time
 
@@ -102,7 +99,7 @@ def is_frozen(row: FloatArray, sensors: WheelSensors, wheel: int, time: float) -
     the same time as this wheel's do not count.
     """
     usual = sensors.interval[wheel]
-    if time - sensors.changed[wheel] <= min(INTERVALS * usual, UNCHANGED_S):
+    if time - sensors.changed[wheel] <= min(INTERVALS * usual, GAP_S):
         return False
     turns = sensors.reading[wheel] * row[Parameter.RADIUS] > SLOWEST_M_S
     fine = sensors.step[wheel] <= FINEST
@@ -124,7 +121,7 @@ def is_frozen(row: FloatArray, sensors: WheelSensors, wheel: int, time: float) -
         fastest_before = max(fastest_before, before)
     change = FOLLOWS * sensors.step[wheel]
     follows = smallest_change > change if turns else slowest > fastest_before + change
-    return bool(count >= FEWEST and follows)
+    return bool(count >= 2 and follows)
 
 
 @compiled
@@ -133,11 +130,11 @@ def is_dead(row: FloatArray, sensors: WheelSensors, wheel: int) -> bool:
     two other wheels turn. If the wheel has not turned since the drive began, all others must turn,
     because the driven wheels may spin on ice. `row` contains the vehicle's parameters.
     """
-    state = sensors.state[wheel]
-    if state == TURNS or abs(sensors.reading[wheel]) > STEP_LEAST:
+    braked = sensors.turned[wheel] == 1 and sensors.fell[wheel] == 0
+    if braked or abs(sensors.reading[wheel]) > STEP_LEAST:
         return False
     count = 0
     for other in range(4):
         if sensors.reading[other] * row[Parameter.RADIUS] > SLOW_M_S:
             count += 1
-    return bool(count >= (FEWEST if state == STOPPED else 3))
+    return bool(count >= (2 if sensors.fell[wheel] == 1 else 3))

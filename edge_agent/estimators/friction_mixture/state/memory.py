@@ -75,8 +75,9 @@ class WheelSensors:
     interval: Annotated[FloatArray, 4]
     # [rad/s] readings of the other wheels when the reading of a wheel last changed
     others: Annotated[FloatArray, 4, 4]
-    # 0, TURNS or STOPPED (`failed_sensors.py`)
-    state: Annotated[IntArray, 4]
+    turned: Annotated[IntArray, 4]  # 1 if the wheel has turned since the drive began
+    # 1 if the wheel last stopped faster than by a brake
+    fell: Annotated[IntArray, 4]
 
 
 class LastInputs:
