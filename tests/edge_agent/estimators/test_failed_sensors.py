@@ -82,6 +82,17 @@ def test_ice_is_found_with_a_failed_wheel_sensor(fault: str) -> None:
     assert np.mean(estimates.mu_lower[FAILS:] > ICE + 0.05) < 0.05
 
 
+def test_failed_sensor_is_found_if_the_wheels_are_read_in_turn() -> None:
+    t, signals, known = record("pulses", DRY)
+    spoilt = spoil(signals, "frozen", 0)
+    for wheel in range(4):
+        unread = np.arange(len(t)) % 4 != wheel
+        spoilt[unread, OMEGA.start + wheel] = np.nan
+    estimates = estimate(t, spoilt, known)
+    assert np.mean(estimates.p_slippery[FAILS:] > CALLED_SHARE) == 0.0
+    assert np.mean(estimates.mu_upper[FAILS:] < DRY) < 0.05
+
+
 @pytest.mark.parametrize(("name", "brakes"), [("braking", True), ("acceleration", False)])
 def test_wheels_that_lock_or_spin_are_not_left_out(name: str, brakes: bool) -> None:
     t, signals, known = record(name, ICE)

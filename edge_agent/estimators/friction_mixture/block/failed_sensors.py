@@ -39,14 +39,17 @@ def leave_out_failed(row: FloatArray, last: LastInputs, time: float) -> int:
     """Set the readings of failed wheel speed sensors to NaN in the readings of the sample at `time`
     [s], last.now. Return the health flags.
 
-    `row` contains the vehicle's parameters. The function updates the history of the readings.
+    `row` contains the vehicle's parameters. The function updates the history of the readings,
+    last.wheel_sensors.
     """
     sensors = last.wheel_sensors
     health = 0
     for wheel in range(4):
         if not math.isnan(last.now[S.OMEGA + wheel]):
-            note_reading(row, last.now, sensors, wheel, time)
+            note_reading(row, sensors, wheel, last.now[S.OMEGA + wheel], time)
     for wheel in range(4):
+        if sensors.changed[wheel] == time:
+            sensors.others[wheel] = sensors.reading
         if is_frozen(row, sensors, wheel, time) or is_dead(row, sensors, wheel):
             last.now[S.OMEGA + wheel] = math.nan
             health = flags.NO_WHEEL_SPEED
@@ -55,12 +58,11 @@ def leave_out_failed(row: FloatArray, last: LastInputs, time: float) -> int:
 
 @compiled
 def note_reading(
-    row: FloatArray, now: FloatArray, sensors: WheelSensors, wheel: int, time: float
+    row: FloatArray, sensors: WheelSensors, wheel: int, omega: float, time: float
 ) -> None:
-    """Update the history of a wheel's readings, in `sensors`, with its reading in `now` (15,) at
+    """Update the history of a wheel's readings, in `sensors`, with the reading `omega` [rad/s] at
     `time` [s]. `row` contains the vehicle's parameters.
     """
-    omega = now[S.OMEGA + wheel]
     before = sensors.reading[wheel]
     if omega != before:
         age = time - sensors.changed[wheel]
@@ -68,8 +70,6 @@ def note_reading(
         sensors.interval[wheel] = max(min(age, GAP_S), kept)
         sensors.changed[wheel] = time
         sensors.step[wheel] = min(max(abs(omega - before), FINEST), STEP_MOST)
-        for other in range(4):
-            sensors.others[wheel, other] = now[S.OMEGA + other]
     if omega * row[Parameter.RADIUS] > SLOWEST_M_S:
         sensors.turned[wheel] = 1
         sensors.fell[wheel] = 0
@@ -113,8 +113,6 @@ def is_frozen(row: FloatArray, sensors: WheelSensors, wheel: int, time: float) -
             continue
         now = sensors.reading[other]
         before = sensors.others[wheel, other]
-        if math.isnan(before):
-            return False
         count += 1
         smallest_change = min(smallest_change, abs(now - before))
         slowest = min(slowest, now)
