@@ -49,7 +49,8 @@ def leave_out_failed(row: FloatArray, last: LastInputs, time: float) -> int:
             note_reading(row, sensors, wheel, last.now[S.OMEGA + wheel], time)
     for wheel in range(4):
         if sensors.changed[wheel] == time:
-            sensors.others[wheel] = sensors.reading
+            for other in range(4):
+                sensors.others[wheel, other] = sensors.reading[other]
         if is_frozen(row, sensors, wheel, time) or is_dead(row, sensors, wheel):
             last.now[S.OMEGA + wheel] = math.nan
             health = flags.NO_WHEEL_SPEED
