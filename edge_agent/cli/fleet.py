@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_connection, add_estimator, config_of, memberships_of
+from edge_agent.lab.options import add_simulated_fleet
 from schemas.runtime import commandline
 
 if TYPE_CHECKING:
@@ -19,23 +20,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments of `edge-agent fleet`."""
     parser.add_argument("--vehicles", type=int, default=36, help="number of vehicles (default 36)")
-    parser.add_argument(
-        "--scenario",
-        default="demo",
-        help="demo (default), hills, test, or hills-N, winter-N: a town drawn from seed N",
-    )
-    parser.add_argument(
-        "--rough",
-        type=float,
-        default=0.0,
-        help="share of vehicles with the sensor errors of real cars (default 0)",
-    )
-    parser.add_argument(
-        "--winter",
-        type=float,
-        default=0.0,
-        help="share of vehicles with winter tyres and stability controllers (default 0)",
-    )
+    add_simulated_fleet(parser)
     parser.add_argument(
         "--warned",
         type=float,

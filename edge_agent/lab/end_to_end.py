@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, to_utc_ns
+from edge_agent.lab.options import add_simulated_fleet
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
@@ -97,20 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--seed", type=int, default=FIGURES, help="seed of the simulation (default %(default)s)"
     )
-    parser.add_argument(
-        "--scenario",
-        default="demo",
-        help="demo (default), hills, or hills-N: a town drawn from seed N",
-    )
-    parser.add_argument(
-        "--rough",
-        type=float,
-        default=0.0,
-        help="share of vehicles with the sensor errors of real cars (default 0)",
-    )
-    parser.add_argument(
-        "--winter", type=float, default=0.0, help="share with winter equipment (default 0)"
-    )
+    add_simulated_fleet(parser)
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     fleet = SimulatedFleet(

@@ -171,10 +171,10 @@ def _fail_over(number: int, course: Course, machines: Machines, asking: Asking, 
     """
     found = machines.fail_over(_way_of(number))
     course.happened.extend([found] if found else [])
-    told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
+    result = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
     site.say(
-        f"{len(course.happened)} of {number + 1}: {told}; {asking.unserved} answers say that "
-        "nobody serves"
+        f"{len(course.happened)} of {number + 1}: {result}; {asking.unserved} answers name no "
+        "active service"
     )
 
 
