@@ -168,7 +168,9 @@ class Fuzzer:
         self._random = random.Random(seed)
         self._lines: set[tuple[CodeType, int, int]] = set()
         self._corpus: list[bytes] = []
-        self._executions = self._crashes = self._hangs = 0
+        self._executions = 0
+        self._crashes = 0
+        self._hangs = 0
         for one in inputs or [b""]:
             self._run_input(one, always=True)
 

@@ -37,7 +37,8 @@ def weighted_noise(
 
     `predicted` is the variance of the predicted measurement, without noise.
     """
-    weight = total = 0.0
+    weight = 0.0
+    total = 0.0
     for error in window:
         size = abs(error)
         if not size >= 0.0:

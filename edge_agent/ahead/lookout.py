@@ -134,7 +134,8 @@ class Lookout:
             subscriber = MapSubscriber(
                 name, session, lambda places: self._request_look(vehicle, places)
             )
-            vehicle.subscriber = self.counts.subscribers[name] = subscriber
+            vehicle.subscriber = subscriber
+            self.counts.subscribers[name] = subscriber
 
     def set_poses(self, poses: Sequence[Pose]) -> None:
         """Store the present poses (position, heading, speed) of the vehicles; item k belongs to

@@ -119,7 +119,9 @@ class MapPrior:
         before = self._map[k]
         self._map[k] = belief
         self._key[k] = key
-        self._wrong[k] = self._found[k] = SHARE + KEPT * (self._found[k] - SHARE)
+        share = SHARE + KEPT * (self._found[k] - SHARE)
+        self._wrong[k] = share
+        self._found[k] = share
         if belief is None:
             return
         change = (

@@ -143,14 +143,16 @@ def _split_path(path: Path, needed: BoolArray) -> list[tuple[int, int]]:
     metre) per part. Together the parts contain all points where the mask `needed` is True.
     """
     found: list[tuple[int, int]] = []
-    first = last = -1
+    first = -1
+    last = -1
     for k in (np.flatnonzero(needed) * STEP).tolist():
         if first >= 0 and _fits_box(path, first, k):
             last = k
             continue
         if first >= 0:
             found.append((first, last))
-        first = last = k
+        first = k
+        last = k
     return [*found, (first, last)] if first >= 0 else found
 
 

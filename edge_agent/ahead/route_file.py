@@ -84,7 +84,8 @@ def _parse_gpx(data: bytes) -> list[tuple[float, float]]:
                 ) from error
 
     parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse_doctype
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    parser.EntityDeclHandler = refuse_doctype
     parser.StartElementHandler = read_point
     try:
         parser.Parse(data, True)

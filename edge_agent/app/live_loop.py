@@ -97,7 +97,8 @@ def run_live_loop(
     progress = progress or Progress()
     status_at = STATUS_EVERY_S
     doubted: set[tuple[int, str]] = set()
-    started = first = float("nan")
+    started = float("nan")
+    first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
         _offer_if_admitted(publisher, progress, options.is_admitted(), observations, states)

@@ -86,7 +86,8 @@ class Trip:
         )
         # Blocks of the current section: t, signals, ground.
         self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        self._part_start = self._looked = 0.0
+        self._part_start = 0.0
+        self._looked = 0.0
         self._faults: list[str] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
         self._looking: Future[None] | None = None
@@ -144,7 +145,8 @@ class Trip:
     def _keep_block(self, block: Block, ground: FloatArray) -> None:
         now = float(block.t[-1, 0])
         if not self._blocks:
-            self._part_start = self._looked = float(block.t[0, 0])
+            self._part_start = float(block.t[0, 0])
+            self._looked = self._part_start
         self._blocks.append((block.t[:, 0], block.signals[:, 0], ground))
         if now - self._part_start >= PART_S:
             self._start_examination(final=True)

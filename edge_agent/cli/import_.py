@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
     draft_path = args.draft or out.with_suffix(".profile.json")
     draft = None
     if profile is None:
-        profile = draft = _make_draft(recordings, out, draft_path)
+        profile = _make_draft(recordings, out, draft_path)
+        draft = profile
     with bounded_memory(args.source[0]):  # a clock that jumps by years gives too many rows
         merged, profile = _merge(recordings, profile, vehicle, shifts)
     write_log(out, merged, profile, [source.name for source in args.source])

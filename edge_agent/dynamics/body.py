@@ -33,7 +33,9 @@ def planar_accelerations(
     The wheel forces `force_x` and `force_y` [N] and the road-wheel angles `delta` [rad] have shape
     (4,).
     """
-    total_x = total_y = moment = 0.0
+    total_x = 0.0
+    total_y = 0.0
+    moment = 0.0
     for wheel in range(4):
         cos = math.cos(delta[wheel])
         sin = math.sin(delta[wheel])

@@ -60,7 +60,8 @@ class DrivingDirection:
     def __init__(self, vehicle: Vehicle) -> None:
         self._radius = vehicle.wheel_radius
         self._state = records(DirectionRecord, 1)
-        self._state["time"] = self._state["stopped"] = np.nan
+        self._state["time"] = np.nan
+        self._state["stopped"] = np.nan
         self._state["is_decided"] = True
 
     def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:

@@ -79,7 +79,8 @@ class TruthRecorder:
     def _visit_of(self, n: int, cell: int, sector: int, time: int) -> _Visit:
         visit = self._open.get(n)
         if visit is None or (visit.cell, visit.sector) != (cell, sector):
-            visit = self._open[n] = _Visit(cell, sector, time)
+            visit = _Visit(cell, sector, time)
+            self._open[n] = visit
             self.rows.append((self.names[n], visit))
         return visit
 

@@ -146,7 +146,8 @@ def _receiver_samples(signals: FloatArray) -> RecordArray:
     fixes["yaw"] = signals[..., S.YAW]
     is_located = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
     fixes["cell"] = NOWHERE
-    fixes["cell"][is_located] = cell = grid.cell_of(latitude[is_located], longitude[is_located])
+    cell = grid.cell_of(latitude[is_located], longitude[is_located])
+    fixes["cell"][is_located] = cell
     for name, border in zip(("west", "south", "east", "north"), grid.bounds(cell), strict=True):
         fixes[name][is_located] = border
     return fixes

@@ -108,7 +108,8 @@ class HeldBatches:
             self._oldest[batch.stream.kind] = deque(one for one in oldest if one in self._entries)
         sequence = self._streams.get(batch.stream)
         if sequence is None:
-            sequence = self._streams[batch.stream] = _Sequence(batch.stream)
+            sequence = _Sequence(batch.stream)
+            self._streams[batch.stream] = sequence
         batch.stream = sequence.stream
         sequence.held[batch.seq] = key
         sequence.next = max(sequence.next, batch.seq + 1)

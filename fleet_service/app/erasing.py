@@ -49,7 +49,8 @@ def handle_requests(
     """Handle the waiting erasure requests. Return a line about them for the operator, or None if no
     request was carried out.
     """
-    rows = answered = 0
+    rows = 0
+    answered = 0
     for question in erasure_requests.open_requests(root):
         try:
             outcome = _run_erasure(

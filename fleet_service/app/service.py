@@ -119,9 +119,11 @@ class Service:
             self.engine.counts,
             time.monotonic,
         )
-        self._stepped_at = self._flushed_at = self._repeated_at = time.monotonic()
+        self._began = time.monotonic()
+        self._stepped_at = self._began
+        self._flushed_at = self._began
+        self._repeated_at = self._began
         self._status_line = StatusLine(self.engine, self.inbox, self._clock, events)
-        self._began = self._stepped_at
         self._survived = False
         self._was_replaced = False  # True once another service has the lease
 
@@ -240,7 +242,8 @@ class Service:
             wait_s = min(IDLE_S, self.engine.settlement.until_early_s(time.monotonic()))
             has_work = self._rounds.waiting or self._acks
             self._ingest(session, self.inbox.drain(0.0 if has_work else wait_s))
-        now = self._stepped_at = time.monotonic()
+        now = time.monotonic()
+        self._stepped_at = now
         self._acks.add(self.engine.settlement.end_flush())
         is_flush_due = now - self._flushed_at >= self._config.segment_s
         if is_flush_due or self.engine.settlement.until_early_s(now) <= 0.0:

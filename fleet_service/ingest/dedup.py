@@ -138,7 +138,8 @@ class SequenceTrackers:
     def __getitem__(self, key: StreamKey) -> SequenceTracker:
         stream = self._streams.get(key)
         if stream is None:
-            stream = self._streams[key] = SequenceTracker(key)
+            stream = SequenceTracker(key)
+            self._streams[key] = stream
         return stream
 
     def __contains__(self, key: StreamKey) -> bool:

@@ -365,7 +365,8 @@ class BatchIntake:
         if is_limited and not self._budget.take(witness, 1, self._now):
             self._counts.too_many_streams += 1
             return None
-        stream = self._known[kind][name] = self._streams[key]
+        stream = self._streams[key]
+        self._known[kind][name] = stream
         stream.vehicle = vehicle
         stream.boot = boot
         stream.witness = witness

@@ -156,7 +156,8 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu = visits["mu"].to_numpy()
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
-    false = next_to_ice = 0
+    false = 0
+    next_to_ice = 0
     for alert in raised:
         x, y = (int(value[0]) for value in grid.deinterleave(np.array([alert.cell])))
         far = np.maximum(np.abs(east - x), np.abs(north - y))

@@ -106,9 +106,8 @@ def make_observations(drive: ForeignDrive) -> Observations:
     their optional columns are absent.
     """
     rows = rows_of(drive.visits, drive.cells)
-    rows["used_longitudinal"] = rows["used_lateral"] = np.full(
-        len(drive.visits), np.nan, np.float32
-    )
+    rows["used_longitudinal"] = np.full(len(drive.visits), np.nan, np.float32)
+    rows["used_lateral"] = rows["used_longitudinal"]
     return observations_of(rows, drive.visits.vehicle)
 
 

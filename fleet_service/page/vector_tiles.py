@@ -243,14 +243,16 @@ def _find_entry(directory: bytes, tile_number: int) -> tuple[int, int, int] | No
 
 
 def _decode_varints(data: bytes) -> Iterator[int]:
-    value = shift = 0
+    value = 0
+    shift = 0
     for byte in data:
         value |= (byte & 127) << shift
         if byte & 128:
             shift += 7
         else:
             yield value
-            value = shift = 0
+            value = 0
+            shift = 0
 
 
 def _hilbert_number(zoom: int, x: int, y: int) -> int:

@@ -253,7 +253,8 @@ class MapQueryable:
             with self._has_queued:
                 self._has_queued.wait_for(lambda: self._heavy)
                 first = heapq.heappop(self._heavy)
-            began = self._busy_since = time.monotonic()
+            began = time.monotonic()
+            self._busy_since = began
             goes_on = self._answer_next_tile(first)
             self._busy_since = None
             if goes_on:

@@ -49,7 +49,8 @@ class LinkWatch:
         self._routers = set[str]()
         # Protocol of each link. The key is the identity of the router and its address.
         self._links = dict[tuple[str, str], str]()
-        self.epoch = self.lost = 0
+        self.epoch = 0
+        self.lost = 0
         info = session.info
         self._listeners = (
             info.declare_link_events_listener(self._record_link, history=True),

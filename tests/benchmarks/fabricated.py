@@ -23,11 +23,10 @@ def make_visits(rows: int, vehicles: int, cells: int) -> Columns:
             if dtype.kind == "f"
             else np.zeros(rows, dtype)
         )
-    columns["latitude"], columns["longitude"] = latitude, longitude
-    columns["cell"], columns["sector"] = (
-        grid.cell_of(latitude, longitude),
-        grid.sector_of(columns["yaw"]),
-    )
+    columns["latitude"] = latitude
+    columns["longitude"] = longitude
+    columns["cell"] = grid.cell_of(latitude, longitude)
+    columns["sector"] = grid.sector_of(columns["yaw"])
     columns["enter_time"] = (
         np.sort(rng.integers(0, 60_000_000_000, rows)) + 1_790_000_000_000_000_000
     )
@@ -36,10 +35,10 @@ def make_visits(rows: int, vehicles: int, cells: int) -> Columns:
     columns["log_likelihood"] = np.minimum(shape * rng.integers(2, 12, (rows, 1)), 255).astype(
         np.uint8
     )
-    columns["boot"], columns["region"] = np.ones(rows, np.int64), grid.region_of(columns["cell"])
-    columns["seq"], columns["row"] = np.arange(1, rows + 1), np.zeros(rows, np.int32)
-    columns["vehicle_number"], columns["with_likelihood"] = (
-        rng.integers(0, vehicles, rows),
-        np.ones(rows, bool),
-    )
+    columns["boot"] = np.ones(rows, np.int64)
+    columns["region"] = grid.region_of(columns["cell"])
+    columns["seq"] = np.arange(1, rows + 1)
+    columns["row"] = np.zeros(rows, np.int32)
+    columns["vehicle_number"] = rng.integers(0, vehicles, rows)
+    columns["with_likelihood"] = np.ones(rows, bool)
     return columns

@@ -92,7 +92,9 @@ def first_memory(first: FloatArray, speed: float) -> FloatArray:
     (count, inputs) = first.shape
     turned = FACTOR + ROWS + inputs
     memory = np.zeros((count, turned + 2 * WHEELS))
-    memory[:, 0], memory[:, 2:5], memory[:, 5] = speed, first[:, :3], setting.mu
+    memory[:, 0] = speed
+    memory[:, 2:5] = first[:, :3]
+    memory[:, 5] = setting.mu
     for i in range(STATES):
         memory[:, STATES + i * STATES + i] = np.sqrt(setting.start[i])
     memory[:, FACTOR : FACTOR + ROWS] = 1.0
@@ -186,10 +188,8 @@ class VectorLimit(CompiledFilters):
         self._library = compile_library("kernel_simd.c", *VECTORS)
         self._lanes = int(self._library.lanes())
         self._setting = setting_row(memberships)
-        self._parameters, self._memory = (
-            self.side_by_side(parameters),
-            self.side_by_side(first_memory(first, speed)),
-        )
+        self._parameters = self.side_by_side(parameters)
+        self._memory = self.side_by_side(first_memory(first, speed))
 
     def side_by_side(self, values: FloatArray) -> FloatArray:
         """Rearrange an array (..., N, K) of K values for each of N vehicles to (..., N/L, K, L),

@@ -106,7 +106,8 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
     rng = np.random.default_rng(SEED)
     stretches = Stretches()
     before: bytes | None = None
-    invalid = unended = 0
+    invalid = 0
+    unended = 0
     ended = set[str]()
     standing = dict[tuple[int, int], bool]()
     for step in range(STEPS):

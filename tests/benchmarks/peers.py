@@ -92,7 +92,8 @@ def by_filterpy(problem: Problem) -> FloatArray:
     mean, made.P, made.Q, made.R = problem.start()
     made.x = mean.reshape(made.x.shape)
     for k in range(1, PYTHON_STEPS + 1):
-        inputs["before"], inputs["now"] = problem.readings[k - 1], problem.readings[k]
+        inputs["before"] = problem.readings[k - 1]
+        inputs["now"] = problem.readings[k]
         made.predict()
         made.update(problem.readings[k, :3].reshape(made.z.shape if made.z.size == 3 else (3, 1)))
     return np.asarray(made.x)
@@ -139,7 +140,8 @@ def by_stonesoup(problem: Problem) -> FloatArray:
     began = datetime(2026, 1, 1)
     state = GaussianState(mean.reshape(-1, 1), cov, began)
     for k in range(1, PYTHON_STEPS + 1):
-        inputs["before"], inputs["now"] = problem.readings[k - 1], problem.readings[k]
+        inputs["before"] = problem.readings[k - 1]
+        inputs["now"] = problem.readings[k]
         moment = began + timedelta(seconds=k * problem.gone)
         told = Detection(problem.readings[k, :3].reshape(-1, 1), timestamp=moment)
         state = updater.update(SingleHypothesis(predictor.predict(state, moment), told))

@@ -30,7 +30,8 @@ def public() -> list[Figure]:
     it. Return the time [µs] to read one cell, the time [µs] to add one visit (pass of a vehicle
     through a cell), and the ratios of both times to those of a map that shows every visit at once.
     """
-    private, public = _Map(1), _Map(LEAST)
+    private = _Map(1)
+    public = _Map(LEAST)
     seen, plain = (1e6 * s / CELLS for s in time_in_turn(public.read, private.read))
     # Each measurement has one warm-up pass and ROUNDS timed passes.
     followed, fused = (1e6 * s / CELLS for s in time_in_turn(public.drive, private.drive, ROUNDS))

@@ -120,7 +120,9 @@ def drive(endpoint: str) -> None:
         turn, vehicle = divmod(sent, TILES)
         name, place, message = cars[vehicle]
         now = time.time_ns()
-        message.seq, message.leave_time[0], message.enter_time[0] = turn + 1, now, now - SECOND
+        message.seq = turn + 1
+        message.leave_time[0] = now
+        message.enter_time[0] = now - SECOND
         acks.put[name, turn + 1] = time.perf_counter()
         session.put(
             place,

@@ -164,7 +164,8 @@ def _write_states(root: Path, rows: int) -> None:
         part = {name: column[:n].copy() for name, column in model.items()}
         order = at + np.arange(n)
         part["time"] = START_NS + order * (DAYS * DAY_NS // rows) // 1000 * 1000
-        part["boot"], part["row"] = part["boot"] * 0 + 7, (order % 2).astype(np.int32)
+        part["boot"] = part["boot"] * 0 + 7
+        part["row"] = (order % 2).astype(np.int32)
         part["vehicle"] = np.array([f"{one:016x}" for one in (order // 2 % 1000 + 1).tolist()])
         part["seq"] = order // 2 // 1000 + 1
         part["first_held"] = np.maximum(part["seq"] - 5, 1)

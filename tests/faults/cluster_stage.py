@@ -155,7 +155,9 @@ class Asking:
         self._say = say
         self._router = ZenohSettings(connect=[endpoint])
         self._box = box
-        self.whole = self.unserved = self.silent = 0
+        self.whole = 0
+        self.unserved = 0
+        self.silent = 0
         self._stop = threading.Event()
         self._known = self._read_cells()[0]
         assert len(self._known) > 100, "the box is empty"

@@ -68,7 +68,8 @@ class Reading:
     """
 
     def __init__(self, root: Path, writing: Writing) -> None:
-        self.reads = self.incomplete = 0
+        self.reads = 0
+        self.incomplete = 0
         self._root = root
         self._writing = writing
         self._stop = threading.Event()

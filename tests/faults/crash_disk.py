@@ -59,7 +59,8 @@ class CrashDisk:
         for folder, folders, files in os.walk(live):
             self._names[folder] = dict.fromkeys(folders, FOLDER)
             for name in files:
-                self._names[folder][name] = number = self._number_file(Path(folder) / name)
+                number = self._number_file(Path(folder) / name)
+                self._names[folder][name] = number
                 self._synced[number] = (Path(folder) / name).read_bytes()
 
     def _count_operation(self, *, needs_room: bool) -> None:

@@ -82,8 +82,10 @@ def rows_of(batches: list[Batch]) -> Rows:
         "region": seq * 0 + 1,
         "first_held": seq * 0 + 1,
     }
-    rows["vehicle"], rows["late"] = np.full(n, VEHICLE.to_bytes(8).hex()), np.zeros(n, bool)
-    rows["cell"], rows[layout.TIME[kind]] = CELLS[row], START + seq
+    rows["vehicle"] = np.full(n, VEHICLE.to_bytes(8).hex())
+    rows["late"] = np.zeros(n, bool)
+    rows["cell"] = CELLS[row]
+    rows[layout.TIME[kind]] = START + seq
     return rows
 
 

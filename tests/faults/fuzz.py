@@ -93,7 +93,8 @@ def run(site: Site) -> list[Figure]:
     for turn in range(count // TURN):
         messages = []
         queries = []
-        now = mutants.now = began + turn * SECOND
+        now = began + turn * SECOND
+        mutants.now = now
         for place in range(TURN):
             if place % ASKED_EVERY:
                 messages.append(mutants.make_message())
@@ -203,7 +204,9 @@ def _count_archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
     """Return the numbers of rows, of impossible rows, and of rows of the honest vehicles in all
     files of the archive.
     """
-    rows = impossible = found = 0
+    rows = 0
+    impossible = 0
+    found = 0
     honest = _list_pseudonyms(root, began) | _list_pseudonyms(root, now)
     for file in sorted(root.rglob("*.parquet")):
         table = ds.dataset(file, partitioning=None).to_table()

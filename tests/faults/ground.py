@@ -75,7 +75,8 @@ class Ground:
         )
         self.honest = Listener(self.open_session(HONEST), (keys.ack_key(HONEST),))
         self._probe = self.open_session(SERVICE)
-        self._marks = self._seq = 0
+        self._marks = 0
+        self._seq = 0
 
     def open_session(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
         """Open a Zenoh session with the certificate of `name` at the router `router`. The keywords

@@ -100,10 +100,8 @@ def make_visits(
     columns["latitude"], columns["longitude"] = (centre + span * rng.random(n) for centre in PLACE)
     columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
     columns["sector"] = grid.sector_of(columns["yaw"]).astype(np.int8)
-    columns["mu_lower"], columns["mu_upper"] = (
-        columns["mu"] - np.float32(0.1),
-        columns["mu"] + np.float32(0.1),
-    )
+    columns["mu_lower"] = columns["mu"] - np.float32(0.1)
+    columns["mu_upper"] = columns["mu"] + np.float32(0.1)
     columns["leave_time"] = np.full(n, now, np.int64)
     columns["enter_time"] = columns["leave_time"] - rng.integers(300_000_000, 900_000_000, n)
     seen = -0.5 * np.square((mugrid.CENTRES - columns["mu"][:, None]) / 0.1)

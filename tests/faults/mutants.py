@@ -174,7 +174,8 @@ def _make_states() -> Any:  # noqa: ANN401
     state = pb.StateBatch.FromString(wire.encode(whole_batch(Kind.STATE)))
     state.region = REGION
     state.first_held = 1
-    state.latitude[:], state.longitude[:] = [57.7] * len(state.time), [11.97] * len(state.time)
+    state.latitude[:] = [57.7] * len(state.time)
+    state.longitude[:] = [11.97] * len(state.time)
     return state
 
 

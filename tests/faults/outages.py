@@ -113,7 +113,9 @@ def disk_full(site: Site) -> list[Figure]:
     acknowledged without being stored, and everything must be acknowledged later.
     """
     full_s = site.choose_amount(10, 2)
-    false_acks = recovered = waiting = 0
+    false_acks = 0
+    recovered = 0
+    waiting = 0
     with open_stage(site.folder) as there:
         _load_agents(there, 2)
         for parts in ([there.service], there.loads, there.parts[1:]):

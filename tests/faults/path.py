@@ -110,7 +110,8 @@ def _drive_teleports(site: Site, count: int) -> tuple[int, int]:
     """
     rng = np.random.default_rng(site.seed)
     start = time.time_ns() - 7200 * SECOND
-    fused = excluded = 0
+    fused = 0
+    excluded = 0
     with closing(Engine(ServiceConfig(), site.folder / "teleports")) as engine:
         for number in range(count):
             name = f"car-{number:04}"

@@ -47,7 +47,8 @@ def run(site: Site) -> list[Figure]:
     batches, newest = _write_archive(site.folder)
     whole = newest.read_bytes()
     rng = np.random.default_rng(site.seed)
-    lost = tried = 0
+    lost = 0
+    tried = 0
     for damaged in _make_damages(whole, rng, site.choose_amount(1, 97)):
         newest.write_bytes(damaged)
         lost += _count_lost(site.folder, batches)

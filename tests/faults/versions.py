@@ -49,7 +49,9 @@ def run(site: Site) -> list[Figure]:
         for path in new.glob(pattern):
             rewrite_file(path, with_columns, "1.7")
             changed += 1
-    aside = lost = looks = 0
+    aside = 0
+    lost = 0
+    looks = 0
     difference = 0.0
     for root, made in ((old, made_old), (new, made_new)):
         for turn in range(3):

@@ -119,7 +119,8 @@ def _find_delay(
     """
     most = round(LONGEST_S * RATE_HZ)
     among = among.copy()
-    among[: most + 1] = among[len(among) - most - 1 :] = False
+    among[: most + 1] = False
+    among[len(among) - most - 1 :] = False
     if among.sum() < LEAST_S * RATE_HZ:
         return None
     left = side - smooth_twice(side, SLOW_S)

@@ -95,7 +95,8 @@ class LiveRows:
         self._next = 0  # number of the next row
         self._date_ns: int | None = None
         # Number of rows left out, and of readings that arrived after their row was sent.
-        self.skipped = self.late = 0
+        self.skipped = 0
+        self.late = 0
         # Speed over ground of the rows of the last block (T,) [m/s].
         self.ground: FloatArray = np.zeros(0)
 

@@ -95,7 +95,8 @@ def control_slip(
     if min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3]) > 0.0:
         low = min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3])
     if low > 0.0:
-        x[Motion.LIMIT + 2] = x[Motion.LIMIT + 3] = low
+        x[Motion.LIMIT + 2] = low
+        x[Motion.LIMIT + 3] = low
 
 
 @compiled
@@ -112,7 +113,8 @@ def modulate(
     slip = wheels[Wheel.SLIP, i]
     pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
     if demanded <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
-        x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
+        x[Motion.LIMIT + i] = 0.0
+        x[Motion.PEAK + i] = 0.0
     elif slip < -limit:
         now = demanded if x[Motion.LIMIT + i] <= 0.0 else min(x[Motion.LIMIT + i], demanded)
         if x[Motion.PEAK + i] <= 0.0:
@@ -124,7 +126,8 @@ def modulate(
         x[Motion.LIMIT + i] *= math.exp((BUILD_FAST if fast else BUILD) * pace)
         x[Motion.PEAK + i] = -abs(x[Motion.PEAK + i])
         if x[Motion.LIMIT + i] >= demanded:
-            x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
+            x[Motion.LIMIT + i] = 0.0
+            x[Motion.PEAK + i] = 0.0
 
 
 @compiled
@@ -146,7 +149,8 @@ def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, wheels: FloatArray, d
     Return True if traction control acts now. It acts if the vehicle has traction control, and a
     wheel slips too much because it spins or because drag torque slows it.
     """
-    acts = drags = False
+    acts = False
+    drags = False
     for i in range(4):
         spin = spin_excess(x, p, wheels, i)
         if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (

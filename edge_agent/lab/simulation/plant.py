@@ -289,7 +289,8 @@ def turn_wheels(
         x[Motion.OMEGA + i] = omega + dt * excess / (p[Parameter.WHEEL_INERTIA] + dt * damping)
     if p[Parameter.REAR_LOCKED] > 0.0:
         mean = 0.5 * (x[Motion.OMEGA + 2] + x[Motion.OMEGA + 3])
-        x[Motion.OMEGA + 2] = x[Motion.OMEGA + 3] = mean
+        x[Motion.OMEGA + 2] = mean
+        x[Motion.OMEGA + 3] = mean
 
 
 @compiled
@@ -300,7 +301,9 @@ def is_held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
     if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
     along, across, share = gravity(u)
-    brake = pull = grip = 0.0
+    brake = 0.0
+    pull = 0.0
+    grip = 0.0
     for i in range(4):
         brake += u[Control.BRAKE, i] / p[Parameter.RADIUS]
         pull += u[Control.DRIVE, i] / p[Parameter.RADIUS]
@@ -318,7 +321,9 @@ def settle_standing(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> N
     and inputs.
     """
     along, across, _ = gravity(u)
-    x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
+    x[Motion.VX] = 0.0
+    x[Motion.VY] = 0.0
+    x[Motion.YAW_RATE] = 0.0
     x[Motion.OMEGA : Motion.OMEGA + 4] = 0.0
     x[Motion.SLIP_X : STATES] = 0.0
     follow = min(dt / p[TrueParameter.LAG], 1.0)

@@ -95,7 +95,9 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
     record[RecordColumn.AY] = -across
     record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
     record[RecordColumn.AY_FELT] = -across + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
-    record[RecordColumn.YAW_RATE] = record[RecordColumn.VX] = record[RecordColumn.VY] = 0.0
+    record[RecordColumn.YAW_RATE] = 0.0
+    record[RecordColumn.VX] = 0.0
+    record[RecordColumn.VY] = 0.0
     for i in range(4):
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
         record[RecordColumn.OMEGA + i] = 0.0

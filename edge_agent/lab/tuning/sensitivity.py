@@ -117,7 +117,10 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
     not count for `found`.
     """
     scores = []
-    cried = grippy = warned = slippery = 0
+    cried = 0
+    grippy = 0
+    warned = 0
+    slippery = 0
     for batch, excited in drives:
         estimates, score = run_filter(batch, design)
         scores.append(score.mean(axis=0))

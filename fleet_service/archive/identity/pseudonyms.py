@@ -63,13 +63,15 @@ class Pseudonyms:
         month = self._month(time // _DAY_NS)
         known = self._known.get(month)
         if known is None:
-            known = self._known[month] = {}
+            known = {}
+            self._known[month] = known
             if len(self._known) > MONTHS_KNOWN:
                 del self._known[min(self._known)]
         pseudonym = known.get(vehicle)
         if pseudonym is None:
             digest = blake2b(vehicle.encode(), key=self._key(month), digest_size=_DIGEST_BYTES)
-            pseudonym = known[vehicle] = digest.hexdigest()
+            pseudonym = digest.hexdigest()
+            known[vehicle] = pseudonym
         return pseudonym
 
     def boot(self, vehicle: str, boot: int, time: int) -> int:
@@ -87,7 +89,8 @@ class Pseudonyms:
     def _month(self, day: int) -> str:
         month = self._month_of_day.get(day)
         if month is None:
-            month = self._month_of_day[day] = f"{datetime.fromtimestamp(day * 86400, UTC):%Y-%m}"
+            month = f"{datetime.fromtimestamp(day * 86400, UTC):%Y-%m}"
+            self._month_of_day[day] = month
         return month
 
     def month(self, time: int) -> str:

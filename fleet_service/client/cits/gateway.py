@@ -67,7 +67,8 @@ class Witness:
         self._clock = clock
         self._boot = secrets.randbits(63)
         self._seq = 1
-        self.refused = self.silent = 0
+        self.refused = 0
+        self.silent = 0
 
     def close(self) -> None:
         """Close the publisher's Zenoh session."""

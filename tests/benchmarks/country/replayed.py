@@ -140,7 +140,8 @@ class Country:
         message.vehicle = f"car-{vehicle:06}"
         message.boot = boot
         message.region = self.region_id(k)
-        message.seq = message.first_held = turn + 1
+        message.seq = turn + 1
+        message.first_held = turn + 1
         message.cell[:] = grid.interleave(chunk.cell_x + x0, chunk.cell_y + y0).tolist()
         message.longitude[:] = ((chunk.x + x0) / side * 360.0 - 180.0).tolist()
         message.latitude[:] = np.degrees(

@@ -81,7 +81,8 @@ def main() -> int:
     boot = time.time_ns()
     rate = asked.vehicles / PERIOD_S
     encoding = wire.ENCODING[Kind.OBSERVATION]
-    began = said = time.monotonic()
+    began = time.monotonic()
+    said = began
     late = 0.0
     for number in range(int(asked.seconds * rate)):
         due = began + number / rate

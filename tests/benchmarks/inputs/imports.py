@@ -42,7 +42,8 @@ def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
     For every shipped profile with a CAN database, frames of random bytes are decoded, and also the
     frames of the log `recorded` if it is given.
     """
-    wrong = compared = 0
+    wrong = 0
+    compared = 0
     rng = np.random.default_rng(seed)
     for name in shipped_profiles():
         profile, folder = load_profile(name)

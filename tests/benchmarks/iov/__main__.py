@@ -56,7 +56,8 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
         )
     )
     closed = [{"lat": a, "lon": b} for a, b in middles.tolist()]
-    cases = avoided = 0
+    cases = 0
+    avoided = 0
     error_s = 0.0
     longer = list[float]()
     for _ in range(20 if quick else 60):
@@ -148,7 +149,8 @@ def _decode(text: str) -> np.ndarray[Any, Any]:
         shift += 5
         if bits < 32:
             numbers.append(~(value >> 1) if value & 1 else value >> 1)
-            value = shift = 0
+            value = 0
+            shift = 0
     return np.cumsum(np.array(numbers).reshape(-1, 2), axis=0) / 1e6
 
 

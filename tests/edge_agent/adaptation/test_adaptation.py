@@ -36,7 +36,8 @@ def test_noise_grows_where_innovations_exceed_their_theory() -> None:
 
 
 def test_noise_factor_stays_in_bounds_during_a_long_mismatch() -> None:
-    high = low = 1.0
+    high = 1.0
+    low = 1.0
     for _ in range(1000):
         high = adapted_factor(high, 100.0, 1.0, INPUTS, OUTPUTS)
         low = adapted_factor(low, 0.0, 1.0, INPUTS, OUTPUTS)

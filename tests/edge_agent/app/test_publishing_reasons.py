@@ -46,7 +46,8 @@ def block(position: bool = True, wheels: float = 20.0) -> Block:
     signals = np.full((10, 1, len(CHANNELS)), np.nan)
     signals[..., S.OMEGA : S.OMEGA + 4] = wheels
     if position:
-        signals[..., S.LATITUDE], signals[..., S.LONGITUDE] = 57.7, 11.97
+        signals[..., S.LATITUDE] = 57.7
+        signals[..., S.LONGITUDE] = 11.97
     return Block(np.zeros((10, 1)), np.zeros((10, 1), np.int64), signals)
 
 

@@ -16,7 +16,9 @@ from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS, S
 
 VAN = PRESETS["van"].vehicle
-FRONT, REAR, NONE = 0, 1, -1
+FRONT = 0
+REAR = 1
+NONE = -1
 PULLING = 1.0  # [m/s^2] acceleration at which the tyres certainly drive the car
 RATE_HZ = 100
 

@@ -57,8 +57,10 @@ def test_road_stays_the_same_while_a_wheel_slides_with_the_same_force(
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design_of(Memberships(), adaptive=True))
     memory = records(MixtureMemory, 1)
-    memory["weight"][0, 6] = memory["visit_weight"][0, 6] = 1.0
-    memory["friction_left"]["median"] = memory["friction_right"]["median"] = 0.25
+    memory["weight"][0, 6] = 1.0
+    memory["visit_weight"][0, 6] = 1.0
+    memory["friction_left"]["median"] = 0.25
+    memory["friction_right"]["median"] = 0.25
     memory["slip"]["held"] = slides
     context["scratch"]["features"]["new"] = new
     apply_road_change(
@@ -76,7 +78,8 @@ def test_a_node_that_only_its_neighbours_keep_alive_has_no_penalty() -> None:
     design = design_of(Memberships(), adaptive=True)
     put_record(context["design"][0], design)
     memory = records(MixtureMemory, 1)
-    memory["weight"][0, :NODES] = memory["visit_weight"][0, :NODES] = design.prior
+    memory["weight"][0, :NODES] = design.prior
+    memory["visit_weight"][0, :NODES] = design.prior
     memory["weight"][0, ALONE] = 1e-9
     memory["penalty"] = 50.0
     apply_road_change(

@@ -142,8 +142,10 @@ def test_prediction_is_the_textbook_one() -> None:
     before = covariances(0)
     after = before.copy()
     gain = records(VelocityGain, 1)[0]
-    gain["leak_y"]["x"], gain["leak_y"]["y"] = 0.3, -0.7
-    gain["unit"]["x"], gain["unit"]["y"] = 0.05, 0.002
+    gain["leak_y"]["x"] = 0.3
+    gain["leak_y"]["y"] = -0.7
+    gain["unit"]["x"] = 0.05
+    gain["unit"]["y"] = 0.002
     keep = rng.uniform(0.5, 1.0, STATES)
     noise = rng.uniform(0.0, 0.1, STATES)
     angle = 0.2
@@ -151,7 +153,8 @@ def test_prediction_is_the_textbook_one() -> None:
     predict_covariance(after, np.zeros((2, STATES, LANES)), gain, turn, keep, noise)
     f = np.diag(keep)
     f[:2] = 0.0
-    f[0, :2], f[1, :2] = (turn[0], turn[1]), (-turn[1], turn[0])
+    f[0, :2] = (turn[0], turn[1])
+    f[1, :2] = (-turn[1], turn[0])
     f[:2, NodeState.LEAK_Y] = -0.3, 0.7
     f[:2, [NodeState.BIAS_X, NodeState.SLOPE]] = [[-0.05], [-0.002]]
     f[:2, [NodeState.BIAS_Y, NodeState.BANK]] = [[0.002], [-0.05]]

@@ -27,7 +27,8 @@ def filter_at(vx: float, vy: float, vy_std: float) -> RecordArray:
     memory = records(MixtureMemory, 1)
     memory["nominal"]["std"] = 1.0
     memory["rolling"]["ahead"] = SPEED
-    memory["rolling"]["ahead_std"] = memory["rolling"]["left_std"] = 0.1
+    memory["rolling"]["ahead_std"] = 0.1
+    memory["rolling"]["left_std"] = 0.1
     memory["overall_mean"][0, NodeState.VX] = vx
     memory["overall_mean"][0, NodeState.VY] = vy
     memory["overall_covariance"][0, NodeState.VY, NodeState.VY] = vy_std**2
@@ -56,7 +57,8 @@ def test_motion_is_reset_where_the_filter_is_unsure(
 
 def test_reset_forgets_the_slips_that_a_wrong_velocity_gave() -> None:
     memory = filter_at(SPEED + 3.0, 0.0, 0.1)
-    memory["built_along"], memory["built_across"] = -0.3, 0.2
+    memory["built_along"] = -0.3
+    memory["built_across"] = 0.2
     reset(memory)
     assert not memory["built_along"].any()
     assert not memory["built_across"].any()

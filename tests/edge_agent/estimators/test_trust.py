@@ -35,7 +35,8 @@ CONSTANTS = Constants()
 
 def believing(*, strained: float = 1.0, odd: float = 0.0) -> Trust:
     trust = records(Trust, 1)
-    trust["strain"], trust["odd"] = strained, odd
+    trust["strain"] = strained
+    trust["odd"] = odd
     return cast(Trust, trust[0])  # a kernel gets one element of the record array
 
 
@@ -135,7 +136,8 @@ def test_a_reset_counts_half_unless_it_is_explained(
     memory = bank._filters[0]
     memory["overall_mean"][NodeState.VX] = speed
     memory["slip"]["held"] = held  # a wheel slides
-    memory["trust"]["odd"] = memory["trust"]["ratio"] = 0.0
+    memory["trust"]["odd"] = 0.0
+    memory["trust"]["ratio"] = 0.0
     update_consistency(memory, bank._contexts["design"][0], 0.05, 0.0, flags.RESET)
     expected = share * CONSTANTS.chosen.odd_least
     assert float(memory["trust"]["odd"]) == pytest.approx(expected, rel=0.1, abs=0.01)

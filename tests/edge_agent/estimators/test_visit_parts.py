@@ -21,7 +21,8 @@ def one_visit(name: str, mu: float | None, seed: int) -> tuple[np.ndarray, Estim
     """
     t, signals, vehicle = drive(name, mu, seed)
     closes = np.zeros((len(t), 1), np.bool_)
-    closes[0] = closes[-1] = True
+    closes[0] = True
+    closes[-1] = True
     return t, bank_of(DEFAULT, [vehicle]).advance(t[:, None], signals[:, None], closes)
 
 

@@ -76,7 +76,8 @@ def test_alignment_moves_readings_back_by_their_delay(drive: Recorded) -> None:
 def test_locked_rear_axle_is_recognised_and_freed(drive: Recorded) -> None:
     signals = drive.signals.copy()
     mean = signals[:, OMEGA[2:]].mean(axis=1)
-    signals[:, OMEGA[2]] = signals[:, OMEGA[3]] = mean
+    signals[:, OMEGA[2]] = mean
+    signals[:, OMEGA[3]] = mean
     adopted = adopt_measured(replace(log_of(drive), signals=signals), drive.vehicle)
     assert adopted.vehicle.rear_axle_locked
     apart = adopted.log.signals[:, OMEGA[3]] - adopted.log.signals[:, OMEGA[2]]

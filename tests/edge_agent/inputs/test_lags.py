@@ -94,7 +94,8 @@ def test_correlation_by_spectra_equals_that_of_each_shift() -> None:
     left[300:340] = np.nan
     right[[5, 200, 201, 690]] = np.nan
     among = rng.random(n) < 0.8
-    among[: most + 1] = among[n - most - 1 :] = False
+    among[: most + 1] = False
+    among[n - most - 1 :] = False
     found = correlate_by_spectra(left, right, among, most)
     for k in range(-most, most + 1):
         other = np.roll(right, k)

@@ -181,7 +181,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     told = []
     for felt in (0.1, 0.8, np.nan):
         signals = block.signals.copy()
-        signals[..., S.AX], signals[..., S.AY] = -felt * GRAVITY, 0.0
+        signals[..., S.AX] = -felt * GRAVITY
+        signals[..., S.AY] = 0.0
         _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
         reading = cast("Estimates", used)
         _, records, _ = build_records(
@@ -205,7 +206,8 @@ def observe_grip(observed: np.ndarray, east: np.ndarray, fix_every: int = 10) ->
     block = ground(east, flat, flat, rate_hz=100.0, fix_every=fix_every)
     reported = estimates(len(east), 1, used=0.9)
     signals = block.signals.copy()
-    signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
+    signals[:, 0, S.AX] = -GRAVITY * observed
+    signals[..., S.AY] = 0.0
     _, located = locate_vehicles(Watch.of(1).tracks, block.t, signals)
     reading = cast("Estimates", type(reported)(**{**vars(reported), "vx": flat + 10.0, "vy": flat}))
     _, records, _ = build_records(
@@ -277,7 +279,8 @@ def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     jumps = np.zeros((samples, 1), np.bool_)
     evidence[located.closes[:, 0], 0] = dry
     jump = (first + second) // 2
-    evidence[jump, 0], jumps[jump] = ice, True
+    evidence[jump, 0] = ice
+    jumps[jump] = True
     made = {"evidence": evidence, "jumps": jumps, "mu_utilised": np.full((samples, 1), 0.7)}
     reported = type(reported)(**{**vars(reported), **made})
     watch = Watch.of(1)

@@ -43,7 +43,8 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
         rng.integers(0, vehicles, count)
     ]
     rows["estimator"] = np.full(count, "ckf")
-    rows["seq"], rows["first_held"] = np.arange(1, count + 1), np.ones(count, np.int64)
+    rows["seq"] = np.arange(1, count + 1)
+    rows["first_held"] = np.ones(count, np.int64)
     rows["boot"] = np.full(count, seed, np.int64)
     if kind is Kind.OBSERVATION:
         rows["enter_time"] = rows["leave_time"] - 10**9

@@ -102,7 +102,8 @@ def test_replay_fuses_late_reports_at_the_same_point() -> None:
     n = 400
     found = RecordedResult(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
     for rows, updated in told:
-        found.late[rows], found.late_by[rows] = updated.late, updated.late_by
+        found.late[rows] = updated.late
+        found.late_by[rows] = updated.late_by
         found.weight[rows] = updated.weight
     again = Fusion(120.0)
     first = again.update(LIVE)

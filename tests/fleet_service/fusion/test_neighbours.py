@@ -174,7 +174,8 @@ def test_no_message_crosses_a_known_border(grip_s: float, *, is_known: bool) -> 
     o = observations(seconds, np.arange(8), value([0.15] * 4 + [0.75] * 4, 0.05))
     o.cell[:4] = east(1)
     order = np.argsort(seconds)
-    among, alone = Fusion(120.0), Fusion(120.0)
+    among = Fusion(120.0)
+    alone = Fusion(120.0)
     among.update(o.take(order))
     alone.update(o.take(order[order >= 4]))
     assert np.array_equal(belief(among), belief(alone)) == is_known

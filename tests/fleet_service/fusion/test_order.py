@@ -90,7 +90,8 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     weight = np.zeros(3000, np.float32)
     late_by = np.zeros(3000, np.int64)
     for rows, updated in told:
-        late[rows], weight[rows] = updated.late, updated.weight
+        late[rows] = updated.late
+        weight[rows] = updated.weight
         late_by[rows] = updated.late_by
     assert 0 < late.sum() < 2000
     assert len(np.unique(weight)) > 5

@@ -72,7 +72,8 @@ def test_fifty_bounds_that_fall_by_half_a_nat_are_noise() -> None:
 
 def test_a_larger_fall_of_a_bound_is_evidence_against_high_friction_only() -> None:
     bound = at_least(np.full(5, 0.2))
-    flat, fallen = Fusion(120.0), Fusion(120.0)
+    flat = Fusion(120.0)
+    fallen = Fusion(120.0)
     for fusion, fall in ((flat, 0.0), (fallen, 0.9)):
         falling = bound - np.where(mugrid.CENTRES > 0.5, fall, 0.0)
         fusion.update(observations(5.0 * np.arange(5), np.arange(5), falling))

@@ -156,7 +156,9 @@ def test_cars_that_stood_where_ice_appeared_are_judged_apart() -> None:
 
 def test_slides_are_bridged_and_have_a_least_length() -> None:
     theta = np.zeros((400, 4))
-    theta[100:108, 1] = theta[112:130, 2] = theta[300:305, 0] = 3.0
+    theta[100:108, 1] = 3.0
+    theta[112:130, 2] = 3.0
+    theta[300:305, 0] = 3.0
     assert slides_of(theta) == [(100, 130)]
     assert runs_of(bridge_gaps(np.asarray(theta.any(axis=1)), 1.0)) == [(100, 130), (300, 305)]
 

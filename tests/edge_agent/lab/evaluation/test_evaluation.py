@@ -91,12 +91,11 @@ def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
         truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
     )
     output[..., Column.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
-    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = (
-        mu,
-        lower,
-        upper,
-    )
-    output[..., Column.VX_STD : Column.MU], output[..., Column.INNOVATION_NIS] = 1.0, 1.0
+    output[..., Column.MU] = mu
+    output[..., Column.MU_LOWER] = lower
+    output[..., Column.MU_UPPER] = upper
+    output[..., Column.VX_STD : Column.MU] = 1.0
+    output[..., Column.INNOVATION_NIS] = 1.0
     return Estimates(output)
 
 

@@ -36,11 +36,9 @@ def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
     output = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
         output[..., column] = batch.truth[f"true_{name}"]
-    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = (
-        (lower + upper) / 2,
-        lower,
-        upper,
-    )
+    output[..., Column.MU] = (lower + upper) / 2
+    output[..., Column.MU_LOWER] = lower
+    output[..., Column.MU_UPPER] = upper
     output[..., Column.VX_STD : Column.MU] = 1.0
     output[..., Column.P_SLIPPERY] = upper < SLIPPERY_MU
     return Estimates(output)

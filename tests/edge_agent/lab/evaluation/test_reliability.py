@@ -114,7 +114,8 @@ def test_consistency_is_one_for_the_right_spread_and_zero_for_a_tenth(
     found = consistency(turning, right)
     assert found["nees_within"][0] == pytest.approx(0.95, abs=0.03)
     assert found["nis_within"][0] == pytest.approx(0.95, abs=0.03)
-    wrong.vx_std[:], wrong.vy_std[:] = 0.1 * reported.vx_std, 0.1 * reported.vy_std
+    wrong.vx_std[:] = 0.1 * reported.vx_std
+    wrong.vy_std[:] = 0.1 * reported.vy_std
     assert consistency(turning, wrong)["nees_within"][0] < 0.05
 
 

@@ -40,16 +40,15 @@ def some_instant(
     x = np.zeros(STATES)
     u = np.zeros((len(Control), 4))
     w = np.zeros((len(Wheel), 4))
-    x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = (
-        rng.uniform(3, 30),
-        rng.normal(0, 1),
-        rng.normal(0, 0.4),
-    )
+    x[Motion.VX] = rng.uniform(3, 30)
+    x[Motion.VY] = rng.normal(0, 1)
+    x[Motion.YAW_RATE] = rng.normal(0, 0.4)
     x[Motion.OMEGA : Motion.OMEGA + 4] = (
         x[Motion.VX] / p[Parameter.RADIUS] * rng.uniform(0.8, 1.2, 4)
     )
     x[Motion.AX_LAGGED], x[Motion.AY_LAGGED] = rng.uniform(-4, 4, 2)
-    u[Control.STEER], u[Control.MU] = rng.normal(0, 0.1, 4), mu
+    u[Control.STEER] = rng.normal(0, 0.1, 4)
+    u[Control.MU] = mu
     wheel_forces(x, p, u, w)
     return x, p, u, w
 

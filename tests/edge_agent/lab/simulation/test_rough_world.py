@@ -64,7 +64,9 @@ def still(
     u = np.zeros((INPUTS, 4))
     w = np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 0.0)
-    u[Control.MU], u[Control.TILT, 0], u[Control.TILT, 1] = mu, slope, bank
+    u[Control.MU] = mu
+    u[Control.TILT, 0] = slope
+    u[Control.TILT, 1] = bank
     return x, p, u, w
 
 
@@ -117,7 +119,8 @@ def test_coasting_vehicle_gains_only_its_lost_potential_energy(slope: float) -> 
     u = np.zeros((INPUTS, 4))
     w = np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 15.0)
-    u[Control.MU], u[Control.TILT, 0] = 0.9, slope
+    u[Control.MU] = 0.9
+    u[Control.TILT, 0] = slope
     command(p, u, 0.0, 0.0)
 
     def energy() -> float:
