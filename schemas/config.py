@@ -290,7 +290,7 @@ class ServiceConfig(MonitoringSettings):
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def moment(text: str, field: str) -> int:
+def parse_moment(text: str, field: str) -> int:
     """Convert `text`, an ISO 8601 date with or without a time of day, to nanoseconds since 1970. A
     time without a zone is UTC. Error messages call the parameter `field`.
 
@@ -319,7 +319,7 @@ def nanoseconds(time: datetime) -> int:
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def load(path: Path | str | None, model: type[Model], field: str = "config") -> Model:
+def load_config(path: Path | str | None, model: type[Model], field: str = "config") -> Model:
     """Read a configuration file (JSON), and return its settings as an object of the class `model`.
     If `path` is None, return the default settings. Error messages about the file call it `field`.
 
@@ -337,7 +337,7 @@ def load(path: Path | str | None, model: type[Model], field: str = "config") -> 
             field, f"cannot read {path} ({error.strerror})", "give the path of a JSON file"
         ) from error
     except ValidationError as error:
-        raise explain(error, f"configuration {path}", model) from error
+        raise explain_validation_error(error, f"configuration {path}", model) from error
 
 
 def require_unique_names(text: bytes, where: str) -> None:
@@ -356,7 +356,9 @@ def require_unique_names(text: bytes, where: str) -> None:
         raise InputError(repeated[0][:60], "is given more than once", f"keep one in the {where}")
 
 
-def explain(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
+def explain_validation_error(
+    error: ValidationError, where: str, model: type[BaseModel]
+) -> InputError:
     """Convert an unknown name, or else the first validation error that pydantic reports, to an
     InputError. It names the wrong field, and asks for a correction in `where` (source of the values
     of the class `model`). For a misspelt name it proposes the most similar name.

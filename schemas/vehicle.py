@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from schemas.config import explain, require_unique_names
+from schemas.config import explain_validation_error, require_unique_names
 from schemas.errors import InputError
 from schemas.thresholds import GRAVITY
 from schemas.vehicle_classes import PREFIX, fields_of_class
@@ -205,7 +205,7 @@ def load_vehicle(path: Path | str) -> Vehicle:
         fix = f"name a vehicle file; of a simulated drive, simulate --vehicle-out {path} writes it"
         raise InputError("vehicle", f"cannot read {path} ({error.strerror})", fix) from error
     except ValidationError as error:
-        raise explain(error, f"vehicle file {path}", Vehicle) from error
+        raise explain_validation_error(error, f"vehicle file {path}", Vehicle) from error
     wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
     gyration = math.sqrt(vehicle.yaw_inertia / vehicle.mass)
     if not LEAST_GYRATION < gyration / wheelbase < MOST_GYRATION:

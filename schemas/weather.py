@@ -42,14 +42,14 @@ class Report:
     prior: NDArray[np.float64] | None = None
 
 
-def encode(report: Report) -> bytes:
+def encode_report(report: Report) -> bytes:
     """Return the protobuf bytes of a weather report."""
     known = {name: getattr(report, name) for name in RANGES if not np.isnan(getattr(report, name))}
     prior = [] if report.prior is None else np.asarray(report.prior).tolist()
     return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()
 
 
-def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
+def decode_report(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
     """Read a report from protobuf or JSON, and validate it.
 
     Raises:
@@ -59,13 +59,15 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
     message: Any = wire.parse(payload, encoding, pb.Weather, wire.WEATHER_ENCODING)
     values = {name: getattr(message, name) if message.HasField(name) else np.nan for name in RANGES}
     prior = np.array(message.prior, np.float64) if len(message.prior) else None
-    problem = broken(values, prior)
+    problem = find_report_error(values, prior)
     if problem is not None:
         raise problem
     return Report(message.time, prior=prior, **values)
 
 
-def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
+def find_report_error(
+    values: dict[str, float], prior: NDArray[np.float64] | None
+) -> WireError | None:
     """Return an error for the first rule that a weather report violates; None if the report is
     valid. `values` are the report's numbers by name, `prior` its friction distribution (32,) or
     None.

@@ -50,8 +50,8 @@ def main(command_line: list[str]) -> int:
     argument_parser = argparse.ArgumentParser(prog="tests.branch_coverage")
     argument_parser.add_argument("data", type=Path, help="combined data file of `coverage`")
     measured_figures = measure_coverage(argument_parser.parse_args(command_line).data)
-    figures.write(OUTPUT_FILE, "coverage", [], measured_figures)
-    print(figures.markdown(measured_figures))
+    figures.write_figures(OUTPUT_FILE, "coverage", [], measured_figures)
+    print(figures.format_table(measured_figures))
     return 0 if all(figure.holds for figure in measured_figures) else 1
 
 

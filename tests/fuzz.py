@@ -135,7 +135,7 @@ PARSERS: Final = {
     "standing": Parser(wire.decode_standing),
     "tiles": Parser(decode_tile),
     "queries": Parser(_parse_query),
-    "weather": Parser(lambda data: weather.decode(data, wire.JSON)),
+    "weather": Parser(lambda data: weather.decode_report(data, wire.JSON)),
     "keys": Parser(_decode_first(keys.parse)),
     "versions": Parser(_decode_first(parse_version)),
     "dbc": Parser(_decode_first(parse_dbc)),

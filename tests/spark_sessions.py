@@ -35,7 +35,7 @@ def spark_session(count: int) -> Iterator[Any]:
     )
     found = builder.config(map={**spark.SETTINGS}).getOrCreate()
     try:
-        yield spark.session()
+        yield spark.open_session()
     finally:
         found.stop()
 

@@ -306,11 +306,11 @@ def test_the_ending_of_a_file_decides_its_format(tmp_path: Path, capsys: Capture
 
 def test_output_path_is_checked_before_any_computation(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="out: .* is a folder"):
-        commandline.out_folder("out", tmp_path)
+        commandline.check_out_file("out", tmp_path)
     with pytest.raises(InputError, match="out: a.xls has no known ending; use one of .csv"):
-        commandline.ending_of("out", Path("a.xls"), (".csv",))
+        commandline.check_ending("out", Path("a.xls"), (".csv",))
     assert (
-        commandline.ending_of("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet"))
+        commandline.check_ending("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet"))
         == ".geo.parquet"
     )
 

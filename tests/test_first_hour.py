@@ -25,7 +25,7 @@ from fleet_service.analytics import plots, synthetic
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.cli import main as fleet_service_main
 from schemas import keys, wire
-from schemas.config import AgentConfig, ZenohSettings, load
+from schemas.config import AgentConfig, ZenohSettings, load_config
 from schemas.runtime.zenoh_session import open_session
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.fleet_service.conftest import running
@@ -41,7 +41,7 @@ def test_replay_mentions_faulty_signals_and_is_silent_for_sound_ones(tmp_path: P
 
 
 def test_two_cars_of_one_shipped_configuration_have_an_outbox_each() -> None:
-    config = load(ROOT / "deploy" / "agent.json", AgentConfig)
+    config = load_config(ROOT / "deploy" / "agent.json", AgentConfig)
     assert config.spool_of("car-one") != config.spool_of("car-two")
 
 

@@ -45,7 +45,7 @@ def test_every_judged_figure_is_on_the_page_with_its_commit() -> None:
 
 def test_missed_targets_are_first_and_marked(folder: Path) -> None:
     left = folder / "left.json"
-    figures.write(
+    figures.write_figures(
         left,
         "demo",
         [1, 2, 3],
@@ -66,20 +66,22 @@ def test_fault_campaign_is_kept_alone_if_it_is_complete(folder: Path) -> None:
         ("faults --only path", "1 figures"),
         ("faults-quick --only path", "unchanged"),
     ):
-        figures.write(left, title, [0], [Figure("faults.path.teleports", 1000.0, "cars", 100)])
+        figures.write_figures(
+            left, title, [0], [Figure("faults.path.teleports", 1000.0, "cars", 100)]
+        )
         assert said in results.keep_figures("faults", left)
 
 
 def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
     left = folder / "left.json"
-    figures.write(
+    figures.write_figures(
         left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("unshown", 1.0, "")]
     )
     assert results.keep_figures("demo", left).startswith("demo: 1 figures")
-    figures.write(left, "demo", [1], [Figure("demo.b", 0.1, "", 0.12)])
+    figures.write_figures(left, "demo", [1], [Figure("demo.b", 0.1, "", 0.12)])
     assert results.keep_figures("demo", left).startswith("demo: 1 figures")
     assert set(results.read_kept("demo")) == {"demo.a", "demo.b"}
-    figures.write(left, "demo --quick", [1], [Figure("demo.a", 0.5, "")])
+    figures.write_figures(left, "demo --quick", [1], [Figure("demo.a", 0.5, "")])
     assert "unchanged" in results.keep_figures("demo", left)
     assert results.read_kept("demo")["demo.a"]["value"] == 0.955
     assert "run `make demo` first" in results.keep_figures("demo", folder / "none.json")
@@ -87,7 +89,7 @@ def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:
 
 def test_older_run_replaces_no_figure(folder: Path) -> None:
     left = folder / "left.json"
-    figures.write(left, "demo", [1], [Figure("demo.a", 0.5, "", 0.9)])
+    figures.write_figures(left, "demo", [1], [Figure("demo.a", 0.5, "", 0.9)])
     results.keep_figures("demo", left)
     rows = json.loads(left.read_text())
     rows[0]["date"] = "2000-01-01T00:00:00+00:00"

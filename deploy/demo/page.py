@@ -12,7 +12,7 @@ import numpy as np
 from deploy.demo.compare import MapComparison
 from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render
 from schemas import grid
-from schemas.runtime.figures import Figure, row
+from schemas.runtime.figures import Figure, format_row
 
 NAMES = (
     "truth",
@@ -48,7 +48,7 @@ def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> 
         f"{cells.num_rows} cells and directions with a known true friction; {several} of them were "
         "visited by two or more vehicles, and the figures below cover only these."
     )
-    table = [["figure", "value", "bar", ""], *(row(figure) for figure in figures)]
+    table = [["figure", "value", "bar", ""], *(format_row(figure) for figure in figures)]
     path.write_text(
         render("GripMap: the map next to the truth", drawn, GRIP_SCALE, about=about, table=table)
     )

@@ -24,7 +24,7 @@ def check_screenshot(path: Path) -> None:
         InputError: the path is not that of an image in an existing folder, or Chromium or
             Playwright is missing.
     """
-    commandline.ending_of("screenshot", commandline.out_folder("screenshot", path), ENDINGS)
+    commandline.check_ending("screenshot", commandline.check_out_file("screenshot", path), ENDINGS)
     if find_spec("playwright") is None:
         raise InputError("screenshot", "Playwright is missing", install_command("dev"))
     if _find_chromium() is None:

@@ -87,7 +87,7 @@ def report_figures(
     the new ice; return the figures.
     """
     found = [*measured, *grip.figures()]
-    figures.write(folder / "figures.json", "demo", [seed], found)
+    figures.write_figures(folder / "figures.json", "demo", [seed], found)
     image = ""
     # A picture in addition to the page, if matplotlib is installed.
     if find_spec("matplotlib") is not None:
@@ -96,7 +96,7 @@ def report_figures(
         picture.draw_maps(comparison, folder / "map.png", grip)
         image = f"picture {folder}/map.png, "
     page.write_page(comparison, found, folder / "map.html")
-    table = figures.markdown(found)
+    table = figures.format_table(found)
     print(f"\n{grip.line()}\n\n{table}\n", flush=True)
     print(f"{image}page {folder}/map.html, figures {folder}/figures.json", flush=True)
     return found

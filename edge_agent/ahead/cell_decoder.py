@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
@@ -131,13 +132,10 @@ def _check_alert(alert: Alert, tile: int, now: int) -> Alert:
 
 
 def _tile_of_key(key: str, topic: str) -> int:
-    try:
+    parsed = None
+    with suppress(InputError):
         parsed = keys.parse(key)
-    except InputError as error:
-        raise WireError(
-            "key", f"{key[:80]!r} does not name a tile", "publish on the key of the topic"
-        ) from error
-    if parsed.topic.name != topic or parsed.quadint is None:
+    if parsed is None or parsed.topic.name != topic or parsed.quadint is None:
         raise WireError(
             "key", f"{key[:80]!r} does not name a tile", "publish on the key of the topic"
         )

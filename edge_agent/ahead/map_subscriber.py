@@ -183,7 +183,7 @@ class MapSubscriber:
             log.warning("the map cannot be queried: %s", error)
 
     def _on_alert(self, sample: zenoh.Sample) -> None:
-        self._pass_payload(self._hear_alert, str(sample.key_expr), sample.payload.to_bytes())
+        self._pass_payload(self._store_alert, str(sample.key_expr), sample.payload.to_bytes())
 
     def _pass_payload(self, take: Callable[[str, bytes], None], key: str, payload: bytes) -> None:
         self.counts["bytes"] += len(key) + len(payload)
@@ -193,22 +193,22 @@ class MapSubscriber:
             self.counts[f"refused.{error.field}"] += 1
             log.warning("a message on %s is ignored: %s", key, error)
 
-    def _hear_alert(self, key: str, payload: bytes) -> None:
+    def _store_alert(self, key: str, payload: bytes) -> None:
         now = self._clock()
         alert = decode_alert_message(key, payload, now)
         self.counts["alerts"] += 1
         with self._lock:
-            news = self._map.store_alert(alert, now)
-        if news:
+            changed = self._map.store_alert(alert, now)
+        if changed:
             self._urgent([alert.cell * grid.SECTORS + alert.sector])
 
     def _on_standing(self, key: str, payload: bytes) -> None:
         now = self._clock()
         tile, alerts = decode_standing_alerts(key, payload, now)
         with self._lock:
-            news = self._map.store_standing_alerts(tile, alerts, now)
-        if news:
-            self._urgent(news)
+            changed = self._map.store_standing_alerts(tile, alerts, now)
+        if changed:
+            self._urgent(changed)
 
     def _on_cells(self, key: str, payload: bytes) -> None:
         now = self._clock()

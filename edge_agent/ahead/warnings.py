@@ -85,11 +85,11 @@ def update_warnings(
         if before is None:
             if nearest.braking_energy > 0.5 * speed**2:
                 continue
-            warning = _make_warning(_new_name(nearest, pose), "raised", nearest, pose, sure)
+            warning = _make_warning(_new_name(nearest, pose), "raised", nearest, pose, sure=sure)
             issued.append(warning)
             kept[warning.id] = Active(warning, places, pose.time, nearest.start)
         else:
-            warning = _make_warning(before.warning.id, "updated", nearest, pose, sure)
+            warning = _make_warning(before.warning.id, "updated", nearest, pose, sure=sure)
             has_grown = len(places - before.places) >= CHANGED_PLACES
             if has_grown or abs(warning.mu - before.warning.mu) >= CHANGED_MU:
                 issued.append(warning)
@@ -168,7 +168,7 @@ def _new_name(stretch: _Stretch, pose: Pose) -> str:
 
 
 def _make_warning(
-    name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool
+    name: str, state: WarningState, stretch: _Stretch, pose: Pose, *, sure: bool
 ) -> GripWarning:
     horizon = stretch.horizon
     k = stretch.worst

@@ -229,8 +229,8 @@ def backfill_on_spark(
             created.
     """
     folders = {prepare_path("out", task.out).parent for task in tasks}
-    yield from spark.spread(
-        spark.session(),
+    yield from spark.run_tasks(
+        spark.open_session(),
         tasks,
         partial(estimate_atomically, estimator=estimator, memberships=memberships),
     )

@@ -22,6 +22,19 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     """Return all metrics of an agent with their current values. Metrics of records have one value
     per kind of record.
     """
+    return [
+        *_record_metrics(publisher),
+        *_outbox_metrics(publisher),
+        gauge("sessions", "open sessions", publisher.status.links),
+        *link_metrics(publisher.status.link_watches),
+        gauge("blocks_behind", "blocks that were processed too late", progress.behind),
+        gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
+        gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
+    ]
+
+
+def _record_metrics(publisher: Publisher) -> list[Metric]:
+    """Return the metrics of sent records and of the service's answers to them."""
     counts = publisher.counts
     status = publisher.status
     return [
@@ -47,20 +60,7 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         ),
         counter("resent_batches", "batches sent again", counts.resent_batches),
         counter("bad_acks", "acknowledgements that could not be read", counts.bad_acks),
-        counter(
-            "damaged_spools", "times that the outbox was found damaged", status.damage_counts[0]
-        ),
-        counter(
-            "damaged_records",
-            "records lost because the outbox was damaged",
-            status.damage_counts[1],
-        ),
         counter("sender_failures", "failed iterations of the sending thread", counts.failures),
-        gauge(
-            "stranded_records",
-            "records in the outbox under a previous vehicle name",
-            status.stranded_records,
-        ),
         gauge(
             "unanswered_seconds",
             "time for which sent batches have not been answered",
@@ -71,17 +71,32 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
             "lag of the vehicle's clock behind the service's",
             status.clock_behind_s,
         ),
+    ]
+
+
+def _outbox_metrics(publisher: Publisher) -> list[Metric]:
+    """Return the metrics of the outbox, the file of records that are not acknowledged yet."""
+    status = publisher.status
+    return [
+        counter(
+            "damaged_spools", "times that the outbox was found damaged", status.damage_counts[0]
+        ),
+        counter(
+            "damaged_records",
+            "records lost because the outbox was damaged",
+            status.damage_counts[1],
+        ),
+        gauge(
+            "stranded_records",
+            "records in the outbox under a previous vehicle name",
+            status.stranded_records,
+        ),
         gauge("outbox_fill", "share of the outbox that is full", status.fill_share),
         gauge(
             "unsettled_records",
             "records neither acknowledged nor rejected yet",
             publisher.count_unsettled(),
         ),
-        gauge("sessions", "open sessions", status.links),
-        *link_metrics(status.link_watches),
-        gauge("blocks_behind", "blocks that were processed too late", progress.behind),
-        gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
-        gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
     ]
 
 

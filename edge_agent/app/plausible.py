@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
 IMPLAUSIBLE: Final = 3  # exit code
-FURTHEST_SPEED: Final = 0.15  # largest median of |v_x − wheel speed| / wheel speed
+MOST_SPEED_ERROR: Final = 0.15  # largest median of |v_x − wheel speed| / wheel speed
 LEAST_SPEED: Final = 3.0  # [m/s] speeds are compared only above this value
 MOST_VIOLATION: Final = 0.05  # largest share of samples with an upper bound below the grip in use
 # Tolerance of the comparison of upper bound and grip in use. A tilted mount changes the
@@ -29,7 +29,7 @@ MOST_RESETS_PER_S: Final = 0.2  # [1/s] maximum rate of filter resets
 MOST_RESETS_PER_SAMPLE: Final = 0.1  # the same, if times are in a wrong unit
 
 
-def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
+def grip_in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the grip in use, (T,) [1]: the horizontal acceleration divided by g, smoothed over
     SMOOTHED_S seconds. A missing reading counts as 0.
 
@@ -74,7 +74,7 @@ class Plausibility:
         upper = estimates.mu_upper[:, 0]
         used = estimates.mu_utilised[:, 0]
         mu = estimates.mu[:, 0]
-        self.violations += int(np.sum(upper < in_use(t[:, 0], signals[:, 0]) - SLACK))
+        self.violations += int(np.sum(upper < grip_in_use(t[:, 0], signals[:, 0]) - SLACK))
         self.excited += int(np.sum(used > EXCITED_SHARE * mu))
         self.samples += len(health)
         self.first = min(self.first, float(t[0, 0]))
@@ -98,13 +98,15 @@ class Plausibility:
         means plausible.
         """
         n = max(self.samples, 1)
-        found = {
-            "speed differs much from that of the wheels": self.median_speed_error > FURTHEST_SPEED,
-            "the upper bound lies below the grip in use": self.violations / n > MOST_VIOLATION,
-            "the filter was reset repeatedly": self.resets
-            > 1 + min(MOST_RESETS_PER_S * self.seconds, MOST_RESETS_PER_SAMPLE * n),
-        }
-        return [words for words, bad in found.items() if bad]
+        most_resets = 1 + min(MOST_RESETS_PER_S * self.seconds, MOST_RESETS_PER_SAMPLE * n)
+        found = []
+        if self.median_speed_error > MOST_SPEED_ERROR:
+            found.append("speed differs much from that of the wheels")
+        if self.violations / n > MOST_VIOLATION:
+            found.append("the upper bound lies below the grip in use")
+        if self.resets > most_resets:
+            found.append("the filter was reset repeatedly")
+        return found
 
     def summary_line(self) -> str:
         """Return one line that summarises the plausibility of the replayed log's estimates."""

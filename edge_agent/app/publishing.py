@@ -30,7 +30,7 @@ FLEET = "fleet"  # value of {name} in the path of an outbox that serves many veh
 # Event that is set if a session or a source hangs, for example because a router is frozen. Its
 # library might then wait at the exit of the process. Therefore the command line ends the process
 # itself, after the command has closed its files and returned its exit code.
-left_behind = threading.Event()
+hanging_thread = threading.Event()
 
 
 def open_publisher(
@@ -129,7 +129,7 @@ def close_publisher(
         print_line(
             "warning: a session did not close in time; exiting without closing it", sys.stderr
         )
-        left_behind.set()
+        hanging_thread.set()
     print(json.dumps(final_counts(progress, publisher) | extra_values), flush=True)
 
 

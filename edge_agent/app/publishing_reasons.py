@@ -94,7 +94,7 @@ class SignalWatch:
 
 
 def reasons_not_publishing(
-    watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], troubles: Sequence[str]
+    watch: SignalWatch, publisher: PublisherState, endpoints: Sequence[str], problems: Sequence[str]
 ) -> list[str]:
     """Return the reasons why nothing is published, as sentences for the user. The list is empty if
     records can be published.
@@ -103,10 +103,10 @@ def reasons_not_publishing(
         watch: observer of the blocks of samples that the source has delivered.
         publisher: status of the publisher.
         endpoints: routers that the publisher tries to reach.
-        troubles: problems reported by the signal sources and by the signal doctor (automatic
+        problems: problems reported by the signal sources and by the signal doctor (automatic
             check).
     """
-    found = list(troubles)
+    found = list(problems)
     if watch.is_missing("wheels"):
         found.append(
             "the signals contain no wheel speed: compare the profile with the car's signals"

@@ -87,10 +87,10 @@ class Trip:
         # Blocks of the current section: t, signals, ground.
         self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self._part_start = 0.0
-        self._looked = 0.0
+        self._last_examination = 0.0
         self._faults: list[str] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
-        self._looking: Future[None] | None = None
+        self._examination: Future[None] | None = None
 
     def is_admitted(self) -> bool:
         """Return True if records made from the signals of this trip may be published."""
@@ -124,8 +124,8 @@ class Trip:
             for block in source:
                 self._keep_block(block, ground())
                 t = block.t[:, 0]
-                mended = direction.advance(t, corrector.advance(t, block.signals[:, 0]))
-                yield replace(block, signals=mended[:, None])
+                corrected = direction.advance(t, corrector.advance(t, block.signals[:, 0]))
+                yield replace(block, signals=corrected[:, None])
 
     def learn_rest(self) -> None:
         """Start the examination (search for sensor faults) of the last section of the trip, so that
@@ -135,9 +135,9 @@ class Trip:
 
     def close(self) -> None:
         """Wait at most LEAVE_S seconds for the running examination of the signals to end."""
-        if self._looking is not None:
+        if self._examination is not None:
             try:
-                self._looking.result(LEAVE_S)
+                self._examination.result(LEAVE_S)
             except TimeoutError:
                 log.warning("the end of this trip is not used for learning: no time left")
         self._worker.shutdown(wait=False, cancel_futures=True)
@@ -146,12 +146,12 @@ class Trip:
         now = float(block.t[-1, 0])
         if not self._blocks:
             self._part_start = float(block.t[0, 0])
-            self._looked = self._part_start
+            self._last_examination = self._part_start
         self._blocks.append((block.t[:, 0], block.signals[:, 0], ground))
         if now - self._part_start >= PART_S:
             self._start_examination(final=True)
-        elif not self.is_admitted() and now - self._looked >= LOOK_S:
-            self._looked = now
+        elif not self.is_admitted() and now - self._last_examination >= LOOK_S:
+            self._last_examination = now
             self._start_examination(final=False)
 
     def _start_examination(self, *, final: bool) -> None:
@@ -160,12 +160,12 @@ class Trip:
         """
         if not self._blocks:
             return
-        if not final and self._looking is not None and not self._looking.done():
+        if not final and self._examination is not None and not self._examination.done():
             return
         part = list(self._blocks)
         if final:
             self._blocks = []
-        self._looking = self._worker.submit(self._examine_part, part, final)
+        self._examination = self._worker.submit(self._examine_part, part, final)
 
     def _examine_part(
         self, part: list[tuple[FloatArray, FloatArray, FloatArray]], final: bool

@@ -12,7 +12,7 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from edge_agent.adaptation.memberships import RETIRED, Memberships
-from schemas.config import explain
+from schemas.config import explain_validation_error
 from schemas.errors import InputError
 from schemas.runtime.durable import write_durably
 
@@ -130,7 +130,7 @@ def parse_tuned(text: str | bytes, where: str) -> Tuned:
     try:
         document = Document.model_validate_json(text)
     except ValidationError as error:
-        raise explain(error, where, Document) from error
+        raise explain_validation_error(error, where, Document) from error
     for way in WAYS:
         if way not in document.scores:
             raise InputError(

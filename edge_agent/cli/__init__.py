@@ -127,7 +127,7 @@ def _run_command(
     if level == logging.WARNING:  # libraries report threads and caches at the level INFO
         for package in ("edge_agent", "schemas"):
             logging.getLogger(package).setLevel(logging.INFO)
-    from edge_agent.app.publishing import left_behind
+    from edge_agent.app.publishing import hanging_thread
     from schemas.runtime.process import limit_memory
 
     if limited:
@@ -136,7 +136,7 @@ def _run_command(
     try:
         code = commandline.run_guarded(lambda: int(args.run(args)))
     except Exception:
-        if not left_behind.is_set():
+        if not hanging_thread.is_set():
             raise
         traceback.print_exc()
-    return code, left_behind.is_set()
+    return code, hanging_thread.is_set()

@@ -114,13 +114,13 @@ def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.campaign import run_campaign
     from edge_agent.lab.evaluation.report import evaluation_report
     from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import write
+    from schemas.runtime.figures import write_figures
 
     seeds = range(FIGURES, FIGURES + count)
     results = run_campaign(seeds, quick=args.quick, log_line=_timed_printer())
     figures = figures_of(results, quick=args.quick)
     name = "edge-agent evaluate" + (" --quick" if args.quick else "")
-    write(args.out / "figures.json", name, list(seeds), figures)
+    write_figures(args.out / "figures.json", name, list(seeds), figures)
     text = evaluation_report(figures, seeds=count)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     if not args.no_plots:
@@ -146,11 +146,13 @@ def _evaluate_paper(args: argparse.Namespace, count: int) -> int:
 def _evaluate_searches(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.seeds import FIGURES
     from edge_agent.lab.tuning.search_comparison import compare_searches, comparison_markdown
-    from schemas.runtime.figures import write
+    from schemas.runtime.figures import write_figures
 
     seeds = range(FIGURES, FIGURES + count)
     figures = compare_searches(seeds, quick=args.quick, log_line=_print_progress)
-    write(args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures)
+    write_figures(
+        args.out / "figures.json", "edge-agent evaluate --only searches", list(seeds), figures
+    )
     text = comparison_markdown(figures)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
@@ -160,16 +162,20 @@ def _evaluate_searches(args: argparse.Namespace, count: int) -> int:
 def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation import worth
     from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import markdown, write
+    from schemas.runtime.figures import format_table, write_figures
 
     seeds = range(FIGURES, FIGURES + count)
     scores = worth.campaign(seeds, quick=args.quick, log_line=_print_progress)
     figures = worth.barred_figures(scores)
     part = " --quick" if args.quick else ""
     measured = list(seeds)[: len(scores["fuzzy"]["all"])]
-    write(args.out / "figures.json", f"edge-agent evaluate --only worth{part}", measured, figures)
+    write_figures(
+        args.out / "figures.json", f"edge-agent evaluate --only worth{part}", measured, figures
+    )
     table = worth.comparison_table({figure.name: figure.value for figure in figures})
-    text = f"# Benefit of the fuzzy sets and of the ant colony\n\n{table}\n\n{markdown(figures)}\n"
+    text = (
+        f"# Benefit of the fuzzy sets and of the ant colony\n\n{table}\n\n{format_table(figures)}\n"
+    )
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if _all_hold(figures) else 1
@@ -177,12 +183,12 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
 
 def _evaluate_real_logs(args: argparse.Namespace) -> int:
     from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
-    from schemas.runtime.figures import markdown, write
+    from schemas.runtime.figures import format_table, write_figures
 
     found = judge_folder(args.logs, _print_progress)
     figures = summarise(found)
-    write(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
-    text = f"# Real cars\n\n{table(found)}\n\n{markdown(figures)}\n"
+    write_figures(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
+    text = f"# Real cars\n\n{table(found)}\n\n{format_table(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if _all_hold(figures) else 1
@@ -193,13 +199,13 @@ def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.detection_campaign import campaign
     from edge_agent.lab.evaluation.report import detection_report
     from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import write
+    from schemas.runtime.figures import write_figures
 
     seeds = range(FIGURES, FIGURES + count)
     results = campaign(seeds, _timed_printer(), quick=args.quick)
     figures = detection_figures(results)
     part = " --quick" if args.quick else ""
-    write(
+    write_figures(
         args.out / "figures.json",
         f"edge-agent evaluate --only detection{part}",
         list(seeds),

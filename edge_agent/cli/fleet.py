@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.agent import Agent, AgentOptions, AgentSource
     from edge_agent.app.output_path import prepare_path
-    from edge_agent.cli.live import LookoutPart, warm_up_simulation, warning_lines
+    from edge_agent.cli.live import LookoutPart, make_warning_printer, warm_up_simulation
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
     from edge_agent.lab.simulation.fleet import check_live_fleet
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     drivers = WarnedDrivers(fleet, args.warned)
     parts = []
     if drivers.warned.any():
-        show = warning_lines(config)
+        show = make_warning_printer(config)
 
         def pass_warning(name: str, warning: GripWarning) -> None:
             show(name, warning)

@@ -116,7 +116,7 @@ def _check_paths(args: argparse.Namespace) -> None:
         raise InputError(
             "source", "sources and --out are needed", "name recordings, and the log to write"
         )
-    commandline.ending_of("out", args.out, (".parquet",))
+    commandline.check_ending("out", args.out, (".parquet",))
     used = {source.resolve(): "one of the recordings" for source in args.source}
     if args.out.resolve() in used:
         raise InputError("out", f"{args.out} is one of the recordings", "name another file")

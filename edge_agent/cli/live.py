@@ -100,7 +100,7 @@ class VssPart:
         return {}
 
 
-def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
+def make_warning_printer(config: AgentConfig) -> Callable[[str, GripWarning], None]:
     """Return a function that prints a warning of slippery road ahead as one line on stdout. Its
     arguments are the vehicle's name and the warning. The log format selects text or JSON.
 

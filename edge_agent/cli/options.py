@@ -48,9 +48,9 @@ def config_of(args: argparse.Namespace) -> AgentConfig:
     Raises:
         InputError: the file cannot be read, or a setting is unknown or out of range.
     """
-    from schemas.config import AgentConfig, load
+    from schemas.config import AgentConfig, load_config
 
-    config = load(args.config, AgentConfig)
+    config = load_config(args.config, AgentConfig)
     return config.model_copy(update={"zenoh": config.zenoh.with_endpoint(args.connect)})
 
 

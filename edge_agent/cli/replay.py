@@ -267,7 +267,7 @@ def _check_output(args: argparse.Namespace, vehicle_file: Path) -> None:
     require_log(args.log[0])
     commandline.refuse_input_path("out", args.out, [args.log[0], vehicle_file])
     if args.out.suffix:
-        commandline.ending_of("out", args.out, [*filter(None, ENDINGS), *REPORTS])
+        commandline.check_ending("out", args.out, [*filter(None, ENDINGS), *REPORTS])
 
 
 def _split_names(names: str | None) -> list[str]:
@@ -439,10 +439,10 @@ def _start_time(start: str | None, log: SignalLog) -> int:
     """Return the time [ns UTC] of t = 0 in a recorded log: the given time, else the time stated in
     the log, else a time such that the log ends now.
     """
-    from schemas.config import moment
+    from schemas.config import parse_moment
 
     if start is not None and start != NOW:
-        return moment(start, "start")
+        return parse_moment(start, "start")
     if start is None and log.start_ns is not None:
         return log.start_ns
     # A whole second, so that `_start_text` is exact.

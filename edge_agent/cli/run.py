@@ -29,6 +29,33 @@ LIVE_ROWS = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command-line arguments of `edge-agent run`."""
+    _add_source_arguments(parser)
+    _add_output_arguments(parser)
+    parser.add_argument(
+        "--vehicle", type=Path, help="vehicle file (JSON); required except for simulated"
+    )
+    add_estimator(parser)
+    parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
+    add_connection(parser)
+    parser.add_argument(
+        "--scenario", default="demo", help="scenario of the simulated vehicle (default demo)"
+    )
+    parser.add_argument(
+        "--rate",
+        type=commandline.parse_positive,
+        default=100.0,
+        help="samples per second of the simulation (default 100)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation (default 0)")
+    parser.add_argument(
+        "--duration",
+        type=commandline.parse_positive,
+        default=float("inf"),
+        help="duration [s] (default: until stopped or the end of the log)",
+    )
+
+
+def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         action="append",
@@ -46,6 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="publish signals that did not pass the signal doctor, which checks a log and live "
         "sources; no effect on a simulated vehicle and on plug-ins, which are not checked",
     )
+
+
+def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ahead", action="store_true", help="receive the map and warn of slippery road ahead"
     )
@@ -69,28 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--kuksa",
         metavar="HOST:PORT",
         help="write the friction to a Kuksa databroker; ?ca=FILE&token=FILE as in --source vss:",
-    )
-    parser.add_argument(
-        "--vehicle", type=Path, help="vehicle file (JSON); required except for simulated"
-    )
-    add_estimator(parser)
-    parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
-    add_connection(parser)
-    parser.add_argument(
-        "--scenario", default="demo", help="scenario of the simulated vehicle (default demo)"
-    )
-    parser.add_argument(
-        "--rate",
-        type=commandline.parse_positive,
-        default=100.0,
-        help="samples per second of the simulation (default 100)",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulation (default 0)")
-    parser.add_argument(
-        "--duration",
-        type=commandline.parse_positive,
-        default=float("inf"),
-        help="duration [s] (default: until stopped or the end of the log)",
     )
 
 
@@ -188,17 +196,17 @@ def _make_lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> L
         return None
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.ahead.route_file import read_route
-    from edge_agent.cli.live import warning_lines
+    from edge_agent.cli.live import make_warning_printer
 
     route = read_route(args.route) if args.route is not None else None
     if args.autoware is None:
-        return Lookout([name], warning_lines(config), lambda _: route)
+        return Lookout([name], make_warning_printer(config), lambda _: route)
     from edge_agent.ahead.planner import ANY_HASH
     from edge_agent.ahead.planner_link import PlannerLink
 
     planner = PlannerLink(args.autoware, args.autoware_hash or ANY_HASH)
     return Lookout(
-        [name], warning_lines(config), lambda _: route, on_horizons=planner.receive_horizons
+        [name], make_warning_printer(config), lambda _: route, on_horizons=planner.receive_horizons
     )
 
 
@@ -224,7 +232,7 @@ def _make_vss_output(
 
 def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
     from edge_agent.app.agent import Agent, AgentSource
-    from edge_agent.app.publishing import left_behind
+    from edge_agent.app.publishing import hanging_thread
     from edge_agent.app.trip import Trip, state_path_for
     from edge_agent.cli.common import checked_name
     from edge_agent.inputs.live.rows import LiveRows
@@ -251,7 +259,7 @@ def _run_live(args: argparse.Namespace, sources: list[str], config: AgentConfig)
         blocks.close()
         trip.close()
         if any(feed.is_listening for feed in feeds):
-            left_behind.set()
+            hanging_thread.set()
 
 
 def _vehicle_file(args: argparse.Namespace) -> Path:

@@ -280,7 +280,7 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     )
     listed = study_report.figures(done)
     title = "edge-agent tune --study" + " --quick" * args.quick
-    figures.write(args.study / "figures.json", title, list(seeds), listed)
+    figures.write_figures(args.study / "figures.json", title, list(seeds), listed)
     text = study_report.markdown(listed)
     (args.study / "study.md").write_text(text, encoding="utf-8")
     study_report.draw(listed, ants, args.study / "convergence.png")
@@ -356,7 +356,7 @@ def _score_memberships(memberships: Memberships, drives: TuningSet) -> Score:
 
 
 def _make_provenance(command: str, seed: int, budget: Budget) -> Provenance:
-    header = figures.header("tune", [seed])
+    header = figures.make_header("tune", [seed])
     return Provenance.model_validate(
         {name: header[name] for name in ("date", "commit", "machine", "versions")}
         | {"command": command, "seed": seed, "budget": budget}

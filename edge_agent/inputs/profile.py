@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from edge_agent.inputs.log_columns import FRONT_STEERING
 from edge_agent.inputs.units import QUANTITY
-from schemas.config import explain, require_unique_names
+from schemas.config import explain_validation_error, require_unique_names
 from schemas.errors import InputError
 from schemas.signals import CONTEXT, FLAGS
 
@@ -199,4 +199,4 @@ def load_profile(name: str) -> tuple[Profile, Path]:
             "profile", f"cannot read {path} ({error.strerror})", f"name a file, or one of {known}"
         ) from error
     except ValidationError as error:
-        raise explain(error, f"profile {path}", Profile) from error
+        raise explain_validation_error(error, f"profile {path}", Profile) from error

@@ -59,7 +59,7 @@ class QueryEngine:
     def __post_init__(self) -> None:
         self._spark: Any = None
         if self.name == "spark":
-            self._spark = spark.session(progress=self.progress)
+            self._spark = spark.open_session(progress=self.progress)
             self.connection = ibis.pyspark.connect(self._spark)
         else:
             self.connection = ibis.duckdb.connect()

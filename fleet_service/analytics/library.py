@@ -15,7 +15,7 @@ from fleet_service.analytics.questions import question_of
 from fleet_service.archive.export.extract import Box, Extract
 from fleet_service.archive.format.layout import require_archive
 from schemas import query
-from schemas.config import moment
+from schemas.config import parse_moment
 from schemas.errors import InputError
 
 
@@ -25,8 +25,8 @@ def _make_extract(period: tuple[str | None, str | None], bbox: Box | None) -> Ex
             "period", f"{period!r} is not a pair", "give (begin, end), each may be None"
         )
     since, until = period
-    begin = 0 if since is None else moment(str(since), "period")
-    end = time.time_ns() if until is None else moment(str(until), "period")
+    begin = 0 if since is None else parse_moment(str(since), "period")
+    end = time.time_ns() if until is None else parse_moment(str(until), "period")
     if begin >= end:
         raise InputError("period", f"{until or 'now'} is not after {since}", "give a later end")
     box = {} if bbox is None else {"bbox": ",".join(map(str, bbox))}

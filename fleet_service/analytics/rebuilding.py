@@ -97,7 +97,11 @@ def rebuild(request: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
             "archive", f"no compacted observations in {request.root}", "run fleet-service compact"
         )
     work = partial(rebuild_zone, request)
-    yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
+    yield from (
+        map(work, zones)
+        if engine == "local"
+        else spark.run_tasks(spark.open_session(), zones, work)
+    )
     sweep_drafts(request.out)
 
 

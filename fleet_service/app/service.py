@@ -36,7 +36,7 @@ from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 from fleet_service.shards.serving import announce_regions as serving_regions
 from fleet_service.shards.serving import claim_regions, watch_successors
-from schemas.config import ServiceConfig, load
+from schemas.config import ServiceConfig, load_config
 from schemas.runtime import watchdog, zenoh_session
 from schemas.runtime.metrics import serve_metrics
 from schemas.wire import Alert
@@ -84,7 +84,7 @@ class Service:
         self._events = events
         known = None
         if config.fleet is not None:
-            known = set(load(config.fleet, Enrolment, "fleet").vehicles)
+            known = set(load_config(config.fleet, Enrolment, "fleet").vehicles)
         self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(

@@ -18,7 +18,7 @@ from fleet_service.cli.common import (
     time_span,
 )
 from schemas import mugrid
-from schemas.config import moment
+from schemas.config import parse_moment
 from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
 
@@ -156,7 +156,7 @@ def _options_of(arguments: argparse.Namespace) -> Options:
     """Return the options of the question; a default where the user gave none."""
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
     return Options(
-        at=None if arguments.at is None else moment(arguments.at, "at"),
+        at=None if arguments.at is None else parse_moment(arguments.at, "at"),
         stations=arguments.stations,
         least_vehicles=vehicles,
         step_s=arguments.step,
@@ -216,7 +216,7 @@ def _checked_question(arguments: argparse.Namespace) -> Question:
     """
     question = question_of(arguments.question)
     if arguments.out is not None:
-        commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
+        commandline.check_ending("out", commandline.check_out_file("out", arguments.out), ENDINGS)
         if question.colour is None and arguments.out.name.endswith(
             (".html", ".geojson", ".geo.parquet")
         ):

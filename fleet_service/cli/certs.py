@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Check the options, then create missing certificates and router configurations."""
     from fleet_service.enrolment.fleet import Enrolment
-    from schemas.config import load
+    from schemas.config import load_config
 
     days = (arguments.days, arguments.ca_days, arguments.renew_days)
     out = arguments.out
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "renew-days", f"is not less than the {days[0]:g} days of a certificate", "give fewer"
         )
-    fleet = load(arguments.fleet, Enrolment, "fleet")
+    fleet = load_config(arguments.fleet, Enrolment, "fleet")
     try:
         from fleet_service.enrolment.enrol import Registry, Terms
     except ImportError as error:

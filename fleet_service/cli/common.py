@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from schemas.config import moment
+from schemas.config import parse_moment
 from schemas.errors import InputError
 from schemas.runtime import progress_messages
 from schemas.thresholds import NS
@@ -151,7 +151,7 @@ def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
     Raises:
         InputError: an option is not a time, or the end is not after the begin.
     """
-    since = 0 if arguments.since is None else moment(arguments.since, "from")
+    since = 0 if arguments.since is None else parse_moment(arguments.since, "from")
     if arguments.last is not None:
         if arguments.since is not None or arguments.until is not None:
             raise InputError(
@@ -160,7 +160,7 @@ def time_span(arguments: argparse.Namespace) -> tuple[int, int]:
                 "give either --last or --from and --to",
             )
         since = time.time_ns() - round(duration_s("last", arguments.last) * NS)
-    until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
+    until = time.time_ns() if arguments.until is None else parse_moment(arguments.until, "to")
     if since >= until:
         raise InputError(
             "to",

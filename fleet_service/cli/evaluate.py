@@ -78,5 +78,5 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "out", f"cannot write {error.filename} ({error.strerror})", "choose another folder"
         ) from error
-    print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")
+    print(f"\n{figures.format_table([figure for figure in found if figure.bar is not None])}\n")
     return 0 if arguments.quick or campaign.all_hold(found) else 1

@@ -153,7 +153,7 @@ def _route_costs(arguments: argparse.Namespace) -> int:
     from fleet_service.analytics.roads.network import read_network
     from fleet_service.client import map_client, routing
 
-    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".json",))
+    commandline.check_ending("out", commandline.check_out_file("out", arguments.out), (".json",))
     links = read_network(arguments.roads).links
     box = {"format": "arrow"} | ({} if arguments.bbox is None else {"bbox": arguments.bbox})
     table = map_client.served_table(
@@ -183,7 +183,7 @@ def _publish_datex(arguments: argparse.Namespace) -> int:
     from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish_alerts
     from fleet_service.client.map_client import connection_settings
 
-    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".xml",))
+    commandline.check_ending("out", commandline.check_out_file("out", arguments.out), (".xml",))
     feed = DatexFeed(
         DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True))
     )
@@ -199,7 +199,7 @@ def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.export import extract
     from schemas import query
 
-    commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
+    commandline.check_ending("out", commandline.check_out_file("out", arguments.out), ENDINGS)
     if arguments.min_vehicles < 1:
         raise InputError(
             "min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1"

@@ -142,9 +142,9 @@ def _sync_copy(root: Path, path: str | None) -> Iterator[None]:
     """
     from fleet_service.replication.replica import BucketReplica
     from fleet_service.replication.upload_journal import last_copy_url
-    from schemas.config import ServiceConfig, load
+    from schemas.config import ServiceConfig, load_config
 
-    config = load(path, ServiceConfig)
+    config = load_config(path, ServiceConfig)
     url = config.archive.second or last_copy_url(root)
     if url is None:
         yield

@@ -143,5 +143,7 @@ def _datex_file(arguments: argparse.Namespace) -> DatexFile | None:
         return None
     from fleet_service.client.datex_feed import DatexFile
 
-    commandline.ending_of("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
+    commandline.check_ending(
+        "datex", commandline.check_out_file("datex", arguments.datex), (".xml",)
+    )
     return DatexFile(supplier_of(arguments), arguments.datex, lambda line: print(line, flush=True))

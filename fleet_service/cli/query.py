@@ -121,10 +121,10 @@ def _say_what_is_covered(arguments: argparse.Namespace) -> None:
 def _output_format(out: Path | None, given: str | None) -> str | None:
     if out is None:
         return given
-    commandline.out_folder("out", out)
+    commandline.check_out_file("out", out)
     if not out.suffix:
         return given
-    form = FORMS[commandline.ending_of("out", out, tuple(FORMS))]
+    form = FORMS[commandline.check_ending("out", out, tuple(FORMS))]
     if given not in (None, form):
         raise InputError(
             "format",

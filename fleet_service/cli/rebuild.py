@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from fleet_service.cli.common import ArchiveReport, add_archive, compact_first, on_archive
-from schemas.config import moment
+from schemas.config import parse_moment
 from schemas.runtime import progress_messages
 
 
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _rebuild_maps(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.analytics.rebuilding import Rebuild, rebuild, require_empty
 
-    until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
+    until = time.time_ns() if arguments.until is None else parse_moment(arguments.until, "to")
     require_empty(arguments.out)
     if not arguments.as_it_lies:
         compact_first(arguments.archive)

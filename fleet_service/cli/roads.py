@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.analytics.roads.network import read_network
     from schemas.runtime.durable import open_durably
 
-    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".parquet",))
+    commandline.check_ending("out", commandline.check_out_file("out", arguments.out), (".parquet",))
     progress_messages.set_status(f"reading {arguments.extract}")
     network = read_network(arguments.extract, arguments.id, arguments.name)
     progress_messages.set_status(f"joining {len(network.links)} directed links")

@@ -98,9 +98,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _read_config(arguments: argparse.Namespace) -> ServiceConfig:
     """Return the configuration, with the settings that the command's options replace."""
-    from schemas.config import ServiceConfig, load
+    from schemas.config import ServiceConfig, load_config
 
-    config = load(arguments.config, ServiceConfig)
+    config = load_config(arguments.config, ServiceConfig)
     _check_regions(config.regions)
     if arguments.standby:
         config = config.model_copy(update={"standby": True})

@@ -15,7 +15,7 @@ import pyarrow as pa
 import zenoh
 
 from schemas import grid, keys, query, regions, tables
-from schemas.config import ServiceConfig, ZenohSettings, load
+from schemas.config import ServiceConfig, ZenohSettings, load_config
 from schemas.errors import InputError, UnreachableError
 from schemas.numeric import IntArray
 from schemas.query import Format
@@ -87,7 +87,7 @@ def connection_settings(connect: str | None, config: Path | str | None) -> Zenoh
     """Return the Zenoh connection settings from a configuration file; if `connect` is given, it
     replaces the endpoints.
     """
-    return load(config, ServiceConfig).zenoh.with_endpoint(connect)
+    return load_config(config, ServiceConfig).zenoh.with_endpoint(connect)
 
 
 def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:

@@ -133,7 +133,7 @@ class WeatherInbox:
 
 def _decode_report(message: WeatherMessage, now: int) -> tuple[int, Report]:
     region = keys.parse(message.key).quadint
-    report = weather.decode(message.payload, message.encoding)
+    report = weather.decode_report(message.payload, message.encoding)
     if region is None or not now - VALID_NS <= report.time <= now + AHEAD_NS:
         raise InputError("time", "too old, or more than a day ahead", "set the clock")
     return region, report
@@ -302,7 +302,7 @@ def _parse_row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
         raise InputError(
             "weather", f"row {number}: region, time or a number is missing", fix
         ) from error
-    problem = weather.broken(values, prior)
+    problem = weather.find_report_error(values, prior)
     if problem is not None or not 0 <= region < 1 << (2 * grid.REGION_ZOOM):
         refusal = problem or InputError(
             "region", "is not a z10 region", "use its quadint or quadkey"

@@ -75,12 +75,14 @@ def run(
     judged = [
         figure for figure in bars.judge_figures(found) if _is_listed(figure.name, only, found)
     ]
-    figures.write(
+    figures.write_figures(
         folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged
     )
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _is_curve(figure.name)]
-    (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")
+    (folder / "figures.md").write_text(
+        f"{figures.format_table(barred)}\n\n{figures.format_table(shown)}\n"
+    )
     for path in plots.draw_plots(judged, folder) if only is None else []:
         log_line(f"plot {path}")
     return judged

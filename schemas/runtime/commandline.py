@@ -211,7 +211,7 @@ def run_guarded(run: Callable[[], int]) -> int:
         return FAILED
 
 
-def out_folder(field: str, path: Path) -> Path:
+def check_out_file(field: str, path: Path) -> Path:
     """Check that a file can be written at `path`, and return the path. A command calls this before
     it computes anything. `field` is the option's name for error messages.
 
@@ -244,7 +244,7 @@ def report_write_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
+def check_ending(field: str, path: Path, known: Sequence[str]) -> str:
     """Return the ending of a file name, which selects the file format. If several of the `known`
     endings match, return the longest. `field` is the option's name for error messages.
 

@@ -49,13 +49,13 @@ class Figure:
         return bool(self.value <= self.bar if self.better == "less" else self.value >= self.bar)
 
 
-def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
+def make_header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
     """Return the header of a file of figures, with the conditions of the measurement: commit,
     machine, versions of packages, random seeds and date.
     """
     return {
         "campaign": campaign,
-        "commit": commit(Path(__file__)),
+        "commit": find_commit(Path(__file__)),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         "versions": _find_versions(),
@@ -72,7 +72,7 @@ def _find_versions() -> dict[str, str]:
     return found
 
 
-def commit(source: Path) -> str:
+def find_commit(source: Path) -> str:
     """Return the commit of the repository that contains a source file; `-dirty` is appended if a
     tracked file was changed.
 
@@ -90,7 +90,9 @@ def commit(source: Path) -> str:
         return "unknown"
 
 
-def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:
+def write_figures(
+    path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]
+) -> None:
     """Write the figures of a campaign (one run of an evaluation) to a file as one JSON list. Its
     first item is the header with the conditions of the measurement.
     """
@@ -98,18 +100,18 @@ def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Fig
     for row in rows:
         row["value"] = row["value"] if math.isfinite(row["value"]) else None
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps([header(campaign, seeds), *rows], indent=1) + "\n")
+    path.write_text(json.dumps([make_header(campaign, seeds), *rows], indent=1) + "\n")
 
 
-def markdown(figures: Sequence[Figure]) -> str:
+def format_table(figures: Sequence[Figure]) -> str:
     """Return the figures as a Markdown table; a missed target is marked."""
     lines = ["| figure | value | bar | |", "|---|---|---|---|"]
-    for name, *rest in map(row, figures):
+    for name, *rest in map(format_row, figures):
         lines.append(f"| `{name}` | {' | '.join(rest)} |")
     return "\n".join(lines)
 
 
-def row(figure: Figure) -> list[str]:
+def format_row(figure: Figure) -> list[str]:
     """Return the four table cells of a figure: name, value with unit, target, and "holds" or "DOES
     NOT HOLD".
     """

@@ -28,7 +28,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Told(event.Listener):
+class _CompilationListener(event.Listener):
     """Listener to events of numba. It reports each compilation to the user, because a compilation
     takes seconds.
     """
@@ -44,7 +44,7 @@ class _Told(event.Listener):
         """Do nothing; the listener interface requires this method."""
 
 
-event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _CompilationListener())  # type: ignore[no-untyped-call]
 
 
 @typeof_impl.register(NativeKernel)

@@ -38,15 +38,15 @@ class PresenceTracker:
 
     def __init__(self) -> None:
         self._guard = Lock()
-        self._present = set[ServiceToken]()
-        self._withdrawn = set[ServiceToken]()
-        self._fell = set[ServiceToken]()
+        self._active = set[ServiceToken]()
+        self._lost = set[ServiceToken]()
+        self._ever_lost = set[ServiceToken]()
 
     @property
     def active(self) -> set[ServiceToken]:
         """Return the liveliness tokens of services that are active now."""
         with self._guard:
-            return set(self._present)
+            return set(self._active)
 
     @property
     def lost_tokens(self) -> set[ServiceToken]:
@@ -54,13 +54,13 @@ class PresenceTracker:
         longer active.
         """
         with self._guard:
-            return set(self._withdrawn)
+            return set(self._lost)
 
     @property
     def ever_lost(self) -> set[ServiceToken]:
         """Return all services' liveliness tokens that were ever lost; some may be active again."""
         with self._guard:
-            return set(self._fell)
+            return set(self._ever_lost)
 
     def refresh(self, session: zenoh.Session) -> set[ServiceToken]:
         """Query the liveliness tokens that are active now. Return the union of the queried tokens
@@ -72,18 +72,18 @@ class PresenceTracker:
         """
         return active_tokens(session) | self.active
 
-    def record(self, token: ServiceToken, *, stands: bool) -> None:
-        """Record a change of a service's liveliness token: the token appeared if `stands` is True,
-        and disappeared if it is False.
+    def record(self, token: ServiceToken, *, is_active: bool) -> None:
+        """Record that a service's liveliness token has appeared (`is_active` is True) or has
+        disappeared (False).
         """
         with self._guard:
-            if stands:
-                self._present.add(token)
-                self._withdrawn.discard(token)
+            if is_active:
+                self._active.add(token)
+                self._lost.discard(token)
             else:
-                self._present.discard(token)
-                self._withdrawn.add(token)
-                self._fell.add(token)
+                self._active.discard(token)
+                self._lost.add(token)
+                self._ever_lost.add(token)
 
 
 @contextmanager
@@ -93,22 +93,22 @@ def track_tokens(session: zenoh.Session) -> Iterator[PresenceTracker]:
     """
     tokens = PresenceTracker()
 
-    def hear(sample: zenoh.Sample) -> None:
+    def on_sample(sample: zenoh.Sample) -> None:
         with suppress(InputError):
             tokens.record(
-                parse_served(str(sample.key_expr)), stands=sample.kind == zenoh.SampleKind.PUT
+                parse_served(str(sample.key_expr)), is_active=sample.kind == zenoh.SampleKind.PUT
             )
 
     # `indirect=False`: the callback runs on Zenoh's receiving thread. A lost token is thus recorded
     # before the answer of any later query arrives.
     subscriber = session.liveliness().declare_subscriber(
-        _ALL, zenoh.handlers.Callback(hear, indirect=False)
+        _ALL, zenoh.handlers.Callback(on_sample, indirect=False)
     )
     # A query is used instead of the subscription's history, because a query reports when its list
     # is complete.
     for token in active_tokens(session):
         if token not in tokens.lost_tokens:
-            tokens.record(token, stands=True)
+            tokens.record(token, is_active=True)
     try:
         yield tokens
     finally:

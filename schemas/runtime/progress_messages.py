@@ -30,56 +30,56 @@ class _State:
     """
 
     def __init__(self) -> None:
-        self.on = False
-        self.words = ""
-        self.said_once: set[str] = set()
-        self.shown: Any = None
+        self.is_enabled = False
+        self.text = ""
+        self.reported: set[str] = set()
+        self.spinner: Any = None
         self.timer: threading.Timer | None = None
         self.lock = threading.Lock()
 
 
-_voice = _State()
+_state = _State()
 
 
 def enable_messages(*, quiet: bool = False) -> None:
     """Enable progress messages; only the command lines do this."""
-    _voice.on = not quiet
-    _voice.said_once.clear()
+    _state.is_enabled = not quiet
+    _state.reported.clear()
 
 
 def report(line: str) -> None:
     """Print a line about the progress of the command, if progress messages are enabled."""
-    if _voice.on:
+    if _state.is_enabled:
         print_line(line, sys.stderr)
 
 
 def report_once(line: str) -> None:
     """Print a progress message, unless this process has already printed the same message."""
-    if line not in _voice.said_once:
-        _voice.said_once.add(line)
+    if line not in _state.reported:
+        _state.reported.add(line)
         report(line)
 
 
-def set_status(words: str) -> None:
+def set_status(text: str) -> None:
     """Set the text that the spinner shows: a few words about the command's current activity."""
-    with _voice.lock:
-        _voice.words = words
-        if _voice.shown is not None:
-            _voice.shown.update(0, description=words)
+    with _state.lock:
+        _state.text = text
+        if _state.spinner is not None:
+            _state.spinner.update(0, description=text)
 
 
 @contextmanager
-def show_status(words: str) -> Iterator[None]:
-    """Show a spinner with the text `words` until the `with` block ends. It appears only on a
+def show_status(text: str) -> Iterator[None]:
+    """Show a spinner with `text` until the `with` block ends. It appears only on a
     terminal, and only after PATIENCE_S.
     """
-    if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
+    if not (_state.is_enabled and sys.stderr.isatty()) or _state.spinner is not None:
         yield
         return
-    set_status(words)
-    _voice.timer = threading.Timer(PATIENCE_S, _show_status)
-    _voice.timer.daemon = True
-    _voice.timer.start()
+    set_status(text)
+    _state.timer = threading.Timer(PATIENCE_S, _show_status)
+    _state.timer.daemon = True
+    _state.timer.start()
     try:
         yield
     finally:
@@ -90,32 +90,32 @@ def stop_status() -> None:
     """Stop the spinner. Call this when the command has ended, or before it asks the user a
     question.
     """
-    timer = _voice.timer
-    _voice.timer = None
+    timer = _state.timer
+    _state.timer = None
     if timer is not None:
         timer.cancel()
         timer.join()
-    with _voice.lock:
-        shown = _voice.shown
-        _voice.shown = None
-    if shown is not None:
-        shown.stop()
+    with _state.lock:
+        spinner = _state.spinner
+        _state.spinner = None
+    if spinner is not None:
+        spinner.stop()
 
 
 def _show_status() -> None:
     began = time.monotonic()
-    loading = threading.Thread(target=_load_drawing, daemon=True)
+    loading = threading.Thread(target=_import_spinner, daemon=True)
     loading.start()
-    # The import of the drawing library takes seconds next to a busy command.
+    # The import of rich takes seconds next to a busy command.
     while loading.is_alive():
         with suppress(OSError):
             waited = PATIENCE_S + time.monotonic() - began
-            print(f"{_voice.words} … {waited:.0f} s", end="\r", file=sys.stderr, flush=True)
+            print(f"{_state.text} … {waited:.0f} s", end="\r", file=sys.stderr, flush=True)
         loading.join(TICK_S)
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    shown = Progress(
+    spinner = Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
         TimeElapsedColumn(),
@@ -123,12 +123,12 @@ def _show_status() -> None:
         transient=True,
         redirect_stdout=sys.stdout.isatty(),
     )
-    shown.add_task(_voice.words, total=None)
-    shown.start()
-    with _voice.lock:
-        _voice.shown = shown
+    spinner.add_task(_state.text, total=None)
+    spinner.start()
+    with _state.lock:
+        _state.spinner = spinner
 
 
-def _load_drawing() -> None:
-    """Import the library that draws the spinner before it is needed."""
+def _import_spinner() -> None:
+    """Import rich, which draws the spinner."""
     importlib.import_module("rich.progress")

@@ -29,7 +29,7 @@ SETTINGS: Final = {
 }
 
 
-def session(*, progress: bool = False) -> Any:  # noqa: ANN401 pyspark has no types
+def open_session(*, progress: bool = False) -> Any:  # noqa: ANN401 pyspark has no types
     """Return the Spark session of this process. It uses the cluster that spark-submit or Spark's
     settings name, or else this machine.
 
@@ -54,7 +54,7 @@ def session(*, progress: bool = False) -> Any:  # noqa: ANN401 pyspark has no ty
         ) from error
 
 
-def spread(
+def run_tasks(
     session: Any,  # noqa: ANN401 pyspark has no types
     tasks: Sequence[_Task],
     work: Callable[[_Task], _Outcome],

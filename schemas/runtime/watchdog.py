@@ -43,12 +43,12 @@ def notify_waiting() -> Callable[[], None]:
         nonlocal last
         last = time.monotonic()
 
-    def keep() -> None:
+    def notify_repeatedly() -> None:
         while not _at_work.wait(every_s) and time.monotonic() - last < LONG_S:
             _notify_systemd()
 
     _at_work.clear()
-    threading.Thread(target=keep, name="patience", daemon=True).start()
+    threading.Thread(target=notify_repeatedly, name="watchdog", daemon=True).start()
     return beat
 
 

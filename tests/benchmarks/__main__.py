@@ -77,8 +77,8 @@ def main() -> int:
         print(f"    {time.monotonic() - part:.0f} s", flush=True)
     if len(chosen) == len(PARTS):
         found.append(Figure("bench.total_s", time.monotonic() - began, "s, all parts", 600))
-    figures.write(FOLDER / "figures.json", "bench", [SEED], found)
-    print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json")
+    figures.write_figures(FOLDER / "figures.json", "bench", [SEED], found)
+    print(f"\n{figures.format_table(found)}\n\n{FOLDER}/figures.json")
     return 0
 
 

@@ -274,8 +274,8 @@ def main() -> int:
         write_small_archive(work / "small")
         found += measure_agreement(work / "small", readings)
         found += measure_past(work / "past", print_progress)
-    figures.write(FOLDER / "figures.json", "analytics", [SEED], found)
-    print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json")
+    figures.write_figures(FOLDER / "figures.json", "analytics", [SEED], found)
+    print(f"\n{figures.format_table(found)}\n\n{FOLDER}/figures.json")
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
 
 

@@ -48,8 +48,8 @@ def main() -> int:
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         rows = measure_all(Path(folder))
-    figures.write(FOLDER / "figures.json", "batch", (*iceberg.SEEDS, *spread.SEEDS), rows)
-    print(figures.markdown(rows))
+    figures.write_figures(FOLDER / "figures.json", "batch", (*iceberg.SEEDS, *spread.SEEDS), rows)
+    print(figures.format_table(rows))
     return 0 if all(row.holds for row in rows) else 1
 
 

@@ -416,8 +416,8 @@ def main() -> int:
     began = time.time_ns()
     rows = measure_all()
     OUT.mkdir(exist_ok=True)
-    figures.write(OUT / "figures.json", "page", [SEED], rows)
-    print(figures.markdown(rows))
+    figures.write_figures(OUT / "figures.json", "page", [SEED], rows)
+    print(figures.format_table(rows))
     print(f"{(time.time_ns() - began) / NS:.0f} s", file=sys.stderr)
     return 0 if all(row.holds for row in rows) else 1
 

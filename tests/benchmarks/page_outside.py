@@ -282,7 +282,7 @@ def join_right() -> float:
     """
     path = roads.FOLDER / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else [{}]
-    if rows[0].get("commit") != figures.commit(Path(roads.__file__)):
+    if rows[0].get("commit") != figures.find_commit(Path(roads.__file__)):
         try:
             roads.main()
         except (OSError, subprocess.CalledProcessError) as error:

@@ -108,8 +108,8 @@ def main() -> int:
             "roads.links_per_place", most["links_per_place"], "links of a fix's cell, the most", 1.5
         ),
     ]
-    figures.write(FOLDER / "figures.json", "roads", SEEDS, rows)
-    print(figures.markdown(rows))
+    figures.write_figures(FOLDER / "figures.json", "roads", SEEDS, rows)
+    print(figures.format_table(rows))
     return 0 if all(row.holds for row in rows) else 1
 
 

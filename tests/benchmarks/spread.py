@@ -68,7 +68,7 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     with spark_sessions.spark_session(2) as session:
         dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
-        told = spark.spread(session, tasks_of(logs, None, there), dying)
+        told = spark.run_tasks(session, tasks_of(logs, None, there), dying)
     ours = list(estimate_drives(tasks_of(logs, None, here), ESTIMATOR, 1))
     if len(list(tries.iterdir())) != len(logs) or any(outcome.error for outcome in (*told, *ours)):
         raise RuntimeError("a drive was not estimated, or its task was not killed")
@@ -86,7 +86,7 @@ def rebuild_difference(folder: Path) -> float:
     there.mkdir()
     zones = zones_of(archive)
     with spark_sessions.spark_session(2) as session:
-        spark.spread(
+        spark.run_tasks(
             session,
             zones,
             spark_sessions.killed_at_first(

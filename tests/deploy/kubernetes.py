@@ -35,7 +35,7 @@ from typing import Any, Final
 from ruamel.yaml import YAML
 
 from fleet_service.cli import main as fleet_service
-from schemas.runtime.figures import Figure, markdown, write
+from schemas.runtime.figures import Figure, format_table, write_figures
 from schemas.runtime.jit import cache_root
 from tests.buckets import BucketServer, bucket_server
 from tests.ports import free_ports
@@ -422,8 +422,8 @@ def main() -> int:
         Figure("kube.commands_failed", len(failed), "of the containers", 0),
         Figure("kube.pods", started, "pods started as processes", 13, "more"),
     ]
-    write(ROOT / ".kube" / "figures.json", "kube", [0], figures)
-    print(markdown(figures))
+    write_figures(ROOT / ".kube" / "figures.json", "kube", [0], figures)
+    print(format_table(figures))
     return int(not all(figure.holds for figure in figures))
 
 

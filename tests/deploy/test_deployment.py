@@ -24,7 +24,7 @@ from ruamel.yaml import YAML
 
 from fleet_service.client.map_client import query_map
 from fleet_service.enrolment.fleet import Enrolment
-from schemas.config import AgentConfig, ServiceConfig, load
+from schemas.config import AgentConfig, ServiceConfig, load_config
 from schemas.runtime.zenoh_session import configuration
 from tests.ports import free_ports
 from tests.schemas.runtime.test_metrics import fetch_page
@@ -209,8 +209,8 @@ def test_systemd_units_restart_without_limit_under_their_own_user() -> None:
 
 def test_shipped_secure_settings_protect_privacy() -> None:
     secure = DEPLOY / "secure"
-    agent = load(secure / "agent.json", AgentConfig)
-    service = load(secure / "service.json", ServiceConfig)
+    agent = load_config(secure / "agent.json", AgentConfig)
+    service = load_config(secure / "service.json", ServiceConfig)
     assert agent.trip_end_m > 0.0
     assert agent.trip_end_s > 0.0
     assert service.public_vehicles > 1
@@ -253,18 +253,18 @@ def test_the_image_copies_only_what_there_is() -> None:
 
 def test_every_configuration_is_for_a_name_on_the_list() -> None:
     secure = DEPLOY / "secure"
-    fleet = load(secure / "fleet.json", Enrolment)
-    service = load(secure / "service.json", ServiceConfig)
+    fleet = load_config(secure / "fleet.json", Enrolment)
+    service = load_config(secure / "service.json", ServiceConfig)
     endpoints = [endpoint for router in fleet.routers.values() for endpoint in router.endpoints]
     assert service.name in fleet.services
     for config in (
         service,
-        load(secure / "agent.json", AgentConfig),
-        load(secure / "reader.json", ServiceConfig),
+        load_config(secure / "agent.json", AgentConfig),
+        load_config(secure / "reader.json", ServiceConfig),
     ):
         assert config.zenoh.connect == endpoints
     assert f"certs/{fleet.readers[0]}.pem" in json.dumps(
-        load(secure / "reader.json", ServiceConfig).zenoh.config
+        load_config(secure / "reader.json", ServiceConfig).zenoh.config
     )
 
 
@@ -311,7 +311,7 @@ def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site
 
         def count_cells() -> int:
             shown = query_map(
-                load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}
+                load_config(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}
             ).table
             return shown.num_rows if shown else 0
 
@@ -345,7 +345,7 @@ def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site
 
 
 def test_deployment_without_certificates_names_the_missing_one(site: Site) -> None:
-    config = load(site.root / "etc" / "agent.json", AgentConfig)
+    config = load_config(site.root / "etc" / "agent.json", AgentConfig)
     with pytest.raises(
         ValueError, match=r"there is no file .*trust.pem; make it with `fleet-service certs`"
     ):

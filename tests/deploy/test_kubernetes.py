@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from fleet_service.enrolment.fleet import Enrolment
-from schemas.config import ServiceConfig, ZenohSettings, load
+from schemas.config import ServiceConfig, ZenohSettings, load_config
 from schemas.runtime import presence
 from schemas.runtime.zenoh_session import open_session
 from tests.deploy import kubernetes
@@ -148,7 +148,7 @@ def test_each_pod_has_settings_of_its_own_name_and_is_on_the_list(
     overlay: str, tmp_path: Path
 ) -> None:
     made = Cluster(overlay, tmp_path)
-    listed = load(tmp_path / "fleet.json", Enrolment) if overlay != "one-node" else None
+    listed = load_config(tmp_path / "fleet.json", Enrolment) if overlay != "one-node" else None
     # Configuration files as they are shipped.
     configs = {
         name: text

@@ -91,7 +91,9 @@ def test_a_missing_key_of_the_router_is_named(tmp_path: Path) -> None:
     ("name", "model"), [("agent.json", AgentConfig), ("service.json", ServiceConfig)]
 )
 def test_shipped_configurations_are_read(name: str, model: type[AgentConfig]) -> None:
-    assert config.load(router.CONFIG.with_name(name), model).zenoh.connect == ["tcp/127.0.0.1:7447"]
+    assert config.load_config(router.CONFIG.with_name(name), model).zenoh.connect == [
+        "tcp/127.0.0.1:7447"
+    ]
 
 
 def test_every_setting_of_a_session_is_one_that_zenoh_knows() -> None:

@@ -34,7 +34,7 @@ def main() -> int:
     if args.only:
         title += f" --only {' '.join(args.only)}"
     found = run_campaigns(chosen, args.out, title, args.quick, args.seed)
-    print(figures.markdown(found))
+    print(figures.format_table(found))
     return 0 if all(figure.holds for figure in found) else 1
 
 

@@ -285,7 +285,7 @@ def main() -> int:
     found = run_campaigns(
         [campaign], args.out, "cluster", quick=args.failovers < FULL, seed=args.seed
     )
-    print(figures.markdown(found))
+    print(figures.format_table(found))
     return 0 if all(one.holds for one in found) else 1
 
 

@@ -42,7 +42,7 @@ from fleet_service.replay import checkpoints
 from schemas import grid, keys, tables, wire
 from schemas.config import LEAST_RAW_DAYS, ServiceConfig
 from schemas.errors import InputError
-from schemas.weather import Report, encode
+from schemas.weather import Report, encode_report
 from schemas.wire import Kind
 from tests.faults.crash_lives import Lives
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, SECOND, batch, key
@@ -242,7 +242,9 @@ class ServiceHistory(Lives[Sent]):
         report = Report(self._now, 0.5, 0.5, 0.5)
         failures = engine.counts.failures["weather"]
         engine.intake.weather.enqueue(
-            weather.WeatherMessage(keys.weather_key(REGION), encode(report), wire.WEATHER_ENCODING)
+            weather.WeatherMessage(
+                keys.weather_key(REGION), encode_report(report), wire.WEATHER_ENCODING
+            )
         )
         engine.intake.update_weather(self._now)
         if engine.counts.failures["weather"] == failures:

@@ -77,8 +77,8 @@ def run_campaigns(
     out.mkdir(parents=True, exist_ok=True)
     for campaign in campaigns:
         found += _run_campaign(campaign, out, quick, seed)
-        figures.write(out / "figures.json", title, [seed], found)
-        (out / "figures.md").write_text(figures.markdown(found) + "\n")
+        figures.write_figures(out / "figures.json", title, [seed], found)
+        (out / "figures.md").write_text(figures.format_table(found) + "\n")
     return found
 
 

@@ -119,7 +119,7 @@ def main() -> int:
     args = parser.parse_args()
     campaign = Campaign("soak", partial(run, minutes=args.minutes), OWES)
     found = run_campaigns([campaign], args.out, "soak", quick=False, seed=0)
-    print(figures.markdown(found))
+    print(figures.format_table(found))
     return 0 if all(one.holds for one in found) else 1
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import tables
-from schemas.config import LEAST_RAW_DAYS, AgentConfig, ServiceConfig, load
+from schemas.config import LEAST_RAW_DAYS, AgentConfig, ServiceConfig, load_config
 from schemas.errors import InputError
 from schemas.vehicle import load_vehicle
 
@@ -36,7 +36,7 @@ def test_a_misspelt_setting_is_reported_with_the_known_name(
     path = tmp_path / "settings.json"
     path.write_text(json.dumps(settings))
     with pytest.raises(InputError) as error:
-        load(path, model)
+        load_config(path, model)
     assert re.search(message, str(error.value)), str(error.value)
 
 
@@ -44,7 +44,7 @@ def test_a_setting_that_is_given_twice_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "settings.json"
     path.write_text('{"archive": {"path": "a"}, "zenoh": {}, "archive": {"copy": "file:///b"}}')
     with pytest.raises(InputError, match="^archive: is given more than once; keep one in the conf"):
-        load(path, ServiceConfig)
+        load_config(path, ServiceConfig)
     path.write_text('{"mass": 1500, "mass": 1600}')
     with pytest.raises(InputError, match="^mass: is given more than once; keep one in the vehicle"):
         load_vehicle(path)
@@ -52,26 +52,26 @@ def test_a_setting_that_is_given_twice_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_file_is_reported_under_the_name_of_its_option(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^config: cannot read .*nosuch.json"):
-        load(tmp_path / "nosuch.json", ServiceConfig)
+        load_config(tmp_path / "nosuch.json", ServiceConfig)
     with pytest.raises(InputError, match="^fleet: cannot read .*nosuch.json"):
-        load(tmp_path / "nosuch.json", Enrolment, "fleet")
+        load_config(tmp_path / "nosuch.json", Enrolment, "fleet")
 
 
 def test_an_archive_without_name_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "service.json"
     path.write_text(json.dumps({"archive": ""}))
     with pytest.raises(InputError, match=r'^archive: should be a folder, or left out \(got ""\);'):
-        load(path, ServiceConfig)
+        load_config(path, ServiceConfig)
 
 
 def test_raw_days_too_few_to_recognise_repeats_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "service.json"
     for days in (0, LEAST_RAW_DAYS):
         path.write_text(json.dumps({"raw_days": days}))
-        assert load(path, ServiceConfig).raw_days == days
+        assert load_config(path, ServiceConfig).raw_days == days
     path.write_text(json.dumps({"raw_days": LEAST_RAW_DAYS - 1}))
     with pytest.raises(InputError, match=r"^raw_days: .* 0 or at least 31 \(got 30\);"):
-        load(path, ServiceConfig)
+        load_config(path, ServiceConfig)
 
 
 @pytest.mark.parametrize("uri", ["foo", "s3://", "bucket/folder"])
@@ -79,7 +79,7 @@ def test_uri_that_can_name_no_folder_is_refused(tmp_path: Path, uri: str) -> Non
     path = tmp_path / "service.json"
     path.write_text(json.dumps({"put_to": uri}))
     with pytest.raises(InputError, match="^put_to: "):
-        load(path, ServiceConfig)
+        load_config(path, ServiceConfig)
 
 
 @pytest.mark.parametrize("name", ["position_std", "yaw_std"])
@@ -90,7 +90,7 @@ def test_an_accuracy_that_a_service_rejects_is_refused_at_the_start(
     assert limits is not None
     path = tmp_path / "agent.json"
     path.write_text(json.dumps({name: limits[1]}))
-    load(path, AgentConfig)
+    load_config(path, AgentConfig)
     path.write_text(json.dumps({name: 1.01 * limits[1]}))
     with pytest.raises(InputError, match=name):
-        load(path, AgentConfig)
+        load_config(path, AgentConfig)

@@ -174,8 +174,8 @@ def test_an_unknown_setting_is_refused_and_defaults_hold(tmp_path: Path) -> None
     path = tmp_path / "agent.json"
     path.write_text('{"state_rate": 3}')
     with pytest.raises(InputError, match="^state_rate: "):
-        config.load(path, config.AgentConfig)
-    assert config.load(None, config.AgentConfig).state_rate_hz == 2.0
+        config.load_config(path, config.AgentConfig)
+    assert config.load_config(None, config.AgentConfig).state_rate_hz == 2.0
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(
     text: str, utc: str
 ) -> None:
     expected = int(np.datetime64(utc, "ns").astype(np.int64))
-    assert config.moment(text, "from") == expected
+    assert config.parse_moment(text, "from") == expected
     at = query.parse({"at": text}).at
     assert at is not None
     assert config.nanoseconds(at) == expected
@@ -204,7 +204,7 @@ def test_invalid_time_is_refused_with_the_field(text: str) -> None:
         InputError,
         match="^from: .* is not a time; write it like|^from: .* lies before 1970 or after",
     ):
-        config.moment(text, "from")
+        config.parse_moment(text, "from")
 
 
 @pytest.mark.parametrize(

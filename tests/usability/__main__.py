@@ -457,8 +457,8 @@ def main() -> int:
             )
     finally:
         shutil.rmtree(place, ignore_errors=True)
-    figures.write(FOLDER / "figures.json", "usability", [SEED], found)
-    print(figures.markdown(found))
+    figures.write_figures(FOLDER / "figures.json", "usability", [SEED], found)
+    print(figures.format_table(found))
     return 0 if len(found) == len(PARTS) and all(figure.holds for figure in found) else 1
 
 

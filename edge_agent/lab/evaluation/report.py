@@ -10,7 +10,7 @@ from typing import Final
 from edge_agent.lab.evaluation.faults import CASES
 from edge_agent.lab.evaluation.printed import DEFAULT, OWN, PRINTED, WHY_NOT
 from edge_agent.lab.evaluation.reliability import LEVELS
-from schemas.runtime.figures import Figure, markdown
+from schemas.runtime.figures import Figure, format_table
 
 PAPERS_HEAD: Final = """\
 ## The papers' figures
@@ -103,7 +103,7 @@ def evaluation_report(figures: Sequence[Figure], *, seeds: int) -> str:
     held = sum(figure.holds for figure in barred)
     parts = (
         f"# Evaluation\n\n{held} of {len(barred)} bars hold; mean over {seeds} seeds.",
-        markdown(barred),
+        format_table(barred),
         PAPERS_HEAD,
         paper_table(by_name),
         WHY_NOT.rstrip(),

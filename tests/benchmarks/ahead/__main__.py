@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from edge_agent.lab.seeds import FIGURES
-from schemas.runtime.figures import Figure, markdown, write
+from schemas.runtime.figures import Figure, format_table, write_figures
 from tests.benchmarks.ahead import approaches, cost, entry, latency
 
 TITLE: Final = "ahead"
@@ -43,7 +43,7 @@ def measure_ahead(seeds: range, quick: bool) -> list[Figure]:
     for row in rows:
         found = row()
         figures += found
-        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
+        print(format_table(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
     return figures
 
 
@@ -60,8 +60,8 @@ def main() -> int:
     seeds = range(FIGURES, FIGURES + args.seeds)
     figures = measure_ahead(seeds, args.quick)
     part = " --quick" if args.quick else f" --seeds {args.seeds}" if args.seeds < SEEDS else ""
-    write(args.out / "figures.json", TITLE + part, list(seeds), figures)
-    text = f"# Road ahead\n\n{markdown(figures)}\n"
+    write_figures(args.out / "figures.json", TITLE + part, list(seeds), figures)
+    text = f"# Road ahead\n\n{format_table(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

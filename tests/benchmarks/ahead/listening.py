@@ -288,10 +288,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     campaign = "tests.benchmarks.ahead.listening" + (
         f" --seeds {args.seeds}" if args.seeds < SEEDS else ""
     )
-    figures.write(
+    figures.write_figures(
         args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found
     )
-    print(figures.markdown(found))
+    print(figures.format_table(found))
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
 
 

@@ -65,8 +65,8 @@ def main() -> int:
         ),
     ]
     found += estimate_million({figure.name: figure.value for figure in found})
-    figures.write(FOLDER / "figures.json", "country", [SEED], found)
-    print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json, {FOLDER}/country.png")
+    figures.write_figures(FOLDER / "figures.json", "country", [SEED], found)
+    print(f"\n{figures.format_table(found)}\n\n{FOLDER}/figures.json, {FOLDER}/country.png")
     return 0 if all(figure.holds for figure in found) else 1
 
 

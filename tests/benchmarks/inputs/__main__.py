@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from edge_agent.lab.seeds import FIGURES
-from schemas.runtime.figures import Figure, markdown, write
+from schemas.runtime.figures import Figure, format_table, write_figures
 from tests.benchmarks.inputs import calibrated, imports, live_benchmark, planted
 
 TITLE: Final = "inputs"
@@ -46,7 +46,7 @@ def measure_inputs(folder: Path, recorded: Path | None, quick: bool) -> list[Fig
     for row in rows:
         found = row()
         figures += found
-        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
+        print(format_table(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
     return figures
 
 
@@ -63,8 +63,8 @@ def main(words: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(dir=args.out) as scratch:
         figures = measure_inputs(Path(scratch), args.recorded, args.quick)
     title = TITLE + " --quick" * args.quick
-    write(args.out / "figures.json", title, [FIGURES, FIGURES + 1], figures)
-    text = f"# Inputs\n\n{markdown(figures)}\n"
+    write_figures(args.out / "figures.json", title, [FIGURES, FIGURES + 1], figures)
+    text = f"# Inputs\n\n{format_table(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

@@ -182,8 +182,8 @@ def main() -> int:
         began = time.monotonic()
         found += PARTS[name](arguments.out, arguments.quick)
         print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-        figures.write(arguments.out / "figures.json", "iov", [SEED], found)
-    print(figures.markdown(found))
+        figures.write_figures(arguments.out / "figures.json", "iov", [SEED], found)
+    print(figures.format_table(found))
     return 0 if all(one.holds for one in found) else 1
 
 

@@ -81,7 +81,7 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     (tmp_path / "spark").mkdir()
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tmp_path / "tries")
-    told = spark.spread(session, tasks_of(drives, None, tmp_path / "spark"), dying)
+    told = spark.run_tasks(session, tasks_of(drives, None, tmp_path / "spark"), dying)
     assert sorted(path.name for path in (tmp_path / "tries").iterdir()) == [
         path.name for path in drives
     ], "all died"

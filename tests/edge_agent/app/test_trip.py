@@ -43,13 +43,13 @@ def drive_trip(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
     admitted = []
     blocks = []
     for block in trip.corrected_blocks(source(drive), lambda: np.full(ROWS, np.nan)):
-        if trip._looking is not None:
-            trip._looking.result()
+        if trip._examination is not None:
+            trip._examination.result()
         admitted.append(trip.is_admitted())
         blocks.append(block)
     trip.learn_rest()
-    if trip._looking is not None:
-        trip._looking.result()
+    if trip._examination is not None:
+        trip._examination.result()
     trip.close()
     return admitted, blocks
 
@@ -153,7 +153,7 @@ def test_doctor_runs_next_to_the_live_loop(smooth: Recorded, tmp_path: Path) -> 
     trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
     for block in trip.corrected_blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
         replace(block)  # stands for the main loop, which does not wait for the doctor
-    until(lambda: trip._looking is not None and trip._looking.done())
+    until(lambda: trip._examination is not None and trip._examination.done())
     assert trip.is_admitted()
     trip.close()
 

@@ -69,7 +69,7 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
         partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries
     )
     zones = zones_of(archive)
-    told = spark.spread(session, zones, dying)
+    told = spark.run_tasks(session, zones, dying)
     assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, (
         "none was killed"
     )
@@ -86,7 +86,7 @@ def test_errors_of_spark_tasks_are_reported_as_input_errors(
     session: Any,  # noqa: ANN401
 ) -> None:
     with pytest.raises(InputError, match="log: 1.parquet is no log; give another"):
-        spark.spread(session, ["1.parquet"], _refuse_task)
+        spark.run_tasks(session, ["1.parquet"], _refuse_task)
     with pytest.raises(InputError, match="engine: Spark gave up: "):
-        spark.spread(session, ["x"], partial(int, base=10))
-    assert spark.spread(session, [], _refuse_task) == []
+        spark.run_tasks(session, ["x"], partial(int, base=10))
+    assert spark.run_tasks(session, [], _refuse_task) == []

@@ -143,7 +143,7 @@ def make(root: Path) -> dict[str, Any]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if turn == 2:
-                report = weather.encode(
+                report = weather.encode_report(
                     weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0)
                 )
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))

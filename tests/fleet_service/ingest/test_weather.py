@@ -49,13 +49,13 @@ from tests.waiting import matched, until
 
 def test_weather_report_round_trips_and_missing_values_are_unknown() -> None:
     prior = np.full(mugrid.BINS, 1.0 / mugrid.BINS)
-    got = weather.decode(
-        weather.encode(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))
+    got = weather.decode_report(
+        weather.encode_report(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))
     )
     assert (got.time, got.road_temperature, got.precipitation) == (17, -2.5, 0.25)
     assert np.isnan(got.air_temperature)
     assert got.prior == pytest.approx(prior)
-    by_hand = weather.decode(b'{"time": "5", "airTemperature": 3.5}', wire.JSON)
+    by_hand = weather.decode_report(b'{"time": "5", "airTemperature": 3.5}', wire.JSON)
     assert (by_hand.time, by_hand.air_temperature) == (5, 3.5)
     assert np.isnan(by_hand.precipitation)
     assert by_hand.prior is None
@@ -75,7 +75,7 @@ def test_weather_report_round_trips_and_missing_values_are_unknown() -> None:
 )
 def test_a_report_that_breaks_a_rule_is_refused_by_name(report: Report, field: str) -> None:
     with pytest.raises(WireError, match=f"^{field}: .*; "):
-        weather.decode(weather.encode(report))
+        weather.decode_report(weather.encode_report(report))
 
 
 def file(path: Path, **columns: object) -> Path:
@@ -148,7 +148,9 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     config = ServiceConfig(weather=path)
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
-    told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
+    told = weather.encode_report(
+        Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0)
+    )
     engine.intake.weather.enqueue(
         WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
     )
@@ -178,7 +180,7 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     root = tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
-            told = weather.encode(
+            told = weather.encode_report(
                 Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2))
             )
             engine.intake.weather.enqueue(
@@ -214,7 +216,7 @@ def test_weather_that_no_longer_matters_is_not_loaded_or_kept(tmp_path: Path) ->
     recent = (now // SECOND - 7200) * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq, begin in enumerate((old, recent), 1):
-            told = weather.encode(Report(begin, road_temperature=-1.0))
+            told = weather.encode_report(Report(begin, road_temperature=-1.0))
             engine.intake.weather.enqueue(
                 WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
             )
@@ -241,9 +243,12 @@ def test_a_running_service_takes_weather_over_its_key(
     matched(publisher)
     publisher.put(bytes(wire.MAX_BYTES + 1), encoding=wire.WEATHER_ENCODING)
     publisher.put(
-        weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING
+        weather.encode_report(Report(time.time_ns(), precipitation=2.0)),
+        encoding=wire.WEATHER_ENCODING,
     )
-    publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
+    publisher.put(
+        weather.encode_report(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING
+    )
     counts = service.service.engine.counts
     until(lambda: counts.weather == 1 and counts.refused["weather"] == 2)
     publisher.undeclare()
@@ -256,7 +261,7 @@ def test_inbox_keeps_a_limited_number_of_reports_the_newest(tmp_path: Path) -> N
     many = WAITING + 50
     key = keys.weather_key(REGION)
     for k in range(many):
-        payload = weather.encode(Report(now + k * 1000, precipitation=2.0))
+        payload = weather.encode_report(Report(now + k * 1000, precipitation=2.0))
         inbox.enqueue(WeatherMessage(key, payload, wire.WEATHER_ENCODING))
     taken = inbox.take(now)
     assert taken is not None

@@ -35,7 +35,7 @@ def test_late_uploads_of_a_former_lease_holder_overwrite_nothing(
 
     def hears(one: Machine, region: int) -> None:
         inbox = WeatherInbox(one.root, one.config.name, fusion, ServiceCounts())
-        report = weather.encode(weather.Report(time.time_ns(), precipitation=1.0))
+        report = weather.encode_report(weather.Report(time.time_ns(), precipitation=1.0))
         inbox.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
         assert inbox.take(time.time_ns()) is not None
 

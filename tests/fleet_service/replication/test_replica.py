@@ -28,7 +28,7 @@ from fleet_service.replication import file_transfer, replica, upload_backoff, up
 from fleet_service.replication.bucket import CopyError, ObjectBucket
 from fleet_service.replication.replica import OWNER, BucketReplica
 from fleet_service.replication.upload_journal import Stamp, UploadJournal, last_copy_url
-from schemas.config import ServiceConfig, load
+from schemas.config import ServiceConfig, load_config
 from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.buckets import SECRET, BucketServer, list_copied_files
@@ -342,10 +342,10 @@ def test_bucket_works_by_environment_alone_and_errors_are_stable_lines(
 
 def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) -> None:
     (path := tmp_path / "service.json").write_text('{"archive": "here"}')
-    assert load(path, ServiceConfig).archive.path == Path("here")
+    assert load_config(path, ServiceConfig).archive.path == Path("here")
     settings = {"path": "here", "copy": "s3://b/c", "store": {"secret_access_key": SECRET}}
     path.write_text(json.dumps({"archive": settings}))
-    config = load(path, ServiceConfig)
+    config = load_config(path, ServiceConfig)
     assert (config.archive.second, config.archive.options) == (
         "s3://b/c",
         {"secret_access_key": SECRET},
@@ -355,7 +355,7 @@ def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) ->
     assert again.archive.second == "s3://b/c", "what is written can be read"
     path.write_text(json.dumps({"archive": {"store": {"secret_access_key": [SECRET]}}}))
     with pytest.raises(InputError) as told:
-        load(path, ServiceConfig)
+        load_config(path, ServiceConfig)
     assert SECRET not in str(told.value)
 
 

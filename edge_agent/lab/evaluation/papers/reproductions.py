@@ -20,7 +20,7 @@ from edge_agent.lab.evaluation.papers import (
 from edge_agent.lab.evaluation.papers.drawing import write_plots
 from edge_agent.lab.evaluation.papers.outcome import Reproduction
 from edge_agent.lab.evaluation.papers.page import report_html, report_markdown
-from schemas.runtime.figures import Figure, write
+from schemas.runtime.figures import Figure, write_figures
 
 REPRODUCTIONS: Final[dict[str, Callable[[Sequence[int]], Reproduction]]] = {
     "000": reproduction_000.reproduce,
@@ -49,7 +49,7 @@ def write_paper(
         Figure(f"papers.{paper}.elements.missing_unsaid", unsaid, "1", 0.0, "less"),
         Figure(f"papers.{paper}.seconds", seconds, "s", LONGEST_S, "less"),
     ]
-    write(
+    write_figures(
         folder / "figures.json",
         f"edge-agent evaluate --paper {paper}",
         list(seeds),
