@@ -71,14 +71,14 @@ def _publish_drive(system: System, log: Path) -> tuple[Cells, list[str]]:
                 "--config",
                 str(system.agent),
             ]
-            with redirect_stdout(StringIO()) as told:
+            with redirect_stdout(StringIO()) as stdout:
                 assert edge_agent([*words, "--start", "now"]) == 0
-            said = json.loads(told.getvalue().splitlines()[-1])
-            assert said["observations_acknowledged"] > 50
-            assert said["rejected"] == 0
-        with redirect_stdout(StringIO()) as told, redirect_stderr(StringIO()) as warned:
+            counts = json.loads(stdout.getvalue().splitlines()[-1])
+            assert counts["observations_acknowledged"] > 50
+            assert counts["rejected"] == 0
+        with redirect_stdout(StringIO()) as stdout, redirect_stderr(StringIO()) as warned:
             assert edge_agent(words) == 1, "of 2018, and nobody takes it"
-        refused = json.loads(told.getvalue().splitlines()[-1])["rejected"]
+        refused = json.loads(stdout.getvalue().splitlines()[-1])["rejected"]
         assert refused > 50
         assert (
             f"error: publish: {refused} records were refused; the log is older than a month: "

@@ -151,13 +151,13 @@ def time_start(image: Image) -> float:
                 words, cwd=image.folder, env=image.environment, stdout=out, stderr=out
             )
         until(lambda: service.poll() is not None or "ready: " in lines.read_text(), START_S)
-        took = time.monotonic() - began
+        elapsed_s = time.monotonic() - began
         for process in (service, router):
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0, lines.read_text()
     assert "ready: " in lines.read_text()
     assert COMPILING not in lines.read_text(), "its kernels were compiled when it was built"
-    return took
+    return elapsed_s
 
 
 def main() -> int:

@@ -78,15 +78,17 @@ def find_interpreters() -> list[str]:
     found = []
     for version in VERSIONS:
         why = "no such command on this machine"
-        for here in list_candidates(version):
-            said = subprocess.run(
-                [here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60
+        for python in list_candidates(version):
+            completed = subprocess.run(
+                [python, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60
             )
-            if said.stdout.strip() == version:
-                found.append(here)
+            if completed.stdout.strip() == version:
+                found.append(python)
                 break
-            last = ((said.stderr or said.stdout).strip() or "says nothing").splitlines()[-1]
-            why = f"{here} does not work ({last[:100]})"
+            last = ((completed.stderr or completed.stdout).strip() or "says nothing").splitlines()[
+                -1
+            ]
+            why = f"{python} does not work ({last[:100]})"
         else:
             print(f"python{version} skipped: {why}", flush=True)
     return found

@@ -148,11 +148,11 @@ class Network:
         )
         self.routers[router] = process
         assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.startswith("router: "), f"{router} does not start"
-        heard = {place.partition("/")[0]: place for place in said.split()[1:]}
-        self.endpoints[router] = heard[self.protocol]
-        self.between[router] = heard["tls"]
+        line = process.stdout.readline()
+        assert line.startswith("router: "), f"{router} does not start"
+        endpoints = {place.partition("/")[0]: place for place in line.split()[1:]}
+        self.endpoints[router] = endpoints[self.protocol]
+        self.between[router] = endpoints["tls"]
 
     def stop(self, router: str) -> None:
         """Stop one of the two routers."""
@@ -163,14 +163,14 @@ class Network:
         """Wait until a message of each of the two routers reaches the other."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with (
-                self.open_session(SERVICE, first) as here,
-                self.open_session(SERVICE, second) as there,
+                self.open_session(SERVICE, first) as receiver,
+                self.open_session(SERVICE, second) as sender,
             ):
                 arrived = threading.Event()
-                subscriber = here.declare_subscriber(PROBE, partial(_set_arrived, arrived))
+                subscriber = receiver.declare_subscriber(PROBE, partial(_set_arrived, arrived))
                 # Repeat a put. A publisher that is older than the link may never learn of its
                 # subscriber.
-                until(partial(_has_arrived, there, arrived))
+                until(partial(_has_arrived, sender, arrived))
                 subscriber.undeclare()
 
     def close(self) -> None:
@@ -183,8 +183,8 @@ def _set_arrived(arrived: threading.Event, _: zenoh.Sample) -> None:
     arrived.set()
 
 
-def _has_arrived(there: zenoh.Session, arrived: threading.Event) -> bool:
-    there.put(PROBE, b"")
+def _has_arrived(sender: zenoh.Session, arrived: threading.Event) -> bool:
+    sender.put(PROBE, b"")
     return arrived.is_set()
 
 

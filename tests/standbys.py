@@ -93,7 +93,7 @@ class Host:
         self.to_router = Link(int(router.rpartition(":")[2]))
         self.to_bucket = Link(int(bucket.store["endpoint"].rpartition(":")[2]))
         store = {**bucket.store, "endpoint": f"http://127.0.0.1:{self.to_bucket.port}"}
-        told = {
+        document = {
             "zenoh": {"connect": [f"tcp/127.0.0.1:{self.to_router.port}"]},
             "standby": True,
             "segment_s": 0.1,
@@ -101,7 +101,7 @@ class Host:
             **settings,
         }
         config = folder / "service.json"
-        config.write_text(json.dumps(told))
+        config.write_text(json.dumps(document))
         words = ["-m", module, "run", "--config", str(config)]
         self.part = Part("service", [sys.executable, *words], folder)
 

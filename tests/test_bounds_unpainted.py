@@ -50,9 +50,9 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     synthetic.write_archive(root, WORLD, 2000)
     compact(root)
     rollup.complete_parts(root)
-    told = two_cells()
-    old = told.set_column(
-        told.schema.get_field_index("mu"), "mu", pa.array([0.7, 0.7], pa.float32())
+    tile = two_cells()
+    old = tile.set_column(
+        tile.schema.get_field_index("mu"), "mu", pa.array([0.7, 0.7], pa.float32())
     )
     snapshots.write_snapshot(root, old, synthetic.START_NS + 20 * 3600 * 10**9)
     return root

@@ -17,47 +17,47 @@ from tests.waiting import until
 
 
 @pytest.fixture
-def there(tmp_path: Path) -> Iterator[Stage]:
+def stage(tmp_path: Path) -> Iterator[Stage]:
     """Yield a router, a service and two vehicles, after the service has acknowledged a first
     report.
     """
-    with open_stage(tmp_path, segment_s=0.2) as there:
-        there.make_load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
-        until(lambda: read_journals(there.journals).settled)
-        yield there
+    with open_stage(tmp_path, segment_s=0.2) as stage:
+        stage.make_load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
+        until(lambda: read_journals(stage.journals).settled)
+        yield stage
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_agent_and_service_settle_all_records_and_stop(
-    there: Stage, number: signal.Signals
+    stage: Stage, number: signal.Signals
 ) -> None:
-    (load,) = there.loads
-    for part in (load, there.service):
+    (load,) = stage.loads
+    for part in (load, stage.service):
         assert part.stop(number) == 0
     end = json.loads(load.read_lines()[-1])
     assert end["unsettled"] == 0
-    census = compare_with_archive(there.journals, there.archive)
+    census = compare_with_archive(stage.journals, stage.archive)
     assert (census.lost, census.doubled) == (0, 0)
     # On a busy machine the service may reach its time limit before the last step. No row is lost
     # then, as the check above shows.
     assert any(
-        line.startswith(("status: ", "shutdown incomplete")) for line in there.service.read_lines()
+        line.startswith(("status: ", "shutdown incomplete")) for line in stage.service.read_lines()
     )
 
 
 @pytest.mark.campaign
-def test_agent_and_service_leave_a_frozen_router_without_loss(there: Stage) -> None:
-    (load,) = there.loads
-    there.router.freeze()
-    stored = len(read_journals(there.journals).stored)
-    until(lambda: len(read_journals(there.journals).stored) > stored + 4)
-    for part in (load, there.service):
+def test_agent_and_service_leave_a_frozen_router_without_loss(stage: Stage) -> None:
+    (load,) = stage.loads
+    stage.router.freeze()
+    stored = len(read_journals(stage.journals).stored)
+    until(lambda: len(read_journals(stage.journals).stored) > stored + 4)
+    for part in (load, stage.service):
         assert part.stop() == 0
-    there.router.send_signal(signal.SIGCONT)
-    there.service.start()
-    there.service.line_with("ready: ")
+    stage.router.send_signal(signal.SIGCONT)
+    stage.service.start()
+    stage.service.line_with("ready: ")
     load.start()
-    there.drain(60.0)
-    census = compare_with_archive(there.journals, there.archive)
+    stage.drain(60.0)
+    census = compare_with_archive(stage.journals, stage.archive)
     assert (census.lost, census.acknowledged_lost, census.doubled) == (0, 0, 0)

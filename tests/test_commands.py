@@ -169,9 +169,9 @@ def test_destructive_command_has_a_dry_run_and_asks_on_a_terminal(
     assert fleet_service.cli.main([*command, "--dry-run"]) == 0
     assert "would be" in capsys.readouterr().out
     assert list_files(archive) == before
-    said = on_terminal([sys.executable, "-m", "fleet_service.cli", *command], "n\n")
-    assert "Continue? [y/N]" in said
-    assert "nothing" in said
+    output = on_terminal([sys.executable, "-m", "fleet_service.cli", *command], "n\n")
+    assert "Continue? [y/N]" in output
+    assert "nothing" in output
     assert list_files(archive) == before
     assert fleet_service.cli.main([*command, "--yes"]) == 0
     assert list_files(archive) != before
@@ -179,19 +179,19 @@ def test_destructive_command_has_a_dry_run_and_asks_on_a_terminal(
 
 def on_terminal(command: list[str], answer: str) -> str:
     """Run the command on a terminal with `answer` as the typed input, and return its output."""
-    here, there = pty.openpty()
-    with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
-        os.close(there)
-        os.write(here, answer.encode())
-        said = b""
+    controller, terminal = pty.openpty()
+    with subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal) as process:
+        os.close(terminal)
+        os.write(controller, answer.encode())
+        output = b""
         try:
-            while block := os.read(here, 4096):
-                said += block
+            while block := os.read(controller, 4096):
+                output += block
         except OSError:  # the program has closed its terminal
             pass
         assert process.wait(60) == 0
-    os.close(here)
-    return said.decode()
+    os.close(controller)
+    return output.decode()
 
 
 def test_forget_reports_an_unknown_vehicle(archive: Path, capsys: Capture) -> None:
@@ -211,9 +211,9 @@ def test_map_export_is_of_the_present_and_states_its_time(
     then = pq.read_table(tmp_path / "map.parquet")
     assert {f"{time:%S}" for time in then["snapshot_time"].to_pylist()} == {"50"}
     assert fleet_service.cli.main([*words, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["as_of"] > "2026-"
-    assert said["rows"] >= then.num_rows
+    document = json.loads(capsys.readouterr().out)
+    assert document["as_of"] > "2026-"
+    assert document["rows"] >= then.num_rows
 
 
 def test_rows_in_the_log_are_compacted_and_counted(archive: Path, capsys: Capture) -> None:
@@ -224,8 +224,8 @@ def test_rows_in_the_log_are_compacted_and_counted(archive: Path, capsys: Captur
     whole = capsys.readouterr()
     assert "compacted first: " in whole.err
     visits = [
-        sum(json.loads(line)["observations"] for line in said.out.splitlines())
-        for said in (without, whole)
+        sum(json.loads(line)["observations"] for line in captured.out.splitlines())
+        for captured in (without, whole)
     ]
     assert visits[0] < visits[1]
 
@@ -355,9 +355,9 @@ def test_missing_package_is_one_line_with_its_extra(capsys: pytest.CaptureFixtur
         raise ModuleNotFoundError("No module named 'scipy.stats'", name="scipy.stats")
 
     assert commandline.run_guarded(import_missing) == commandline.BAD_INPUT
-    said = capsys.readouterr().err
-    assert said.startswith("error: packages: scipy is not installed; pip install ")
-    assert "analytics" in said
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("error: packages: scipy is not installed; pip install ")
+    assert "analytics" in stderr
 
     def import_unknown() -> int:
         raise ModuleNotFoundError("No module named 'typo'", name="typo")

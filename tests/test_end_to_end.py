@@ -37,7 +37,7 @@ class System:
     def __init__(self, folder: Path, endpoint: str) -> None:
         self.folder = folder
         self.endpoint = endpoint
-        self.said: list[str] = []
+        self.events: list[str] = []
         self.agent = folder / "agent.json"
         zenoh_settings = {"connect": [endpoint]}
         self.agent.write_text(
@@ -51,11 +51,11 @@ class System:
     def start(self) -> None:
         """Start a service on the archive, also after `stop`, and wait until it is ready."""
         self._stop = threading.Event()
-        service = Service(self.config, self.folder / "archive", logger_into(self.said))
+        service = Service(self.config, self.folder / "archive", logger_into(self.events))
         self._thread = threading.Thread(target=service.run, args=(self._stop,))
-        before = len(self.said)
+        before = len(self.events)
         self._thread.start()
-        until(lambda: any(line.startswith("ready") for line in self.said[before:]))
+        until(lambda: any(line.startswith("ready") for line in self.events[before:]))
 
     def stop(self) -> None:
         """Stop the service. Before it ends, it stores and acknowledges the received reports."""

@@ -123,7 +123,7 @@ def test_tuned_memberships_change_the_estimates_of_replay(tmp_path: Path) -> Non
         )
         == 0
     )
-    said = []
+    estimates = []
     for more in ([], ["--memberships", str(tmp_path / "mine.json")]):
         words = [
             "replay",
@@ -135,8 +135,8 @@ def test_tuned_memberships_change_the_estimates_of_replay(tmp_path: Path) -> Non
             *more,
         ]
         assert main(words) in (0, 3)
-        said.append(pq.read_table(tmp_path / "e.parquet")["adaptation"])
-    assert not said[0].equals(said[1])
+        estimates.append(pq.read_table(tmp_path / "e.parquet")["adaptation"])
+    assert not estimates[0].equals(estimates[1])
     assert (
         main([*words[:2], "--out", str(tmp_path / "e.parquet"), "--estimator", "sr-ukf", *more])
         == 2

@@ -90,13 +90,13 @@ def test_a_person_s_report_by_hand_as_the_page_has_it_is_acknowledged(tmp_path: 
         reader: zenoh.Session | None = open_session(settings)
         assert reader is not None
         with reader:
-            heard: list[bytes] = []
+            acks: list[bytes] = []
             reader.declare_subscriber(
-                keys.ack_key("anna"), lambda sample: heard.append(sample.payload.to_bytes())
+                keys.ack_key("anna"), lambda sample: acks.append(sample.payload.to_bytes())
             )
             exec(found[1].replace("tcp/127.0.0.1:7447", endpoints[0]), {})
-            until(lambda: heard)
-    vehicle, (stream,) = wire.decode_ack(heard[0])
+            until(lambda: acks)
+    vehicle, (stream,) = wire.decode_ack(acks[0])
     assert vehicle == "anna"
     assert stream.durable
     assert not stream.rejected
@@ -109,10 +109,10 @@ def test_replay_without_a_vehicle_file_explains_how_to_get_one(
     assert edge_agent_main(["simulate", "slalom", "--duration", "2", "--out", str(log)]) == 0
     words = ["replay", str(log), "--out", str(tmp_path / "e.parquet")]
     assert edge_agent_main(words) == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("error: vehicle: cannot read ")
-    assert f"--vehicle-out {tmp_path / 'drive.json'}" in said
-    again = ["simulate", "slalom", "--duration", "2", "--out", str(log), *said.split()[-4:-2]]
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    assert last_line.startswith("error: vehicle: cannot read ")
+    assert f"--vehicle-out {tmp_path / 'drive.json'}" in last_line
+    again = ["simulate", "slalom", "--duration", "2", "--out", str(log), *last_line.split()[-4:-2]]
     assert edge_agent_main(again) == 0
     assert edge_agent_main(words) in (0, 3)
 
@@ -184,8 +184,8 @@ def test_argument_errors_are_one_line(
     with pytest.raises(SystemExit) as left:
         main(line.split())
     assert left.value.code == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("error: ")
+    (error_line,) = capsys.readouterr().err.splitlines()
+    assert error_line.startswith("error: ")
 
 
 def test_title_of_the_first_estimate_has_the_speed_of_its_curve() -> None:

@@ -62,14 +62,14 @@ def test_missed_targets_are_first_and_marked(folder: Path) -> None:
 
 def test_fault_campaign_is_kept_alone_if_it_is_complete(folder: Path) -> None:
     left = folder / "left.json"
-    for title, said in (
+    for title, expected in (
         ("faults --only path", "1 figures"),
         ("faults-quick --only path", "unchanged"),
     ):
         figures.write_figures(
             left, title, [0], [Figure("faults.path.teleports", 1000.0, "cars", 100)]
         )
-        assert said in results.keep_figures("faults", left)
+        assert expected in results.keep_figures("faults", left)
 
 
 def test_keep_takes_only_complete_runs_and_keeps_the_rest(folder: Path) -> None:

@@ -59,8 +59,8 @@ def agent() -> list[Figure]:
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with open_stage(folder / "stage") as there:
-            found = [*measure_live(folder, there.endpoint), *measure_fleet(folder, there.endpoint)]
+        with open_stage(folder / "stage") as stage:
+            found = [*measure_live(folder, stage.endpoint), *measure_fleet(folder, stage.endpoint)]
         return [*measure_start(folder), *found, *measure_replay(folder)]
 
 

@@ -238,9 +238,9 @@ def _count_differences(root: Path, readings: Path) -> int:
         one, other = (
             question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark")
         )
-        said = differs(one, other, question)
-        print_progress(f"{question.name}: {said or 'the engines agree'}")
-        count += said is not None
+        difference = differs(one, other, question)
+        print_progress(f"{question.name}: {difference or 'the engines agree'}")
+        count += difference is not None
     return count
 
 

@@ -61,5 +61,5 @@ def cluster() -> list[Figure]:
             if not objects:
                 raise RuntimeError("nothing was put into the bucket")
     least = statistics.median(alone)
-    said = f"of the {least:.3f} s without a bucket; medians of {len(both)} batches"
-    return [Figure("cluster.ack_p50_s", statistics.median(both) / least, said, BAR)]
+    unit = f"of the {least:.3f} s without a bucket; medians of {len(both)} batches"
+    return [Figure("cluster.ack_p50_s", statistics.median(both) / least, unit, BAR)]

@@ -45,10 +45,10 @@ def growth() -> list[Figure]:
     """
     cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
     slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])
-    told = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
+    costs = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
     return [
         Figure(
-            "bench.growth.rate_exponent", slope, f"of the rate; an observation costs {told}", 1.05
+            "bench.growth.rate_exponent", slope, f"of the rate; an observation costs {costs}", 1.05
         )
     ]
 

@@ -41,9 +41,9 @@ def rows_different(root: Path, uri: str) -> int:
         files = [
             pq.read_table(path, partitioning=None) for path in layout.compacted_files(root, kind)
         ]
-        there = pa.concat_tables(files)
-        seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
-        ours = _count_rows(there)
+        exported = pa.concat_tables(files)
+        seen = table_of(uri, kind).scan().to_arrow().select(exported.column_names)
+        ours = _count_rows(exported)
         theirs = _count_rows(seen)
         different += (ours - theirs).total() + (theirs - ours).total()
     return different

@@ -273,7 +273,7 @@ async def _measure_pushes(on: Stage, count: int) -> float:
     that a watcher missed counts as infinity.
     """
     host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
-    heard = [dict[int, float]() for _ in range(count)]
+    received = [dict[int, float]() for _ in range(count)]
     local = on.town.local_marker(on.town.marker)
     begins = base64.b64encode(struct.pack("<I", on.town.marker))[:5]
 
@@ -289,7 +289,7 @@ async def _measure_pushes(on: Stage, count: int) -> float:
                 for number in vehicles[place >> 2 == local].tolist():
                     own[number] = time.time()
 
-    tasks = [asyncio.create_task(watch_events(own)) for own in heard]
+    tasks = [asyncio.create_task(watch_events(own)) for own in received]
     while (
         json.loads(await asyncio.to_thread(_fetch_page, f"{on.address}health"))["watchers"] < count
     ):
@@ -304,7 +304,7 @@ async def _measure_pushes(on: Stage, count: int) -> float:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    late = [own.get(number, math.inf) - begun for own in heard for number, begun in put.items()]
+    late = [own.get(number, math.inf) - begun for own in received for number, begun in put.items()]
     return float(np.quantile(late, 0.95, method="higher"))
 
 

@@ -144,9 +144,9 @@ def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
             )
         stretches.take_changes()
         before = make_publication(OURS, stretches.standing, now, before)
-        told = list_records(before)
-        ended |= {f"{one.get('id')}" for one in told if is_over(one)}
-        unended += abs(sum(not is_over(one) for one in told) - len(stretches.standing))
+        records = list_records(before)
+        ended |= {f"{one.get('id')}" for one in records if is_over(one)}
+        unended += abs(sum(not is_over(one) for one in records) - len(stretches.standing))
         invalid += valid is not None and not valid(before)
     enough = len(ended) >= LEAST_ENDED
     return (float(invalid) if valid and enough else math.nan), (

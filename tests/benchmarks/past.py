@@ -35,7 +35,7 @@ SIDE = 320
 QUERIES = 15
 
 
-def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
+def measure_past(root: Path, log_line: Callable[[str], None]) -> list[Figure]:
     """Measure the time [ms] of a query for a thousand cells of a past map (parameter `at`), and the
     largest difference between the probabilities of a cell before and after a restart. Return the
     figures.
@@ -49,9 +49,9 @@ def measure_past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         after = _read_beliefs(engine)
     difference = _find_largest_change(before, after)
-    tell(f"restart: {len(before[0])} cells, {difference:.1e}")
+    log_line(f"restart: {len(before[0])} cells, {difference:.1e}")
     spent, cells = _time_queries(root)
-    tell(f"at=: {np.round(np.array(spent) * 1e3)} ms, {cells} cells")
+    log_line(f"at=: {np.round(np.array(spent) * 1e3)} ms, {cells} cells")
     return [
         Figure("archive.at_query_p50_ms", float(np.median(spent)) * 1e3, f"ms, {cells} cells", 500),
         Figure("archive.restart_difference", difference, "probability", 1e-6),

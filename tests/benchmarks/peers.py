@@ -143,8 +143,8 @@ def by_stonesoup(problem: Problem) -> FloatArray:
         inputs["before"] = problem.readings[k - 1]
         inputs["now"] = problem.readings[k]
         moment = began + timedelta(seconds=k * problem.gone)
-        told = Detection(problem.readings[k, :3].reshape(-1, 1), timestamp=moment)
-        state = updater.update(SingleHypothesis(predictor.predict(state, moment), told))
+        detection = Detection(problem.readings[k, :3].reshape(-1, 1), timestamp=moment)
+        state = updater.update(SingleHypothesis(predictor.predict(state, moment), detection))
     return np.asarray(state.state_vector, dtype=float)
 
 

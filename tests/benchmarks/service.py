@@ -193,11 +193,11 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
 
     Alerts of neighbouring cells, and alerts that are published again, do not count.
     """
-    heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
+    received: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
     def record_alert(sample: zenoh.Sample) -> None:
         now = time.perf_counter()
-        heard.put((wire.decode_alert(sample.payload.to_bytes()).cell, now))
+        received.put((wire.decode_alert(sample.payload.to_bytes()).cell, now))
 
     session.declare_subscriber(f"{keys.ROOT}/alert/**", record_alert)
     out = []
@@ -211,7 +211,7 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
         began = time.perf_counter()
         put_batch(session, second)
         when = next(
-            when for found, when in iter(lambda: heard.get(timeout=30.0), None) if found == cell
+            when for found, when in iter(lambda: received.get(timeout=30.0), None) if found == cell
         )
         assert when > began, "an alert before there was a second vehicle"
         out.append(1e3 * (when - began))
@@ -227,14 +227,14 @@ def ack_delays_s(
     Raises:
         TimeoutError: a batch was not acknowledged.
     """
-    heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
+    received: SimpleQueue[tuple[int, float]] = SimpleQueue()
 
     def record_ack(sample: zenoh.Sample) -> None:
         now = time.perf_counter()
         for stream in wire.decode_ack(sample.payload.to_bytes())[1]:
             for first, last in stream.durable:
                 for seq in range(first, last + 1):
-                    heard.put((seq, now))
+                    received.put((seq, now))
 
     session.declare_subscriber(keys.ack_key(vehicle), record_ack)
     rng = np.random.default_rng(0)
@@ -248,7 +248,7 @@ def ack_delays_s(
         time.sleep(rng.uniform(*apart_s))
     out = []
     for _ in sent:
-        seq, when = heard.get(timeout=30.0)
+        seq, when = received.get(timeout=30.0)
         out.append(when - sent[seq])
     return out
 

@@ -51,7 +51,7 @@ def shards() -> list[Figure]:
     alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
     whole = [statistics.median(services_s(sent, split)) for split in (1, 2)]
     rates = [2 * BURST * ROWS / seconds for seconds in (alone[0], whole[0])]
-    told = (
+    unit = (
         f"times one, which took {rates[1]:.0f} observations/s; router and sender on the same cores"
     )
     return [
@@ -62,7 +62,7 @@ def shards() -> list[Figure]:
             1.6,
             "more",
         ),
-        Figure("bench.shards.over_zenoh", whole[0] / whole[1], told),
+        Figure("bench.shards.over_zenoh", whole[0] / whole[1], unit),
     ]
 
 
@@ -117,15 +117,15 @@ def engine(root: str) -> None:
         [Message(*fields) for fields in burst]
         for burst in pickle.loads((Path(root) / "sent").read_bytes())
     ]
-    with closing(Engine(ServiceConfig(), Path(root) / "archive")) as there:
+    with closing(Engine(ServiceConfig(), Path(root) / "archive")) as opened:
         gc.freeze()
         for burst in ([], *bursts):
             sys.stdin.readline()
             for at in range(0, len(burst), TURN):
-                there.intake.ingest(burst[at : at + TURN], time.time_ns())
-            there.settlement.flush()
+                opened.intake.ingest(burst[at : at + TURN], time.time_ns())
+            opened.settlement.flush()
             print("done", flush=True)
-        assert there.counts.observations == sum(map(len, bursts)) * ROWS, there.counts
+        assert opened.counts.observations == sum(map(len, bursts)) * ROWS, opened.counts
 
 
 def _make_burst(number: int) -> list[Message]:
@@ -211,9 +211,9 @@ def _send_burst(session: zenoh.Session, burst: Sequence[Message]) -> float:
         )
     if not done.wait(PATIENCE_S):
         raise TimeoutError(f"{len(burst) - settled} batches were not acknowledged")
-    took = time.perf_counter() - began
+    elapsed_s = time.perf_counter() - began
     subscriber.undeclare()
-    return took
+    return elapsed_s
 
 
 _BLOCK: Final = zenoh.CongestionControl.BLOCK

@@ -48,12 +48,12 @@ def sizing() -> list[Figure]:
         measured = found.pop("bytes")
         estimated = sum(split_memory(MemoryContent(**found)).values())
         content = ", ".join(f"{number} {name}" for name, number in found.items())
-        said = (
+        unit = (
             f"of the measured memory; {measured / 1e6:.0f} MB measured, {estimated / 1e6:.0f} MB "
             f"estimated for {content}"
         )
         error = abs(estimated / measured - 1.0)
-        out.append(Figure(f"scale.calculator_error.v{vehicles}", error, said, BAR))
+        out.append(Figure(f"scale.calculator_error.v{vehicles}", error, unit, BAR))
     return out
 
 

@@ -61,43 +61,52 @@ def replay_difference(logs: Sequence[Path], folder: Path) -> float:
     """Estimate the recorded drives `logs` on Spark, where each task is killed once and repeated,
     and in this process. Return the number of estimate files that differ.
     """
-    here = folder / "here"
-    there = folder / "there"
+    local_folder = folder / "here"
+    spark_folder = folder / "there"
     tries = folder / "tries"
-    there.mkdir(parents=True)
+    spark_folder.mkdir(parents=True)
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     with spark_sessions.spark_session(2) as session:
         dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
-        told = spark.run_tasks(session, tasks_of(logs, None, there), dying)
-    ours = list(estimate_drives(tasks_of(logs, None, here), ESTIMATOR, 1))
-    if len(list(tries.iterdir())) != len(logs) or any(outcome.error for outcome in (*told, *ours)):
+        outcomes = spark.run_tasks(session, tasks_of(logs, None, spark_folder), dying)
+    ours = list(estimate_drives(tasks_of(logs, None, local_folder), ESTIMATOR, 1))
+    if len(list(tries.iterdir())) != len(logs) or any(
+        outcome.error for outcome in (*outcomes, *ours)
+    ):
         raise RuntimeError("a drive was not estimated, or its task was not killed")
-    names = {path.name for folder in (here, there) for path in folder.iterdir()}
-    return float(sum(_read_content(here / name) != _read_content(there / name) for name in names))
+    names = {path.name for folder in (local_folder, spark_folder) for path in folder.iterdir()}
+    return float(
+        sum(
+            _read_content(local_folder / name) != _read_content(spark_folder / name)
+            for name in names
+        )
+    )
 
 
 def rebuild_difference(folder: Path) -> float:
     """Rebuild a map from an archive on Spark, where each task is killed once and repeated, and in
     this process. Return the largest difference between both maps.
     """
-    archive, here, there, tries = (folder / name for name in ("archive", "here", "there", "tries"))
+    archive, local_folder, spark_folder, tries = (
+        folder / name for name in ("archive", "here", "there", "tries")
+    )
     fill(archive, WORLD)
-    here.mkdir()
-    there.mkdir()
+    local_folder.mkdir()
+    spark_folder.mkdir()
     zones = zones_of(archive)
     with spark_sessions.spark_session(2) as session:
         spark.run_tasks(
             session,
             zones,
             spark_sessions.killed_at_first(
-                partial(rebuild_zone, Rebuild(archive, there, UNTIL)), str, tries
+                partial(rebuild_zone, Rebuild(archive, spark_folder, UNTIL)), str, tries
             ),
         )
-    if sum(zone.cells for zone in rebuild(Rebuild(archive, here, UNTIL))) == 0 or len(
+    if sum(zone.cells for zone in rebuild(Rebuild(archive, local_folder, UNTIL))) == 0 or len(
         list(tries.iterdir())
     ) != len(zones):
         raise RuntimeError("no cell was rebuilt, or a task was not killed")
-    return difference(rebuilt_map(here), rebuilt_map(there))
+    return difference(rebuilt_map(local_folder), rebuilt_map(spark_folder))
 
 
 def replay_scaling(logs: Sequence[Path], folder: Path) -> float:

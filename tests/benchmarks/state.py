@@ -94,11 +94,11 @@ def checkpoint_s(engine: Engine, sent: list[Message], now: int) -> tuple[float, 
     worker.start()
     began = time.perf_counter()
     assert engine.save_checkpoint(threading.Event())
-    took = time.perf_counter() - began
+    elapsed_s = time.perf_counter() - began
     busy = len(turns)
     saved.set()
     worker.join()
-    return took, max(turns[: busy + 1])
+    return elapsed_s, max(turns[: busy + 1])
 
 
 def restart_s(folder: Path, root: Path) -> float:
@@ -114,6 +114,6 @@ def restart_s(folder: Path, root: Path) -> float:
         began = time.perf_counter()
         service.start()
         service.line_with("ready: ")
-        took = time.perf_counter() - began
+        elapsed_s = time.perf_counter() - began
         service.kill()
-    return took
+    return elapsed_s

@@ -95,10 +95,10 @@ def same_filter(drive: Drive) -> float:
         ArithmeticError: the estimates differ.
     """
     t, signals, readings = drive.repeat_samples(len(drive.t), 1)
-    said: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
-    speed = float(said.vx[0, 0])
+    estimates: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
+    speed = float(estimates.vx[0, 0])
     means = make_limit(Limit, drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
-    ours = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)[1:, 0]
+    ours = np.stack([estimates.vx, estimates.vy, estimates.yaw_rate], axis=-1)[1:, 0]
     apart = float(np.abs(ours - means[:, [0, 1, 4]]).max())
     if not apart < AGREE:
         raise ArithmeticError(f"the C kernel and {NAME} are {apart:g} apart: not the same filter")

@@ -132,7 +132,7 @@ def drive(endpoint: str) -> None:
         )
         sent += 1
         time.sleep(max(began + sent / RATE - time.perf_counter(), 0.0))
-    took = time.perf_counter() - began
+    elapsed_s = time.perf_counter() - began
     since = began + WARM_S
     deadline = time.perf_counter() + PATIENCE_S
     while len(acks.waits) < sent and time.perf_counter() < deadline:
@@ -141,7 +141,7 @@ def drive(endpoint: str) -> None:
     found = {
         "p50": statistics.median(waits),
         "p99": float(np.quantile(waits, 0.99)),
-        "rate": sent / took,
+        "rate": sent / elapsed_s,
     }
     print(json.dumps({**found, "acknowledged": len(acks.waits) / sent}), flush=True)
     session.close()

@@ -223,9 +223,9 @@ def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     assert not any(one.holds for one in unheard.figures())
     assert compare.demo_works(unheard.figures()), "few passes are no failure of the demo"
     found = compare.MapComparison(make_tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
-    told = report_figures(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
+    figures = report_figures(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
     assert grip.line() in capsys.readouterr().out
-    shares = {figure.name: figure.value for figure in told}
+    shares = {figure.name: figure.value for figure in figures}
     assert (shares["demo.lost_grip.warned"], shares["demo.lost_grip.unwarned"]) == (0.5, 1.0)
     assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(
         shares

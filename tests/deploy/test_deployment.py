@@ -334,14 +334,14 @@ def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site
             assert process.wait(timeout=10.0) == 0, (
                 f"{process.args!r} after {time.monotonic() - began:.1f} s"
             )
-    said = [
+    events = [
         json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()
     ]
-    assert said[0]["event"] == "ready"
+    assert events[0]["event"] == "ready"
     # On a busy machine the service may reach its time limit before the last step. Then it reports
     # that.
-    assert said[-1]["event"] in ("status", "shutdown incomplete")
-    assert said[-1]["service"] == "shard-0"
+    assert events[-1]["event"] in ("status", "shutdown incomplete")
+    assert events[-1]["service"] == "shard-0"
 
 
 def test_deployment_without_certificates_names_the_missing_one(site: Site) -> None:

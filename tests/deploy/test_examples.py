@@ -63,10 +63,10 @@ def serve_ice(folder: Path) -> Iterator[str]:
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
     with session, running(settings, folder):
-        heard: zenoh.Session | None = open_session(settings)
-        assert heard is not None
-        with heard:
-            fleet = Fleet(heard).await_services()
+        monitoring_session: zenoh.Session | None = open_session(settings)
+        assert monitoring_session is not None
+        with monitoring_session:
+            fleet = Fleet(monitoring_session).await_services()
             fleet.settle(
                 *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3))
             )
@@ -96,9 +96,9 @@ def test_the_archive_is_the_same_in_pandas_and_duckdb(tmp_path: Path, capsys: Ou
     synthetic.write_archive(tmp_path / "archive", world, 2000)
     compact(tmp_path / "archive")
     archive_questions.main(tmp_path / "archive", tmp_path / "out")
-    said = capsys.readouterr().out
-    assert said.startswith("largest difference of the two: 0")
-    assert "stretches, " in said
+    stdout = capsys.readouterr().out
+    assert stdout.startswith("largest difference of the two: 0")
+    assert "stretches, " in stdout
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: str(path.stem))

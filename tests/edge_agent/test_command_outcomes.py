@@ -54,8 +54,8 @@ def test_estimates_given_as_a_log_are_recognised(
     out = tmp_path / ("out.parquet" if command == "import" else "out.html")
     words = [command, str(path), "--out", str(out)]
     assert main(words) == 2
-    said = capsys.readouterr().err
-    assert said == (
+    stderr = capsys.readouterr().err
+    assert stderr == (
         f"error: log: {path} contains estimates, not signals; give the signal log from which they "
         "were estimated\n"
     )
@@ -116,11 +116,11 @@ def test_import_without_a_channel_that_replay_needs_returns_1(
     rows = "".join(f"0.{k},1,0,5,50,50,50,,0\n" for k in range(3))
     path.write_text(f"t,ax,ay,gier,{wheels},delta_fl\n{rows}")
     assert main(["import", str(path), "--out", str(tmp_path / "little.parquet")]) == 1
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     profile = tmp_path / "little.profile.json"
-    assert "no reading of yaw_rate, omega_rr: check and replay refuse" in said
-    assert f"--profile {profile}" in said
-    assert said.endswith("signals without a channel: gier\n")
+    assert "no reading of yaw_rate, omega_rr: check and replay refuse" in stderr
+    assert f"--profile {profile}" in stderr
+    assert stderr.endswith("signals without a channel: gier\n")
     assert main(["check", str(tmp_path / "little.parquet"), "--vehicle", "class:suv"]) == 2
 
 
@@ -245,12 +245,12 @@ def test_replay_reports_unsent_records_and_how_to_continue(
         "counts twice\n"
     ) in seen.err
     assert main([*words, "--name", "car-two"]) == 1
-    said = capsys.readouterr().err
-    assert f"{left} records of other vehicle names stay in {spool};" in said
-    again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", said)
+    stderr = capsys.readouterr().err
+    assert f"{left} records of other vehicle names stay in {spool};" in stderr
+    again = re.search(r"repeat the command( with --start 2\S+Z), no record counts twice", stderr)
     assert again is not None
-    assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in said
-    assert "note: the log has no date: published as if it ended now" in said
+    assert f"note: repeated{again[1]}, this drive counts once; otherwise it is another\n" in stderr
+    assert "note: the log has no date: published as if it ended now" in stderr
 
 
 def test_records_lost_by_a_damaged_outbox_are_reported(

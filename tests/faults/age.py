@@ -120,8 +120,8 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
     """Return the folder `root` of an archive with `observations` observations. Generate the archive
     if `root` contains none of this size.
     """
-    said = root / "size"
-    if said.exists() and said.read_text() == str(observations):
+    size_file = root / "size"
+    if size_file.exists() and size_file.read_text() == str(observations):
         return root
     shutil.rmtree(root, ignore_errors=True)
     synthetic.write_archive(root, SyntheticFleet(observations, DAYS, vehicles=1000), SEGMENT)
@@ -131,7 +131,7 @@ def _ensure_archive(site: Site, root: Path, observations: int) -> Path:
     subprocess.run(
         [sys.executable, "-m", "fleet_service.cli", *words], check=True, stdout=subprocess.DEVNULL
     )
-    said.write_text(str(observations))
+    size_file.write_text(str(observations))
     return root
 
 

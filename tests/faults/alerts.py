@@ -49,29 +49,29 @@ def run(site: Site) -> list[Figure]:
     each = site.choose_amount(20, 10)
     missing = 0
     waits = []
-    with open_stage(site.folder) as there:
-        beside = _make_second_router(there)
-        with _open_session(there.endpoint) as driver, _open_session(beside.command[-1]) as watcher:
+    with open_stage(site.folder) as stage:
+        beside = _make_second_router(stage)
+        with _open_session(stage.endpoint) as driver, _open_session(beside.command[-1]) as watcher:
             fleet = Fleet(driver).await_services()
-            heard = dict[Place, float]()
+            received = dict[Place, float]()
             watched = watcher.declare_subscriber(
-                f"{keys.ROOT}/alert/**", lambda sample: _record_alert(heard, sample)
+                f"{keys.ROOT}/alert/**", lambda sample: _record_alert(received, sample)
             )
             for turn in range(site.choose_amount(8, 1)):
                 beside.kill()
                 until(lambda: not list(watcher.info.routers_zid()))
-                heard.clear()
+                received.clear()
                 fleet.settle(*_make_ice_batches(turn, each))
                 until(partial(_has_alerts, driver, each * (turn + 1)))
                 standing = _list_alerts(driver)
-                assert not heard, "the watcher was not away"
+                assert not received, "the watcher was not away"
                 beside.start()
                 until(lambda: list(watcher.info.routers_zid()))
                 back = time.monotonic()
-                while standing - heard.keys() and time.monotonic() < back + SOON_S:
+                while standing - received.keys() and time.monotonic() < back + SOON_S:
                     time.sleep(0.02)
-                missing += len(standing - heard.keys())
-                waits += [heard[place] - back for place in standing & heard.keys()]
+                missing += len(standing - received.keys())
+                waits += [received[place] - back for place in standing & received.keys()]
             watched.undeclare()
         beside.kill()
     site.say(
@@ -85,17 +85,17 @@ def run(site: Site) -> list[Figure]:
     ]
 
 
-def _make_second_router(there: Stage) -> Part:
+def _make_second_router(stage: Stage) -> Part:
     """Start and return a second router, which is connected to the first and keeps its port over
     restarts. Clients of the first router do not learn this port, so they cannot connect to the
     second.
     """
-    config = Path(there.folder) / "router-b.json"
+    config = Path(stage.folder) / "router-b.json"
     settings = zenoh.Config.from_file(str(CONFIG))
-    settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))
+    settings.insert_json5("connect/endpoints", json.dumps([stage.endpoint]))
     config.write_text(str(settings))
     command = [sys.executable, "-m", "deploy.router", "--config", str(config), "--listen"]
-    part = Part("router-b", [*command, f"tcp/127.0.0.1:{free_ports(1)[0]}"], there.folder)
+    part = Part("router-b", [*command, f"tcp/127.0.0.1:{free_ports(1)[0]}"], stage.folder)
     part.start()
     part.line_with("router: ")
     return part
@@ -107,10 +107,10 @@ def _open_session(endpoint: str) -> zenoh.Session:
     return session
 
 
-def _record_alert(heard: dict[Place, float], sample: zenoh.Sample) -> None:
+def _record_alert(received: dict[Place, float], sample: zenoh.Sample) -> None:
     alert = wire.decode_alert(sample.payload.to_bytes())
     if alert.raised:
-        heard.setdefault((alert.cell, alert.sector), time.monotonic())
+        received.setdefault((alert.cell, alert.sector), time.monotonic())
 
 
 def _make_ice_batches(turn: int, places: int) -> list[Batch]:

@@ -274,7 +274,7 @@ def delete(ground: Ground) -> bool:
     return not all(
         put
         for one in (ground.monitor, ground.reader, ground.honest)
-        for _, put, _ in list(one.heard)
+        for _, put, _ in list(one.received)
     )
 
 
@@ -319,7 +319,7 @@ def can_overhear(ground: Ground, session: zenoh.Session) -> bool:
     ground.await_effects(session)
     ground.drive()
     ground.await_effects(session, listener)
-    return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in listener.heard)
+    return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in listener.received)
 
 
 @register_attempt
@@ -357,9 +357,11 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
     token = ground.honest.session.liveliness().declare_token(keys.alive_key(HONEST))
     asked = f"{keys.ROOT}/alive/*"
     until(lambda: any(reply.ok for reply in ground.monitor.session.liveliness().get(asked)))
-    told = any(reply.ok for reply in ground.open_session(ROGUE, ROUTERS[1]).liveliness().get(asked))
+    is_visible = any(
+        reply.ok for reply in ground.open_session(ROGUE, ROUTERS[1]).liveliness().get(asked)
+    )
     token.undeclare()
-    return told
+    return is_visible
 
 
 def as_router(ground: Ground, mode: str) -> bool:
@@ -368,7 +370,7 @@ def as_router(ground: Ground, mode: str) -> bool:
     given = given.model_copy(
         update={"config": {**given.config, "mode": mode, "listen/endpoints": []}}
     )
-    told = {
+    task = {
         "settings": given.model_dump(),
         "name": ROGUE,
         "hear": [f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/ack/**"],
@@ -381,19 +383,19 @@ def as_router(ground: Ground, mode: str) -> bool:
     ) as process:
         assert process.stdin
         assert process.stdout
-        print(json.dumps(told), file=process.stdin, flush=True)
+        print(json.dumps(task), file=process.stdin, flush=True)
         assert process.stdout.readline(), "the rogue does not open a session"
         ground.drive()
         print("look", file=process.stdin, flush=True)
-        heard = json.loads(process.stdout.readline())
+        received = json.loads(process.stdout.readline())
     ground.await_effects(ground.honest.session)
-    own = set(told["put"])  # a client also receives its own messages
+    own = set(task["put"])  # a client also receives its own messages
     overheard = [
-        name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own
+        name for name in received if not name.startswith(f"{keys.ROOT}/map/") and name not in own
     ]
     return (
         bool(overheard)
-        or heard.count(key(HONEST)) > 1
+        or received.count(key(HONEST)) > 1
         or ground.monitor.has_payload(SECRET)
         or ground.reader.has_payload(SECRET)
     )
@@ -427,7 +429,7 @@ def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
             listener = Listener(session, (f"{keys.ROOT}/**",))
             list(session.get(f"{keys.ROOT}/map/**"))
             ground.drive()
-            through |= bool(listener.heard)
+            through |= bool(listener.received)
     ground.await_effects(ground.reader.session)
     return through or ground.monitor.has_payload(SECRET)
 
@@ -478,7 +480,7 @@ def private_message_that_is_too_large_travels(ground: Ground) -> bool:
     def put_both() -> bool:
         session.put(keys.ahead_key(ROGUE), b"small")
         session.put(keys.ahead_key(ROGUE), SECRET + bytes(PRIVATE_BYTES))
-        return len(listener.heard) > 1
+        return len(listener.received) > 1
 
     until(put_both)
     return listener.has_payload(SECRET)
@@ -527,4 +529,4 @@ def revoked_vehicle(ground: Ground) -> bool:
     ground.drive()
     with suppress(InputError):
         return bool(again.enrol(make_enrolment()))
-    return ground.monitor.has_payload(SECRET) or bool(listener.heard)
+    return ground.monitor.has_payload(SECRET) or bool(listener.received)

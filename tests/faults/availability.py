@@ -59,20 +59,20 @@ def run(site: Site) -> list[Figure]:
     """
     asked = site.choose_amount(20, 6)
     served = {}
-    with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
-        session = open_session(ZenohSettings(connect=[there.endpoint]))
+    with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as stage:
+        session = open_session(ZenohSettings(connect=[stage.endpoint]))
         assert session is not None
         with session:
-            _fill_map(session, there, site.choose_amount(40, 10))
+            _fill_map(session, stage, site.choose_amount(40, 10))
             _await_tile(session)
-        words = ["page", "--connect", there.endpoint, "--port", "0"]
-        words += ["--archive", str(there.archive)]
+        words = ["page", "--connect", stage.endpoint, "--port", "0"]
+        words += ["--archive", str(stage.archive)]
         page = Part("page", [sys.executable, "-m", "fleet_service.cli", *words], site.folder)
         page.start()
         try:
             address = urlsplit(page.line_with("page: ").removeprefix("page: "))
             moment = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-            target = Target(str(address.hostname), int(address.port or 0), there.endpoint, moment)
+            target = Target(str(address.hostname), int(address.port or 0), stage.endpoint, moment)
             time.sleep(1.0)
             _await_page(target)
             for name, (attack, ask) in ATTACKS.items():

@@ -91,7 +91,7 @@ def _make_draft(car: int, now: float) -> tuple[Draft, int]:
     cell = int(grid.cell_of(latitude, longitude))
     region = int(grid.region_of(cell))
     time = START + round(now * NS)
-    told = batch(
+    message = batch(
         f"car-{car:03}",
         1,
         time,
@@ -104,10 +104,10 @@ def _make_draft(car: int, now: float) -> tuple[Draft, int]:
 
     def encode_batch(seq: int, first_held: int) -> bytes:
         return wire.encode(
-            replace(told, boot=car + 1, region=region, seq=seq, first_held=first_held)
+            replace(message, boot=car + 1, region=region, seq=seq, first_held=first_held)
         )
 
-    return Draft(told.vehicle, Kind.OBSERVATION, region, 1, encode_batch), cell
+    return Draft(message.vehicle, Kind.OBSERVATION, region, 1, encode_batch), cell
 
 
 def run(site: Site) -> list[Figure]:

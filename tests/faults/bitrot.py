@@ -112,19 +112,19 @@ def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
                 engine.intake.ingest(list(messages(turn)), now_of(ROUNDS))
         engine.settlement.flush()
         counts = engine.counts
-        told: list[Path] = []
-        rows = {kind: _read_rows(root, kind, told) for kind in Kind}
+        damaged: list[Path] = []
+        rows = {kind: _read_rows(root, kind, damaged) for kind in Kind}
         counted = counts.files_set_aside + counts.checkpoints_refused + counts.key_failures
-        counted += counts.witnesses_damaged + len(told)
+        counted += counts.witnesses_damaged + len(damaged)
         return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
 
 
-def _read_rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]]:
+def _read_rows(root: Path, kind: Kind, damaged: list[Path]) -> list[tuple[str, int, int]]:
     columns = ("vehicle", "seq", "row")
     return sorted(
         row
         for table in reading.read_tables(
-            root, kind, columns, damaged=lambda path, _: told.append(path)
+            root, kind, columns, damaged=lambda path, _: damaged.append(path)
         )
         for row in zip(*(table[name].to_pylist() for name in columns), strict=True)
     )

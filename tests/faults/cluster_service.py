@@ -34,13 +34,13 @@ def _print_mark(sign: str, what: str) -> None:
 
 
 def run(
-    what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
+    what: str, module: str, words: Sequence[str], stop: threading.Event, stdin: str | None = None
 ) -> str | None:
     """Run a module in a subprocess, as the service does for compaction, and print a line when the
     subprocess begins and when it ends.
     """
     _print_mark(BEGINS, COMPACTING)
-    output = _run(what, module, words, stop, told)
+    output = _run(what, module, words, stop, stdin)
     _print_mark(ENDS, COMPACTING)
     return output
 

@@ -419,10 +419,10 @@ def _require_alive(host: Host) -> Host:
 
 
 def _was_amid(host: Host, what: str) -> bool:
-    said = [
+    marks = [
         line for line in host.part.read_lines() if line in (f"{what} {BEGINS}", f"{what} {ENDS}")
     ]
-    return bool(said) and said[-1].endswith(BEGINS)
+    return bool(marks) and marks[-1].endswith(BEGINS)
 
 
 def find_difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:

@@ -105,8 +105,8 @@ def is_complete(tables: Iterable[pa.Table], owed: int) -> bool:
     rows = Counter(
         p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
     )
-    there = all((seq, row) in rows for seq in range(1, owed + 1) for row in range(ROWS))
-    return there and (not rows or max(rows.values()) == 1)
+    has_rows = all((seq, row) in rows for seq in range(1, owed + 1) for row in range(ROWS))
+    return has_rows and (not rows or max(rows.values()) == 1)
 
 
 def run(site: Site) -> list[Figure]:

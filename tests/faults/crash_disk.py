@@ -222,8 +222,8 @@ class CrashDisk:
         """Write into the folder `target` the files that a machine would find after a power loss at
         this moment.
         """
-        there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
-        numbered = {self._number.get(path.stat().st_ino): path for path in there}
+        paths = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
+        numbered = {self._number.get(path.stat().st_ino): path for path in paths}
         written = {
             number: path.read_bytes() for number, path in numbered.items() if number is not None
         }

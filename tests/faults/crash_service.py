@@ -267,7 +267,7 @@ class ServiceHistory(Lives[Sent]):
         reports = (
             load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.weather_files(root)
         )
-        there = {
+        stored = {
             time
             for table in reports
             if table is not None
@@ -275,7 +275,7 @@ class ServiceHistory(Lives[Sent]):
         }
         found += [
             f"the weather of {time} is lost"
-            for time in sorted(self.weather - there)
+            for time in sorted(self.weather - stored)
             if time // layout.DAY_NS > self.retired
         ]
         found += self._find_state_errors(root, rows)
@@ -373,14 +373,14 @@ def _find_differences(
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)
-    there = begun.fusion.slots_of(
+    begun_slots = begun.fusion.slots_of(
         whole.fusion.cell[slots], whole.fusion.sector[slots].astype(np.int64)
     )
-    if (there < 0).any():
-        return [f"{int((there < 0).sum())} cells are not in the checkpoint's map"]
-    restored = begun.fusion.beliefs(there, now)
+    if (begun_slots < 0).any():
+        return [f"{int((begun_slots < 0).sum())} cells are not in the checkpoint's map"]
+    restored = begun.fusion.beliefs(begun_slots, now)
     difference = np.abs(restored - whole.fusion.beliefs(slots, now)).max(axis=1)
     # The cell was at rest and dropped, and has been visited again since.
-    is_revisited = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]
+    is_revisited = begun.fusion.live.visits[begun_slots] < whole.fusion.live.visits[slots]
     excessive = difference[difference > np.where(is_revisited, NEARLY, accepted)]
     return [f"the maps differ by {excessive.max():.2g}"] if len(excessive) else []

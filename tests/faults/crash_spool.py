@@ -109,11 +109,11 @@ def _find_problems(path: Path, image: Files, owed: set[int], known: dict[int, by
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)
     again = Outbox(path, boot=6, capacity_bytes=CAPACITY)
-    there = {batch.seq: batch.payload for batch in read_batches(again)}
+    kept = {batch.seq: batch.payload for batch in read_batches(again)}
     again.close()
-    found = [f"batch {seq} is lost" for seq in owed - there.keys()]
+    found = [f"batch {seq} is lost" for seq in owed - kept.keys()]
     return found + [
         f"batch {seq} is not what was stored"
-        for seq, payload in there.items()
+        for seq, payload in kept.items()
         if known.get(seq) != payload
     ]

@@ -215,7 +215,7 @@ def _run_flood(running: Network, honest: Sequence[Honest], seconds: float) -> in
     """Let the honest vehicles drive during the flood. Return the number of messages that the
     flooding vehicle sent.
     """
-    told = {
+    task = {
         "settings": settings(running.endpoints[ROUTERS[0]], running.folder).model_dump(),
         "name": FLOODER,
         "cells": list_places(),
@@ -228,7 +228,7 @@ def _run_flood(running: Network, honest: Sequence[Honest], seconds: float) -> in
     ) as process:
         assert process.stdin
         assert process.stdout
-        print(json.dumps(told), file=process.stdin, flush=True)
+        print(json.dumps(task), file=process.stdin, flush=True)
         assert process.stdout.readline(), "the flooder does not open a session"
         _drive(honest, seconds)
         return int(process.stdout.readline())

@@ -29,9 +29,9 @@ def main() -> None:
     """Send observations as fast as possible, with the settings and for the time that the line on
     standard input states.
     """
-    told = json.loads(sys.stdin.readline())
-    name = told["name"]
-    cells = told["cells"]
+    task = json.loads(sys.stdin.readline())
+    name = task["name"]
+    cells = task["cells"]
     messages = [
         pb.ObservationBatch.FromString(
             wire.encode(
@@ -39,7 +39,7 @@ def main() -> None:
                     name,
                     1,
                     time.time_ns(),
-                    [told["mu"]] * rows,
+                    [task["mu"]] * rows,
                     cell=[cell] * rows,
                     latitude=[latitude] * rows,
                     longitude=[longitude] * rows,
@@ -49,12 +49,12 @@ def main() -> None:
         for cell, latitude, longitude in cells
         for rows in ROWS
     ]
-    session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), name))
+    session = zenoh.open(configuration(ZenohSettings.model_validate(task["settings"]), name))
     place = key(name)
     encoding = wire.ENCODING[Kind.OBSERVATION]
     block = zenoh.CongestionControl.BLOCK
     print("ready", flush=True)
-    end = time.monotonic() + told["seconds"]
+    end = time.monotonic() + task["seconds"]
     sent = 0
     while time.monotonic() < end:
         message = messages[sent % len(messages)]

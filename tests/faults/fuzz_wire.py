@@ -58,10 +58,10 @@ def run(site: Site) -> list[Figure]:
     r = random.Random(site.seed)
     sent = 0
     answers = 0
-    with open_stage(site.folder, metrics_port=0) as there:
-        there.make_load(HONEST, RATE, flush_s=0.5).start()
-        there.loads[0].line_with("ready: ")
-        session = open_session(ZenohSettings(connect=[there.endpoint]))
+    with open_stage(site.folder, metrics_port=0) as stage:
+        stage.make_load(HONEST, RATE, flush_s=0.5).start()
+        stage.loads[0].line_with("ready: ")
+        session = open_session(ZenohSettings(connect=[stage.endpoint]))
         assert session is not None
         with session:
             mutants = Mutants(site.seed, time.time_ns())
@@ -69,7 +69,7 @@ def run(site: Site) -> list[Figure]:
             deadline = time.monotonic() + HONEST_S
             turn = 0
             while turn < turns or (
-                len(read_journals(there.journals).settled) < HONEST_LEAST
+                len(read_journals(stage.journals).settled) < HONEST_LEAST
                 and time.monotonic() < deadline
             ):
                 mutants.now = time.time_ns()
@@ -78,14 +78,14 @@ def run(site: Site) -> list[Figure]:
                 if not turn % 50:
                     site.say(f"{sent} malformed, {answers} answers")
                 turn += 1
-            alive = there.service.is_alive and all(part.is_alive for part in there.loads)
-            counts = _read_metrics(there)
-        there.drain(DRAIN_S)
-        code = there.service.stop() if there.service.is_alive else 1
-        census = compare_with_archive(there.journals, there.archive)
-        said = [
+            alive = stage.service.is_alive and all(part.is_alive for part in stage.loads)
+            counts = _read_metrics(stage)
+        stage.drain(DRAIN_S)
+        code = stage.service.stop() if stage.service.is_alive else 1
+        census = compare_with_archive(stage.journals, stage.archive)
+        tracebacks = [
             line
-            for part in (there.service, *there.loads)
+            for part in (stage.service, *stage.loads)
             for line in part.read_lines()
             if "Traceback" in line
         ]
@@ -93,9 +93,11 @@ def run(site: Site) -> list[Figure]:
     refused = sum(
         value for name, value in counts.items() if name.startswith("gripmap_refused_messages")
     )
-    site.say(f"{census}; {failures:.0f} answers failed, {len(said)} tracebacks, exit {code}")
+    site.say(f"{census}; {failures:.0f} answers failed, {len(tracebacks)} tracebacks, exit {code}")
     return [
-        make_figure("faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(said) + failures),
+        make_figure(
+            "faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(tracebacks) + failures
+        ),
         make_figure("faults.fuzz_wire.honest_lost", census.lost),
         make_figure("faults.fuzz_wire.doubled", census.doubled),
         make_figure("faults.fuzz_wire.honest", census.settled),
@@ -165,9 +167,9 @@ def _ask_query(session: zenoh.Session, r: random.Random, mutants: Mutants) -> in
         return 0
 
 
-def _read_metrics(there: Stage) -> dict[str, float]:
+def _read_metrics(stage: Stage) -> dict[str, float]:
     """Return the current metrics of the service under attack, by name."""
-    address = there.service.line_with("ready: ").split()[-1]
+    address = stage.service.line_with("ready: ").split()[-1]
     with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:
         lines = [line for line in page.read().decode().splitlines() if not line.startswith("#")]
     return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines}

@@ -41,7 +41,7 @@ class Listener:
 
     session: zenoh.Session
     expressions: tuple[str, ...]
-    heard: list[tuple[str, bool, bytes]] = field(default_factory=list)
+    received: list[tuple[str, bool, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._subscribers = [
@@ -50,13 +50,13 @@ class Listener:
 
     def _record_sample(self, sample: zenoh.Sample) -> None:
         put = sample.kind == zenoh.SampleKind.PUT
-        self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
+        self.received.append((str(sample.key_expr), put, sample.payload.to_bytes()))
 
     def has_payload(self, payload: bytes) -> bool:
         """Return True if the listener (subscriber that observes the effects of an attack) received
         a message that contains this payload.
         """
-        return any(payload in told for _, _, told in list(self.heard))
+        return any(payload in message for _, _, message in list(self.received))
 
 
 class Ground:
@@ -111,7 +111,7 @@ class Ground:
         Other messages on the Zenoh key of these acknowledgements are ignored: acknowledgements of
         earlier batches, and forged ones that cannot be decoded.
         """
-        for place, _, payload in list(self.monitor.heard):
+        for place, _, payload in list(self.monitor.received):
             if place == keys.ack_key(sent.vehicle):
                 with suppress(WireError):
                     _, streams = wire.decode_ack(payload)

@@ -63,7 +63,7 @@ def run(site: Site) -> list[Figure]:
     sent = 0
     at = 0.0
     replayed = 0
-    said = deque[Message](maxlen=100)
+    queued = deque[Message](maxlen=100)
     config = ServiceConfig()
     limits = RateLimiter(
         config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at
@@ -78,16 +78,16 @@ def run(site: Site) -> list[Figure]:
             honest = [_make_message(_make_visit(name, second + 1, now, second)) for name in HONEST]
             attack: list[Message] = []
             while True:
-                again = sent % 7 == 6 and bool(said)
+                again = sent % 7 == 6 and bool(queued)
                 one = (
-                    said[int(random_.integers(len(said)))]
+                    queued[int(random_.integers(len(queued)))]
                     if again
                     else _make_attack(sent, second, now, random_)
                 )
                 if not limits.allows(one.key, len(one.payload), one.encoding):
                     break
                 attack.append(one)
-                said.append(one)
+                queued.append(one)
                 sent = sent + 1
                 replayed = replayed + again
             began = time.perf_counter()

@@ -93,18 +93,18 @@ def run(site: Site) -> list[Figure]:
     for number in range(site.choose_amount(10, 1)):
         began = time.monotonic()
         begin_with_old_rows(site.folder / f"round-{number}" / "archive")
-        with open_stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as there:
+        with open_stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as stage:
             census, load = _run_round(
-                there,
+                stage,
                 site.choose_amount(AGENTS, 6),
                 site.choose_amount(KILLS_PER_ROUND, 5),
                 random_,
             )
         upkeep = upkeep.union(
-            _find_finished_jobs(there.archive), {"retention"} if load.retired else ()
+            _find_finished_jobs(stage.archive), {"retention"} if load.retired else ()
         )
-        difference = max(difference, map_difference(there.archive))
-        kills += sum(part.starts - 1 for part in there.parts)
+        difference = max(difference, map_difference(stage.archive))
+        kills += sum(part.starts - 1 for part in stage.parts)
         offered = offered + load.observations
         seconds = seconds + load.seconds
         whole_s += time.monotonic() - began
@@ -180,14 +180,15 @@ def map_difference(archive: Path) -> float:
         ours[name].equals(theirs[name]) for name in ("cell", "sector", "observations", "vehicles")
     ):
         return float("inf")
-    told = ("mu", "mu_lower", "mu_upper", "p_slippery")
+    quantities = ("mu", "mu_lower", "mu_upper", "p_slippery")
     return max(
-        float(np.nanmax(np.abs(ours[name].to_numpy() - theirs[name].to_numpy()))) for name in told
+        float(np.nanmax(np.abs(ours[name].to_numpy() - theirs[name].to_numpy())))
+        for name in quantities
     )
 
 
 def _run_round(
-    there: Stage, agents: int, kills: int, random_: random.Random
+    stage: Stage, agents: int, kills: int, random_: random.Random
 ) -> tuple[Census, Load]:
     """Run one round of kills. Return the counts of batches and rows (census), and the load from the
     start of all processes until the end.
@@ -196,57 +197,57 @@ def _run_round(
     (sorted) rows and written a checkpoint (saved state).
     """
     for number in range(agents):
-        there.make_load([f"sim-{number:03}"], RATE, seed=number).start()
-    for part in there.loads:
+        stage.make_load([f"sim-{number:03}"], RATE, seed=number).start()
+    for part in stage.loads:
         part.line_with("ready: ")
     words = [
         "retention",
         "--archive",
-        str(there.archive),
+        str(stage.archive),
         "--raw-days",
         str(LEAST_RAW_DAYS),
         "--yes",
     ]
-    retention = Part("retention", [sys.executable, "-m", "fleet_service.cli", *words], there.folder)
+    retention = Part("retention", [sys.executable, "-m", "fleet_service.cli", *words], stage.folder)
     killed = 0
     began = time.time()
-    old = len(old_days(there.archive))
+    old = len(old_days(stage.archive))
     assert old
-    while killed < kills or (killed < 3 * kills and len(_find_finished_jobs(there.archive)) < 2):
+    while killed < kills or (killed < 3 * kills and len(_find_finished_jobs(stage.archive)) < 2):
         if killed % RETIRED_EVERY == 1 and not retention.is_alive:
             retention.start()
         time.sleep(random_.uniform(*PAUSE_S))
         if random_.random() < RETIRING_KILLED:
             retention.kill()
-        victims = _choose_victims(there, random_)
+        victims = _choose_victims(stage, random_)
         for part in victims:
             part.kill()
         killed += 1
         time.sleep(random_.uniform(*DOWN_S))
         for part in victims:
             part.start()
-    there.service.line_with("ready: ")
+    stage.service.line_with("ready: ")
     end = time.time()
-    retired = len(old_days(there.archive)) < old
-    there.drain(DRAIN_S)
-    there.service.stop()
+    retired = len(old_days(stage.archive)) < old
+    stage.drain(DRAIN_S)
+    stage.service.stop()
     retention.kill()
     retention.start()  # delete what the killed retention runs have left
     retention.wait(DRAIN_S)
-    assert not old_days(there.archive), f"retention did not go on after a kill; see {retention.log}"
+    assert not old_days(stage.archive), f"retention did not go on after a kill; see {retention.log}"
     amid = sum(
         records
-        for records, at in read_journals(there.journals).stored.values()
+        for records, at in read_journals(stage.journals).stored.values()
         if began <= at <= end
     )
-    return compare_with_archive(there.journals, there.archive), Load(amid, end - began, retired)
+    return compare_with_archive(stage.journals, stage.archive), Load(amid, end - began, retired)
 
 
-def _choose_victims(there: Stage, random_: random.Random) -> list[Part]:
+def _choose_victims(stage: Stage, random_: random.Random) -> list[Part]:
     """Return one or several random processes to kill. Router and service are each among them in 45
     % of the cases; the others are agents.
     """
-    chosen = [part for part in (there.router, there.service) if random_.random() < 0.45]
+    chosen = [part for part in (stage.router, stage.service) if random_.random() < 0.45]
     return chosen + random_.sample(
-        there.loads, random_.choice((0, 1, 3)) if chosen else random_.choice((1, 2, 5))
+        stage.loads, random_.choice((0, 1, 3)) if chosen else random_.choice((1, 2, 5))
     )

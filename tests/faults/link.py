@@ -240,21 +240,21 @@ def change_address(
     the link. With a limit, a busy test machine also causes losses. It delays messages, so they
     arrive close together.
     """
-    with open_namespaces(site.folder / f"address-{protocol}-{capped}") as there:
-        there.start_router(capped=capped)
-        car, _ = there.connect_cars("car", MOBILE)
+    with open_namespaces(site.folder / f"address-{protocol}-{capped}") as network:
+        network.start_router(capped=capped)
+        car, _ = network.connect_cars("car", MOBILE)
         place = key(HONEST[0])
-        service = there.start_end("receive", there.road, SERVICE, ("tls",), keys=[place])
+        service = network.start_end("receive", network.road, SERVICE, ("tls",), keys=[place])
         read_line(service)
         streams = [{"key": place, "size": 300, "rate": SAMPLES_PER_S}]
-        vehicle = there.start_end(
+        vehicle = network.start_end(
             "send", car, HONEST[0], (protocol,), streams=streams, drain_s=QUIET_S
         )
         read_line(vehicle)
         write_line(vehicle, "go")
         for number in (3, 4):
             time.sleep(seconds / 3)
-            there.move_car(car, number)
+            network.move_car(car, number)
         time.sleep(seconds / 3)
         put = finish_end(vehicle)[place]
         arrived = finish_end(service).get(place, [])
@@ -268,19 +268,19 @@ def delay_alerts(site: Site, protocol: str, seconds: float) -> dict[str, float]:
     alerts [ms], the numbers of alerts that arrived and that were lost, and the share of tiles that
     arrived.
     """
-    with open_namespaces(site.folder / f"lossy-{protocol}") as there:
-        there.start_router()
-        car, _ = there.connect_cars("car", LOSSY)
+    with open_namespaces(site.folder / f"lossy-{protocol}") as network:
+        network.start_router()
+        car, _ = network.connect_cars("car", LOSSY)
         alert = keys.alert_key(TILE)
         tile = keys.map_key(TILE)
-        reader = there.start_end("receive", car, READER, (protocol,), keys=[alert, tile])
+        reader = network.start_end("receive", car, READER, (protocol,), keys=[alert, tile])
         used = json.loads(read_line(reader))["protocols"]
         assert used == [protocol], used
         streams = [
             {"key": alert, "size": 150, "rate": ALERTS_PER_S},
             {"key": tile, "size": TILE_BYTES, "rate": TILES_PER_S},
         ]
-        service = there.start_end("send", there.road, SERVICE, ("tls",), streams=streams)
+        service = network.start_end("send", network.road, SERVICE, ("tls",), streams=streams)
         read_line(service)
         write_line(service, "go")
         time.sleep(seconds)
@@ -301,12 +301,12 @@ def block_udp(site: Site) -> float:
     """Return the time [s] until a car's Zenoh session is open over TLS on a link that blocks UDP
     and therefore QUIC.
     """
-    with open_namespaces(site.folder / "udp") as there:
+    with open_namespaces(site.folder / "udp") as network:
         for letter in "ab":
-            there.start_router(letter)
-        car, _ = there.connect_cars("car", LinkTerms(delay_s=0.04, drop_udp=True))
+            network.start_router(letter)
+        car, _ = network.connect_cars("car", LinkTerms(delay_s=0.04, drop_udp=True))
         found = json.loads(
-            read_line(there.start_end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS))
+            read_line(network.start_end("open", car, HONEST[0], ("quic", "tls"), ports=PORTS))
         )
         assert found["protocols"] == ["tls"], found
         return float(found["seconds"])
@@ -318,22 +318,22 @@ def return_with_tls(site: Site, outages_s: Sequence[float]) -> float:
     and serves only TLS afterwards.
     """
     longest = 0.0
-    with open_namespaces(site.folder / "back") as there:
-        router = there.start_router()
-        car, _ = there.connect_cars("car", MOBILE)
-        watched = there.start_end("watch", car, HONEST[0], ("quic", "tls"), ports=PORTS)
+    with open_namespaces(site.folder / "back") as network:
+        router = network.start_router()
+        car, _ = network.connect_cars("car", MOBILE)
+        watched = network.start_end("watch", car, HONEST[0], ("quic", "tls"), ports=PORTS)
         assert json.loads(read_line(watched))["protocols"] == ["quic"]
         for outage_s in outages_s:
             stop_process(router)
             while json.loads(read_line(watched))["connected"]:
                 pass
             time.sleep(outage_s)
-            router = there.start_router(protocols=("tls",))
+            router = network.start_router(protocols=("tls",))
             back = time.monotonic()
-            while not (told := json.loads(read_line(watched)))["connected"]:
+            while not (state := json.loads(read_line(watched)))["connected"]:
                 pass
-            longest = max(longest, told["time"] - back)
-            site.say(f"back after {told['time'] - back:.2f} s over {told['protocols']}")
+            longest = max(longest, state["time"] - back)
+            site.say(f"back after {state['time'] - back:.2f} s over {state['protocols']}")
     return longest
 
 
@@ -342,20 +342,20 @@ def measure_flood(site: Site, seconds: float, *, capped: bool) -> tuple[float, f
     during this flood divided by their delay before it, and the rate at which messages of the
     flooding car passed the router [1/s]. `capped` is True if the router limits message rates.
     """
-    with open_namespaces(site.folder / f"flood-{capped}") as there:
-        there.start_router(capped=capped)
-        cars, _ = there.connect_cars("car", MOBILE)
-        flooding, _ = there.connect_cars("flood", UPLINK, FLOOD_NET)
+    with open_namespaces(site.folder / f"flood-{capped}") as network:
+        network.start_router(capped=capped)
+        cars, _ = network.connect_cars("car", MOBILE)
+        flooding, _ = network.connect_cars("flood", UPLINK, FLOOD_NET)
         streams = [{"name": name, "key": key(name), "size": 1000, "rate": 4.0} for name in HONEST]
         place = key(FLOODER)
-        service = there.start_end(
-            "receive", there.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"]
+        service = network.start_end(
+            "receive", network.road, SERVICE, ("tls",), keys=["gripmap/v1/obs/**"]
         )
         read_line(service)
-        honest = there.start_end(
+        honest = network.start_end(
             "send", cars, HONEST[0], ("quic",), streams=streams, drain_s=QUIET_S
         )
-        attacker = there.start_end(
+        attacker = network.start_end(
             "send", flooding, FLOODER, ("quic",), streams=[{"key": place, "size": 1000, "rate": 0}]
         )
         read_line(honest)

@@ -134,8 +134,8 @@ def measure_opening(given: dict[str, Any]) -> None:
     """
     began = time.monotonic()
     with open_end(given) as session:
-        took = time.monotonic() - began
-        print(json.dumps({"seconds": took, "protocols": wait_for_link(session)}), flush=True)
+        elapsed_s = time.monotonic() - began
+        print(json.dumps({"seconds": elapsed_s, "protocols": wait_for_link(session)}), flush=True)
 
 
 def watch(given: dict[str, Any]) -> None:
@@ -147,12 +147,12 @@ def watch(given: dict[str, Any]) -> None:
 
         def print_state() -> None:
             if seen:
-                told = {
+                state = {
                     "time": time.monotonic(),
                     "connected": seen[0].is_connected,
                     "protocols": seen[0].protocols,
                 }
-                print(json.dumps(told), flush=True)
+                print(json.dumps(state), flush=True)
 
         seen.append(LinkWatch(session, given["name"], print_state))
         wait_for_link(session)

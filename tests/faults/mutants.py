@@ -193,10 +193,19 @@ def _shift_columns(place: int, rows: int) -> dict[str, Any]:
 _VALID: Final = {
     Kind.OBSERVATION: [
         pb.ObservationBatch.FromString(
-            wire.encode(batch("rogue-00", 1, 0, mu, told=told, **_shift_columns(place, len(mu))))
+            wire.encode(
+                batch(
+                    "rogue-00",
+                    1,
+                    0,
+                    mu,
+                    with_likelihood=with_likelihood,
+                    **_shift_columns(place, len(mu)),
+                )
+            )
         )
         for mu in ([0.8], [0.2], [0.3, 0.9], [0.5, 0.6, 0.7, 0.8, 0.9])
-        for told in (True, False)
+        for with_likelihood in (True, False)
         for place in range(PLACES)
     ],
     Kind.STATE: [_make_states()],

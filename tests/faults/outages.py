@@ -25,17 +25,17 @@ def router_down(site: Site) -> list[Figure]:
     refused by the service) soon after the router's return.
     """
     down_s = site.choose_amount(60, 4)
-    with open_stage(site.folder) as there:
-        _load_agents(there, site.choose_amount(5, 2))
+    with open_stage(site.folder) as stage:
+        _load_agents(stage, site.choose_amount(5, 2))
         time.sleep(site.choose_amount(3, 1))
-        there.router.kill()
+        stage.router.kill()
         down = time.time()
         time.sleep(down_s)
-        there.router.start()
-        there.router.line_with("router: ")
+        stage.router.start()
+        stage.router.line_with("router: ")
         back = time.time()
-        census = _at_rest(there)
-        known = read_journals(there.journals)
+        census = _at_rest(stage)
+        known = read_journals(stage.journals)
         recovery = known.longest_wait(back)
         amid = known.stored_between(down, back)
     site.say(f"{census}")
@@ -53,20 +53,20 @@ def freeze_parts(site: Site) -> list[Figure]:
     """
     frozen_s = site.choose_amount(20, 3)
     spans = []
-    with open_stage(site.folder) as there:
-        _load_agents(there, site.choose_amount(3, 1))
-        for part in (there.router, there.service):
+    with open_stage(site.folder) as stage:
+        _load_agents(stage, site.choose_amount(3, 1))
+        for part in (stage.router, stage.service):
             time.sleep(site.choose_amount(3, 1))
             part.freeze()
             began = time.time()
             time.sleep(frozen_s)
             spans.append((began, time.time()))
             part.send_signal(signal.SIGCONT)
-        census = _at_rest(there)
-        known = read_journals(there.journals)
+        census = _at_rest(stage)
+        known = read_journals(stage.journals)
         ends = [
             json.loads(next(line for line in part.read_lines() if line.startswith("{")))
-            for part in there.loads
+            for part in stage.loads
         ]
     site.say(f"{census}; {ends}")
     return [
@@ -86,18 +86,18 @@ def stop_parts(site: Site) -> list[Figure]:
     lost = 0
     acknowledged = 0
     for freeze in (False, True):
-        with open_stage(site.folder / str(freeze)) as there:
-            _load_agents(there, 1)
+        with open_stage(site.folder / str(freeze)) as stage:
+            _load_agents(stage, 1)
             time.sleep(site.choose_amount(3, 1))
             if freeze:
-                there.router.freeze()
+                stage.router.freeze()
                 time.sleep(site.choose_amount(3, 1))
-            for part in (*there.loads, there.service):
+            for part in (*stage.loads, stage.service):
                 began = time.monotonic()
                 _check_clean_stop(part)
                 longest = max(longest, time.monotonic() - began)
-            there.router.send_signal(signal.SIGCONT)
-            census = compare_with_archive(there.journals, there.archive)
+            stage.router.send_signal(signal.SIGCONT)
+            census = compare_with_archive(stage.journals, stage.archive)
             lost = lost + census.acknowledged_lost
             acknowledged = acknowledged + census.settled
     site.say(f"gone after {longest:.1f} s at the most")
@@ -116,20 +116,20 @@ def disk_full(site: Site) -> list[Figure]:
     false_acks = 0
     recovered = 0
     waiting = 0
-    with open_stage(site.folder) as there:
-        _load_agents(there, 2)
-        for parts in ([there.service], there.loads, there.parts[1:]):
+    with open_stage(site.folder) as stage:
+        _load_agents(stage, 2)
+        for parts in ([stage.service], stage.loads, stage.parts[1:]):
             time.sleep(site.choose_amount(3, 1))
             for part in parts:
                 part.limit_files(0)
             time.sleep(full_s)
-            census = compare_with_archive(there.journals, there.archive)
+            census = compare_with_archive(stage.journals, stage.archive)
             false_acks += census.acknowledged_lost
             waiting = max(waiting, census.stored - census.settled)
             for part in parts:
                 part.limit_files(-1)
-            recovered += _is_settled(there)
-        census = _at_rest(there)
+            recovered += _is_settled(stage)
+        census = _at_rest(stage)
     site.say(f"{census}")
     return [
         make_figure("faults.disk_full.false_acks", false_acks + census.acknowledged_lost),
@@ -139,31 +139,31 @@ def disk_full(site: Site) -> list[Figure]:
     ]
 
 
-def _load_agents(there: Stage, processes: int) -> None:
+def _load_agents(stage: Stage, processes: int) -> None:
     for number in range(processes):
         names = [f"sim-{number}{place:02}" for place in range(AGENTS_PER_PROCESS)]
-        there.make_load(names, RATE, seed=number, flush_s=1.0).start()
-    for part in there.loads:
+        stage.make_load(names, RATE, seed=number, flush_s=1.0).start()
+    for part in stage.loads:
         part.line_with("ready: ")
 
 
-def _is_settled(there: Stage) -> bool:
+def _is_settled(stage: Stage) -> bool:
     """Return True if every batch that the agents have stored by now is settled (acknowledged or
     refused by the service) within DRAIN_S seconds.
     """
     since = time.time()
     deadline = time.monotonic() + DRAIN_S
     while time.monotonic() < deadline:
-        if read_journals(there.journals).longest_wait(since) < float("inf"):
+        if read_journals(stage.journals).longest_wait(since) < float("inf"):
             return True
         time.sleep(0.2)
     return False
 
 
-def _at_rest(there: Stage) -> Census:
-    there.drain(DRAIN_S)
-    _check_clean_stop(there.service)
-    return compare_with_archive(there.journals, there.archive)
+def _at_rest(stage: Stage) -> Census:
+    stage.drain(DRAIN_S)
+    _check_clean_stop(stage.service)
+    return compare_with_archive(stage.journals, stage.archive)
 
 
 def _check_clean_stop(part: Part) -> None:

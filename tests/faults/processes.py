@@ -72,11 +72,11 @@ class Part:
         """
 
         def find_lines() -> list[str]:
-            there = [line for line in self.read_lines() if line.startswith(start)]
-            assert there or self.is_alive, (
+            started = [line for line in self.read_lines() if line.startswith(start)]
+            assert started or self.is_alive, (
                 f"{self.name} ended before it said {start!r}; see {self.log}"
             )
-            return there
+            return started
 
         until(find_lines, START_S)
         return find_lines()[0]
@@ -196,10 +196,10 @@ class Stage:
         """Wait until a load generator has printed a new line, or all load generators have ended.
         Raise TimeoutError if neither happens within `patience_s` seconds.
         """
-        told = sum(journal.stat().st_size for journal in self.journals)
+        size = sum(journal.stat().st_size for journal in self.journals)
 
         def has_news() -> bool:
-            more = sum(journal.stat().st_size for journal in self.journals) > told
+            more = sum(journal.stat().st_size for journal in self.journals) > size
             return more or not any(part.is_alive for part in self.loads)
 
         until(has_news, patience_s)
@@ -211,11 +211,11 @@ def open_stage(folder: Path, **service: object) -> Iterator[Stage]:
     service. Yield both as a `Stage` when the service is ready. All processes are ended after the
     `with` block.
     """
-    there = Stage(folder, **service)
+    stage = Stage(folder, **service)
     try:
-        there.service.line_with("ready: ")
-        yield there
+        stage.service.line_with("ready: ")
+        yield stage
     finally:
-        for part in there.parts:
+        for part in stage.parts:
             part.send_signal(signal.SIGCONT)
             part.kill()

@@ -152,23 +152,23 @@ def explore_states(rules: Rules, most_number: int = 2, most_turn: int = 3) -> Ch
     archive) and `most_turn` renewals of each. Stop at the first violation.
     """
     start = World((Service(), Service()))
-    came: dict[World, tuple[World, str] | None] = {start: None}
+    reached_from: dict[World, tuple[World, str] | None] = {start: None}
     waiting = deque([start])
     while waiting:
         world = waiting.popleft()
         problem = find_problem(world)
         if problem:
-            return Checked(len(came), Violation(problem, _steps_to(world, came)))
+            return Checked(len(reached_from), Violation(problem, _steps_to(world, reached_from)))
         for step, after in list_steps(world, rules, most_number, most_turn):
-            if after not in came:
-                came[after] = (world, step)
+            if after not in reached_from:
+                reached_from[after] = (world, step)
                 waiting.append(after)
-    return Checked(len(came), None)
+    return Checked(len(reached_from), None)
 
 
-def _steps_to(world: World, came: dict[World, tuple[World, str] | None]) -> tuple[str, ...]:
+def _steps_to(world: World, reached_from: dict[World, tuple[World, str] | None]) -> tuple[str, ...]:
     out = []
-    while (before := came[world]) is not None:
+    while (before := reached_from[world]) is not None:
         world, step = before
         out.append(step)
     return tuple(reversed(out))

@@ -39,13 +39,13 @@ def run(site: Site) -> list[Figure]:
     to a small query.
     """
     seconds = site.choose_amount(30, 4)
-    with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as there:
-        session = open_session(ZenohSettings(connect=[there.endpoint]))
+    with open_stage(site.folder, vehicle_kb_s=1e4, vehicle_burst_kb=1e5) as stage:
+        session = open_session(ZenohSettings(connect=[stage.endpoint]))
         assert session is not None
         with session:
-            cells = _fill_map(session, there, site.choose_amount(80, 20))
+            cells = _fill_map(session, stage, site.choose_amount(80, 20))
             _await_tile(session)
-            readers = [_start_reader(there.endpoint) for _ in range(HEAVY)]
+            readers = [_start_reader(stage.endpoint) for _ in range(HEAVY)]
             try:
                 for reader in readers:
                     assert reader.stdout
@@ -66,7 +66,7 @@ def run(site: Site) -> list[Figure]:
     ]
 
 
-def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
+def _fill_map(session: zenoh.Session, stage: Stage, vehicles: int) -> int:
     """Fill the map: each vehicle visits 250 cells, one per second. Return the number of cells when
     all reports are acknowledged.
     """
@@ -84,7 +84,7 @@ def _fill_map(session: zenoh.Session, there: Stage, vehicles: int) -> int:
                 session.put(message.key, message.payload, encoding=message.encoding)
         time.sleep(1.0)
     acks.undeclare()
-    assert there.service.is_alive
+    assert stage.service.is_alive
     return 250 * vehicles
 
 

@@ -27,23 +27,23 @@ from schemas.runtime.zenoh_session import configuration
 
 def main() -> None:
     """Run the attacker's session that the line on standard input describes."""
-    told = json.loads(sys.stdin.readline())
-    heard: list[str] = []
+    task = json.loads(sys.stdin.readline())
+    received: list[str] = []
     session = zenoh.open(
-        configuration(ZenohSettings.model_validate(told["settings"]), told["name"])
+        configuration(ZenohSettings.model_validate(task["settings"]), task["name"])
     )
     hearing = [
-        session.declare_subscriber(one, lambda s: heard.append(str(s.key_expr)))
-        for one in told["hear"]
+        session.declare_subscriber(one, lambda s: received.append(str(s.key_expr)))
+        for one in task["hear"]
     ]
     list(session.get(f"{keys.ROOT}/map/**"))
-    for place in told["put"]:
-        session.put(place, told["payload"])
+    for place in task["put"]:
+        session.put(place, task["payload"])
     list(session.get(f"{keys.ROOT}/map/**"))
     print(len(hearing), flush=True)
     sys.stdin.readline()
     list(session.get(f"{keys.ROOT}/map/**"))
-    print(json.dumps(heard), flush=True)
+    print(json.dumps(received), flush=True)
     os._exit(0)
 
 

@@ -68,14 +68,14 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
     """
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}
-    with open_stage(site.folder, compact_s=300.0) as there:
+    with open_stage(site.folder, compact_s=300.0) as stage:
         for number in range(PROCESSES):
             names = [f"sim-{number}{place:02}" for place in range(VEHICLES)]
-            there.make_load(names, RATE, seed=number, cells_across=CELLS_ACROSS).start()
+            stage.make_load(names, RATE, seed=number, cells_across=CELLS_ACROSS).start()
         began = time.monotonic()
         while (now := time.monotonic() - began) < minutes * 60:
             times.append(now)
-            for part in there.parts:
+            for part in stage.parts:
                 seen.setdefault(part.name, []).append((memory_mb(part), count_handles(part)))
             if len(times) % 24 == 0:
                 site.say(
@@ -84,9 +84,9 @@ def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
                     )
                 )
             time.sleep(EVERY_S)
-        there.drain(60.0)
-        there.service.stop()
-        census = compare_with_archive(there.journals, there.archive)
+        stage.drain(60.0)
+        stage.service.stop()
+        census = compare_with_archive(stage.journals, stage.archive)
     first = int(len(times) * SETTLED)
     slopes = {}
     grown = {}

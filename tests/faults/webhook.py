@@ -83,11 +83,11 @@ BREAKS: Final[dict[str, Callable[[socket.socket], None]]] = {
 class Receiver:
     """HTTP server on this machine that receives alerts. Its `kind` selects one of the faults in
     BREAKS. The fault affects the first BROKEN connections, or all connections if the kind is in
-    FOREVER. A working receiver records in `heard` the ids of the alerts that it confirmed.
+    FOREVER. A working receiver records in `received` the ids of the alerts that it confirmed.
     """
 
     def __init__(self, kind: str) -> None:
-        self.heard: set[str] = set()
+        self.received: set[str] = set()
         self._break = BREAKS[kind]
         self._left = 10**9 if kind in FOREVER else BROKEN
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -116,7 +116,7 @@ class Receiver:
                 self._break(client)
             elif head.startswith(b"POST /hook "):
                 client.sendall(OK)
-                self.heard.add(json.loads(text)["alerts"][0]["fingerprint"])
+                self.received.add(json.loads(text)["alerts"][0]["fingerprint"])
             else:
                 client.sendall(OK)  # like a login page, which answers every GET
 
@@ -161,19 +161,19 @@ def run_kind(folder: Path, kind: str) -> tuple[int, int]:
     the number of missing ones that the sender counts neither as lost nor as waiting.
     """
     receiver = Receiver(kind)
-    said = list[str]()
+    log_lines = list[str]()
     queue = AlertQueue(folder / f"{kind}.sqlite", FEW if kind == "overflow" else 1000)
-    hook = Webhook(receiver.url, said.append, queue, TIMEOUT_S)
+    hook = Webhook(receiver.url, log_lines.append, queue, TIMEOUT_S)
     for number in range(ALERTS):
         hook.send(make_stretch(number))
     end = time.monotonic() + (1.0 if kind in FOREVER else PATIENCE_S)
-    while time.monotonic() < end and len(receiver.heard) + hook.lost_count < ALERTS:
+    while time.monotonic() < end and len(receiver.received) + hook.lost_count < ALERTS:
         time.sleep(0.02)
     hook.close()
     receiver.close()
-    missing = ALERTS - len(receiver.heard)
-    admitted = hook.lost_count + hook.waiting_count if said else 0
-    return len(receiver.heard), max(missing - admitted, 0)
+    missing = ALERTS - len(receiver.received)
+    admitted = hook.lost_count + hook.waiting_count if log_lines else 0
+    return len(receiver.received), max(missing - admitted, 0)
 
 
 def run(site: Site) -> list[Figure]:

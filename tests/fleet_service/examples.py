@@ -114,7 +114,7 @@ def batch(
     mu: Sequence[float],
     /,
     *,
-    told: bool = True,
+    with_likelihood: bool = True,
     used: float | None = None,
     **changed: object,
 ) -> Batch:
@@ -122,7 +122,7 @@ def batch(
     are one second apart and end at `now` [ns]; `changed` replaces columns.
 
     Without `used` the vehicle used all of the grip, so that the observations are measurements. If
-    `told` is False, the batch contains no log-likelihoods.
+    `with_likelihood` is False, the batch contains no log-likelihoods.
     """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
@@ -141,7 +141,7 @@ def batch(
         "mu_upper": np.array(mu, np.float32) + 0.1,
         "mu_utilised": np.array(mu) if used is None else np.full(n, used),
     }
-    if told:
+    if with_likelihood:
         columns["log_likelihood"] = mugrid.encode_log_likelihood(value(mu))
     columns.update({name: np.asarray(column) for name, column in changed.items()})
     columns = {

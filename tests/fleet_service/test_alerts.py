@@ -136,7 +136,7 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yield the address of a real HTTP server, and the list of webhooks (HTTP calls) that it
     received. The server refuses the first `refuse` requests.
     """
-    heard: list[dict[str, Any]] = []
+    received: list[dict[str, Any]] = []
     left = [refuse]
 
     class Handler(BaseHTTPRequestHandler):
@@ -146,7 +146,7 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
             left[0] -= refused
             if not refused:
                 assert self.headers["Content-Type"] == "application/json"
-                heard.append(json.loads(text))
+                received.append(json.loads(text))
             self.send_response(503 if refused else 200)
             self.end_headers()
 
@@ -157,7 +157,7 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}/hook", heard
+        yield f"http://127.0.0.1:{server.server_port}/hook", received
     finally:
         server.shutdown()
         server.server_close()
@@ -166,37 +166,37 @@ def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
 
 def test_webhook_has_alertmanagers_format_and_order_after_a_refusal(tmp_path: Path) -> None:
     road = Stretches()
-    said = list[str]()
-    with receiver(refuse=1) as (url, heard):
-        hook = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
+    log_lines = list[str]()
+    with receiver(refuse=1) as (url, received):
+        hook = Webhook(url, log_lines.append, AlertQueue(tmp_path / "queue"))
         for one in (*take_alerts(road, alert(0)), *take_alerts(road, alert(0, raised=False, at=5))):
             hook.send(one)
-        until(lambda: len(heard) == 2)
+        until(lambda: len(received) == 2)
         hook.close()
-    assert [one["status"] for one in heard] == ["firing", "resolved"]
-    assert [one["version"] for one in heard] == ["4", "4"]
-    (first,), (second,) = (one["alerts"] for one in heard)
+    assert [one["status"] for one in received] == ["firing", "resolved"]
+    assert [one["version"] for one in received] == ["4", "4"]
+    (first,), (second,) = (one["alerts"] for one in received)
     assert first["fingerprint"] == second["fingerprint"] == first["labels"]["id"]
     assert first["labels"]["alertname"] == "SlipperyRoad"
     assert (first["startsAt"], first["endsAt"]) == ("2027-01-15T08:00:00Z", "0001-01-01T00:00:00Z")
     assert second["endsAt"] == "2027-01-15T08:00:05Z"
-    assert "does not accept alerts" in said[0]
-    assert "answers again" in said[1]
+    assert "does not accept alerts" in log_lines[0]
+    assert "answers again" in log_lines[1]
 
 
 def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
-    said: list[str] = []
-    hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue"))
+    log_lines: list[str] = []
+    hook = Webhook("http://127.0.0.1:9/none", log_lines.append, AlertQueue(tmp_path / "queue"))
     hook.send(take_alerts(Stretches(), alert(0))[0])
     until(lambda: bool(hook.health_problems()))
     hook.close()
-    assert said[-1] == "webhook: 1 alerts remain in the queue for the next watch"
+    assert log_lines[-1] == "webhook: 1 alerts remain in the queue for the next watch"
     assert (hook.waiting_count, hook.lost_count) == (1, 0)
-    with receiver() as (url, heard):
-        again = Webhook(url, said.append, AlertQueue(tmp_path / "queue"))
+    with receiver() as (url, received):
+        again = Webhook(url, log_lines.append, AlertQueue(tmp_path / "queue"))
         until(lambda: again.counts["delivered"] == 1)
         again.close()
-    assert (len(heard), again.waiting_count, again.health_problems()) == (1, 0, [])
+    assert (len(received), again.waiting_count, again.health_problems()) == (1, 0, [])
     assert set(alert_message(take_alerts(Stretches(), alert(0))[0])) >= {
         "receiver",
         "status",
@@ -207,15 +207,15 @@ def test_undelivered_alerts_stay_for_the_next_watch(tmp_path: Path) -> None:
 
 
 def test_full_queue_drops_the_oldest_and_reports_it(tmp_path: Path) -> None:
-    said: list[str] = []
-    hook = Webhook("http://127.0.0.1:9/none", said.append, AlertQueue(tmp_path / "queue", 2))
+    log_lines: list[str] = []
+    hook = Webhook("http://127.0.0.1:9/none", log_lines.append, AlertQueue(tmp_path / "queue", 2))
     for one in take_alerts(Stretches(), *(alert(10 * x) for x in range(5))):
         hook.send(one)
     assert hook.counts["dropped"] == 3
     assert "webhook: 3 alerts were lost" in hook.health_problems()
     assert {m.name: dict(m.values) for m in hook.metrics()}["webhook_waiting"] == {"": 2.0}
     hook.close()
-    assert said[-1] == "webhook: 3 alerts were lost"
+    assert log_lines[-1] == "webhook: 3 alerts were lost"
 
 
 @pytest.mark.parametrize("kind", ["not-http", "redirect-302", "drips", "refuses"])
@@ -245,7 +245,7 @@ def test_queue_belongs_to_one_watch(tmp_path: Path) -> None:
 def test_watch_prints_stretches_as_json_and_sends_them(
     router: ZenohSettings, session: zenoh.Session, service: Running, tmp_path: Path
 ) -> None:
-    with receiver() as (url, heard):
+    with receiver() as (url, received):
         (port,) = free_ports(1)
         words = ["watch", "--alerts", "--json", "--webhook", url, "--connect", router.connect[0]]
         words += ["--webhook-queue", str(tmp_path / "queue"), "--health-port", str(port)]
@@ -258,7 +258,7 @@ def test_watch_prints_stretches_as_json_and_sends_them(
                 *(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4))
             )
             line = json.loads(watching.stdout.readline())
-            until(lambda: heard)
+            until(lambda: received)
             with urllib.request.urlopen(
                 f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S
             ) as answer:
@@ -266,7 +266,7 @@ def test_watch_prints_stretches_as_json_and_sends_them(
             watching.terminate()
             assert watching.wait(PATIENCE_S) == 0
     assert (line["event"], line["state"], line["cells"]) == ("alert", "raised", 1)
-    assert heard[0]["alerts"][0]["labels"]["id"] == line["id"]
+    assert received[0]["alerts"][0]["labels"]["id"] == line["id"]
 
 
 def test_a_webhook_that_is_no_url_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

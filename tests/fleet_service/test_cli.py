@@ -142,8 +142,8 @@ def test_overlapping_regions_are_refused(
     config = tmp_path / "service.json"
     config.write_text(json.dumps({"regions": ["1200/320/*", "1201/*/*", "1200/320/230"]}))
     assert main(["run", "--config", str(config), "--archive", str(tmp_path / "archive")]) == 2
-    said = capsys.readouterr().err
-    assert "error: regions: 1200/320/* and 1200/320/230 overlap; " in said
+    stderr = capsys.readouterr().err
+    assert "error: regions: 1200/320/* and 1200/320/230 overlap; " in stderr
     assert not (tmp_path / "archive").exists()
 
 
@@ -194,8 +194,8 @@ def test_run_and_watch_as_processes_from_start_to_signal(
             assert process.wait(PATIENCE_S) == 0
             assert process.stderr is not None
             assert process.stderr.read() == ""
-        said = run.stdout.read()
-        assert "status: 4 observations" in said
+        stdout = run.stdout.read()
+        assert "status: 4 observations" in stdout
     kept = pa.concat_tables(
         reading.read_tables(tmp_path / "archive", Kind.OBSERVATION, ["boot", "seq", "row"])
     )

@@ -229,7 +229,7 @@ class Done(NamedTuple):
     """Result of a command: exit code, output, and the files below its folder."""
 
     code: int
-    said: str
+    output: str
     files: dict[str, str]
 
 
@@ -272,8 +272,8 @@ def run_command(words: list[str], folder: Path, capsys: Capture) -> Done:
     """Run the command `words` in a new folder with test files, and return the command's result."""
     names = place(folder)
     code = main([word.format(**names) for word in words])
-    said = capsys.readouterr()
-    text = (said.out + (said.err if code else "")).replace(str(folder), "")
+    captured = capsys.readouterr()
+    text = (captured.out + (captured.err if code else "")).replace(str(folder), "")
     files = {
         str(p.relative_to(folder)): content(p, folder)
         for p in sorted(folder.rglob("*"))
@@ -375,12 +375,12 @@ def test_every_option_of_a_command_changes_what_it_does(
         other = [*usual, option, *([change] if change else [])]
     first, again = (run_command(usual, tmp_path / name, capsys) for name in ("first", "again"))
     assert first == again
-    assert first.code == 0, first.said
+    assert first.code == 0, first.output
     seen = run_command(other, tmp_path / "other", capsys)
     assert seen != first
     wrong = {"--period": "has no key of 2024-09", "--engine": "Spark is not installed"}
-    assert wrong.get(option, "") in seen.said
-    assert (seen.code == 0) == (option not in wrong), seen.said
+    assert wrong.get(option, "") in seen.output
+    assert (seen.code == 0) == (option not in wrong), seen.output
 
 
 @pytest.mark.parametrize(("days", "renewed"), [("5", False), ("20", True)])

@@ -18,9 +18,9 @@ def test_no_service_is_not_an_empty_map(
     router: ZenohSettings, tmp_path: Path, capsys: Capture
 ) -> None:
     assert main(["query", "--connect", router.connect[0]]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("no service answers for the map")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("no service answers for the map")
 
 
 @pytest.mark.usefixtures("service")

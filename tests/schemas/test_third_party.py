@@ -76,11 +76,11 @@ def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(
         first: [[41, sent["region"], durable, []]],
         second: [[42, sent["region"], durable, []]],
     }
-    late, told = zip(
+    late, times = zip(
         *(stream[4:] for streams in found["acks"].values() for stream in streams), strict=True
     )
     assert late == ([], [])
-    assert min(told) > 0, "the service's time"
+    assert min(times) > 0, "the service's time"
     assert sorted(found["batches"]) == [
         [vehicle, sent["visits"], sent["region"]] for vehicle in (first, second)
     ]

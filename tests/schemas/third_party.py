@@ -170,7 +170,7 @@ def find_blocked() -> list[str]:
 def main(endpoint: str) -> None:
     """Publish reports, receive messages, query the map, and print the results."""
     with open_session(endpoint) as session:
-        heard = Heard(session)
+        listener = Heard(session)
         sent = {
             PROTOBUF_SENDER: (protobuf_batch(time.time_ns()), wire.ENCODING[Kind.OBSERVATION]),
             JSON_SENDER: (json_batch(time.time_ns()), wire.JSON),
@@ -183,8 +183,13 @@ def main(endpoint: str) -> None:
             publisher.put(payload)
         until(
             lambda: (
-                heard.errors
-                or (len(heard.acks) == len(sent) and heard.alerts and heard.tiles and heard.batches)
+                listener.errors
+                or (
+                    len(listener.acks) == len(sent)
+                    and listener.alerts
+                    and listener.tiles
+                    and listener.batches
+                )
             )
         )
         box = (
@@ -199,14 +204,16 @@ def main(endpoint: str) -> None:
     print(
         json.dumps(
             {
-                "errors": heard.errors,
+                "errors": listener.errors,
                 "acks": {
                     vehicle: [stream[:1] + stream[2:] for stream in streams]
-                    for vehicle, streams in heard.acks.items()
+                    for vehicle, streams in listener.acks.items()
                 },
-                "batches": [[batch.vehicle, batch.rows, batch.region] for batch in heard.batches],
-                "tiles": heard.tiles,
-                "alerts": [asdict(alert) for alert in heard.alerts],
+                "batches": [
+                    [batch.vehicle, batch.rows, batch.region] for batch in listener.batches
+                ],
+                "tiles": listener.tiles,
+                "alerts": [asdict(alert) for alert in listener.alerts],
                 "standing": [standing, [alert.cell for alert in wire.decode_standing(alerts)]],
                 "arrow": [arrow, decode_tile(tile).drop(["first_time", "last_time"]).to_pylist()],
                 "json": json.loads(document),

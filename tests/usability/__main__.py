@@ -126,9 +126,9 @@ def pages_with_errors(house: House) -> float:
         assert fleet_service.cli.main(command) == 0, command
         pages.append(out)
     drive = drives(1, SEED, rough=False)[0]
-    said = diagnose(drive.t, drive.signals, drive.vehicle)
+    diagnosis = diagnose(drive.t, drive.signals, drive.vehicle)
     pages.append(house.folder / "check.html")
-    pages[-1].write_text(doctors_page(said, "a drive"))
+    pages[-1].write_text(doctors_page(diagnosis, "a drive"))
     if (ROOT / ".demo" / "map.html").exists():
         pages.append(ROOT / ".demo" / "map.html")
     bad = [live] if (live := live_page(house)) else []

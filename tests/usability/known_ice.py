@@ -260,9 +260,9 @@ def _hidden_by_watch(ice: KnownIce) -> Places:
     """
     found: set[tuple[int, int]] = set()
     for tile, batch in ice.batches():
-        told = json.loads(watching._tile_line(tile, pa.Table.from_batches([batch]), True))
+        document = json.loads(watching._tile_line(tile, pa.Table.from_batches([batch]), True))
         own = {place for place in ice.places if int(grid.tile_of(place[0])) == tile}
-        if told["slippery"] < len(own) or told["measured"] < len(own):
+        if document["slippery"] < len(own) or document["measured"] < len(own):
             found |= own
     return found
 

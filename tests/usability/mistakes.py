@@ -157,15 +157,15 @@ def find_tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
     lines += [(fleet_service.cli.main, line) for line in FLEET]
     for main, line in lines:
         words = line.format(d=folder, a=archive).split()
-        said = io.StringIO()
+        stderr = io.StringIO()
         try:
-            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
                 code = main(words)
         except SystemExit as left:
             code = left.code if isinstance(left.code, int) else 1
         except BaseException as error:  # noqa: BLE001 a user would see any exception
             bad.append(f"{line}: {type(error).__name__}: {error}")
             continue
-        if code == 0 or "Traceback" in said.getvalue():
+        if code == 0 or "Traceback" in stderr.getvalue():
             bad.append(f"{line}: exit code {code}")
     return len(lines), bad

@@ -197,11 +197,11 @@ def look_at_demo(folder: Path) -> str:
     failed: list[str] = []
     try:
         deadline = time.monotonic() + 2 * LONGEST_S
-        while "runs until Ctrl-C" not in (said := log.read_text(errors="replace")):
+        while "runs until Ctrl-C" not in (text := log.read_text(errors="replace")):
             if demo.poll() is not None or time.monotonic() > deadline:
                 return f"the demo did not get so far: {_last_line(log)}"
             time.sleep(0.5)
-        address = re.search(r"Live map: (\S+)", said)
+        address = re.search(r"Live map: (\S+)", text)
         return look_at_map(address[1]) if address else "the demo names no address"
     finally:
         _end_process("gripmap demo", demo, failed)

@@ -50,39 +50,39 @@ def longest_silence(command: list[str], cache: Path, ready: bytes | None = None)
     `ready` is for a command that does not end by itself: it is interrupted as soon as it prints
     this text. The time from then until its end does not count.
     """
-    here, there = pty.openpty()
+    controller, terminal = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}
     environment.pop("NUMBA_CACHE_DIR", None)
     last = time.monotonic()
     worst = 0.0
-    said = b""
+    output = b""
     began = last
     program = [str(Path(sys.executable).parent / command[0]), *command[1:]]
     with subprocess.Popen(
-        program, stdin=there, stdout=there, stderr=there, env=environment
+        program, stdin=terminal, stdout=terminal, stderr=terminal, env=environment
     ) as process:
-        os.close(there)
+        os.close(terminal)
         while time.monotonic() - began < LONGEST_S:
-            waiting, _, _ = select.select([here], [], [], 0.1)
+            waiting, _, _ = select.select([controller], [], [], 0.1)
             try:
-                heard = os.read(here, 65536) if waiting else b""
+                block = os.read(controller, 65536) if waiting else b""
             except OSError:  # the program has ended
                 break
-            if heard:
+            if block:
                 worst = max(worst, time.monotonic() - last)
                 last = time.monotonic()
-            said += heard
-            if ready is not None and ready in said:
+            output += block
+            if ready is not None and ready in output:
                 process.send_signal(signal.SIGINT)
                 break
         whole = max(worst, time.monotonic() - last)
         # Read the remaining output, because a full pipe would prevent the program from ending.
         while ready is not None and process.poll() is None:
-            if select.select([here], [], [], 0.1)[0]:
+            if select.select([controller], [], [], 0.1)[0]:
                 with suppress(OSError):
-                    os.read(here, 65536)
+                    os.read(controller, 65536)
         process.wait(60)
-        os.close(here)
+        os.close(controller)
     return whole
 
 

@@ -56,7 +56,7 @@ def _has_warned(folder: Path, drive: Recorded) -> bool:
     columns = {name: pa.array(signals[:, k], from_pandas=True) for k, name in enumerate(CHANNELS)}
     pq.write_table(pa.table({"t": pa.array(t), **columns}), folder / "wrong.parquet")
     (folder / "wrong.json").write_text(vehicle.model_dump_json(exclude_none=True))
-    heard = io.StringIO()
+    stderr = io.StringIO()
     words = [
         "replay",
         str(folder / "wrong.parquet"),
@@ -65,6 +65,6 @@ def _has_warned(folder: Path, drive: Recorded) -> bool:
         "--out",
         str(folder / "e.parquet"),
     ]
-    with contextlib.redirect_stderr(heard), contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
         code = edge_agent.cli.main(words)
-    return code == 2 or "warning: " in heard.getvalue()
+    return code == 2 or "warning: " in stderr.getvalue()

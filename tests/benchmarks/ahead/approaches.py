@@ -56,7 +56,7 @@ class Approaches:
     and towns.
     """
 
-    came: int = 0
+    arrived: int = 0
     warned: int = 0
     raised: int = 0
     false: int = 0
@@ -113,9 +113,9 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
         out += [
             Figure(
                 f"ahead.warned_share{ending}",
-                counts.warned / counts.came if counts.came else float("nan"),
+                counts.warned / counts.arrived if counts.arrived else float("nan"),
                 "",
-                0.99 if routed and counts.came >= LEAST_CAME else None,
+                0.99 if routed and counts.arrived >= LEAST_CAME else None,
                 "more",
             ),
             Figure(
@@ -124,7 +124,7 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
                 "",
                 1 if routed and km >= LEAST_KM else None,
             ),
-            Figure(f"ahead.approaches{ending}", counts.came, "to alerted stretches"),
+            Figure(f"ahead.approaches{ending}", counts.arrived, "to alerted stretches"),
             Figure(f"ahead.driven_km{ending}", km, "km"),
         ]
     return out
@@ -219,7 +219,7 @@ def _count_outcome(track: _Track, counts: Approaches) -> None:
         before = (far > 0.0) & (far <= NEW_M)
         if look < SETTLE_S or not before.any() or (mu[before] < NEAR_SLIPPERY).any():
             continue
-        counts.came += 1
+        counts.arrived += 1
         # The ice begins after the previous sample and at the latest at this one.
         start = float(metre[look - 1])
         standing = (one.at for one in track.raised.values() if one.at < look < one.ended)

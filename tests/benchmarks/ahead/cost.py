@@ -61,19 +61,19 @@ def draw_way(rng: np.random.Generator, metres: float) -> FloatArray:
 
     At each crossing the route goes straight on, left or right, and never leaves the city.
     """
-    here = np.array([BLOCKS // 2, BLOCKS // 2])
+    place = np.array([BLOCKS // 2, BLOCKS // 2])
     heading = 0
-    corners = [here]
+    corners = [place]
     for _ in range(math.ceil(metres / BLOCK_M)):
         turns = [heading, heading, heading, (heading + 1) % 4, (heading + 3) % 4]
         rng.shuffle(turns)
         for turn in turns:
-            there = here + np.array([[1, 0], [0, 1], [-1, 0], [0, -1]][turn])
-            if ((there >= 0) & (there <= BLOCKS)).all():
-                here = there
+            next_place = place + np.array([[1, 0], [0, 1], [-1, 0], [0, -1]][turn])
+            if ((next_place >= 0) & (next_place <= BLOCKS)).all():
+                place = next_place
                 heading = turn
                 break
-        corners.append(here)
+        corners.append(place)
     return np.array(corners) * BLOCK_M
 
 
@@ -109,7 +109,7 @@ def drive_way(
     corners = draw_way(rng, metres)
     run = BLOCK_M * np.arange(len(corners))
     route = GivenRoute(*to_degrees(corners[:, 0], corners[:, 1], CENTRE))
-    heard = LocalMap()
+    local_map = LocalMap()
     asked = RequestLog()
     tiles = Tiles()
     active: tuple[Active, ...] = ()
@@ -130,14 +130,14 @@ def drive_way(
             paths = [given]
         paths = (
             paths
-            or ways_on(pose, heard.keys(), length + FURTHER_M)
+            or ways_on(pose, local_map.keys(), length + FURTHER_M)
             or [straight_path(pose, length)]
         )
         active, _ = update_warnings(
             active,
-            [look_ahead(path.first_metres(length), heard, now) for path in paths],
+            [look_ahead(path.first_metres(length), local_map, now) for path in paths],
             pose,
-            heard,
+            local_map,
         )
         tiles.update_subscriptions([path.first_metres(length) for path in paths], pose)
         boxes = [box for path in paths for box in asked.missing_boxes(path, pose, length)]
@@ -150,7 +150,7 @@ def drive_way(
                 key = keys.map_key(one)
                 total += len(payload) + len(key) + FRAME
                 began = time.process_time()
-                heard.store_cells(*decode_cells(key, payload, now), now)
+                local_map.store_cells(*decode_cells(key, payload, now), now)
                 spent += time.process_time() - began
             total += FRAME * len(keys_of(box))
         if second % 2 == 0:

@@ -130,10 +130,10 @@ class MadeUpService:
             self.asked.append(str(asked.selector))
             for tile in {int(grid.tile_of(alert.cell)) for alert in standing}:
                 if asked.key_expr.intersects(zenoh.KeyExpr(keys.alert_key(tile))):
-                    there = [alert for alert in standing if int(grid.tile_of(alert.cell)) == tile]
+                    in_tile = [alert for alert in standing if int(grid.tile_of(alert.cell)) == tile]
                     asked.reply(
                         keys.alert_key(tile),
-                        wire.encode_standing(there),
+                        wire.encode_standing(in_tile),
                         encoding=wire.STANDING_ENCODING,
                     )
 

@@ -235,8 +235,8 @@ def _update_least(before: list[float], parts: Sequence[Part]) -> list[float]:
 def _last_line(sender: Part) -> dict[str, float]:
     """Return the last complete line that the sender process printed, parsed from JSON."""
     whole = [line for line in sender.read_lines() if line.endswith("}")]
-    said: dict[str, float] = json.loads(whole[-1])
-    return said
+    summary: dict[str, float] = json.loads(whole[-1])
+    return summary
 
 
 def _save_course(folder: Path, looks: Sequence[Look]) -> None:

@@ -82,7 +82,7 @@ def main() -> int:
     rate = asked.vehicles / PERIOD_S
     encoding = wire.ENCODING[Kind.OBSERVATION]
     began = time.monotonic()
-    said = began
+    last_printed = began
     late = 0.0
     for number in range(int(asked.seconds * rate)):
         due = began + number / rate
@@ -94,10 +94,10 @@ def main() -> int:
         key, payload = country.encode_report(vehicle, turn, boot)
         waits.put[turn, vehicle] = time.monotonic()
         session.put(key, payload, encoding=encoding, congestion_control=_BLOCK)
-        if time.monotonic() - said >= EVERY_S:
-            line = waits.summarize(said) | {"late_s": late, "payload": float(len(payload))}
+        if time.monotonic() - last_printed >= EVERY_S:
+            line = waits.summarize(last_printed) | {"late_s": late, "payload": float(len(payload))}
             print(json.dumps(line), flush=True)
-            said = time.monotonic()
+            last_printed = time.monotonic()
             late = 0.0
     deadline = time.monotonic() + PATIENCE_S
     while (

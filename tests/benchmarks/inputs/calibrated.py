@@ -104,11 +104,11 @@ def learn_and_narrow(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed
     judged = slice(round(SETTLED_S * RATE_HZ), None)
     found = []
     for vehicles in (fleet.vehicles, learned):
-        mended = np.stack(
+        corrected = np.stack(
             [correct_log(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)],
             axis=1,
         )
-        estimated = bank_of(ESTIMATOR, vehicles).advance(t, mended)
+        estimated = bank_of(ESTIMATOR, vehicles).advance(t, corrected)
         inside = (estimated.mu_lower <= mu) & (mu <= estimated.mu_upper)
         found += [
             float((estimated.mu_upper - estimated.mu_lower)[judged].mean()),

@@ -121,7 +121,7 @@ def _send_events(path: Path, events: int) -> tuple[list[Transfer], Received]:
     ]
     transfers: list[Transfer] = []
     received: Received = []
-    with separate_interchange(url) as there:
+    with separate_interchange(url) as peer:
         for standing in steps:
             settled: list[str] = []
             link = AmqpLink(url, "deliveries", on_accepted=settled.append).open()
@@ -142,8 +142,8 @@ def _send_events(path: Path, events: int) -> tuple[list[Transfer], Received]:
                 output.mark_accepted(name)
             output.keep_up(standing, lambda *_: True)
             link.close()
-            there.send(True)
-            received = there.recv()
+            peer.send(True)
+            received = peer.recv()
             assert len(received) - before == sent
     return transfers, received
 

@@ -105,8 +105,10 @@ def _alerted(
                     ]
                     if foreign:
                         denm = Denm(99, k, 99, START, now, None, (latitude, longitude), 2.0, 3600)
-                        said = decode_denm(encode_denm(replace(denm, sub_cause=ICE, heading=0.0)))
-                        batches += encode_reports(said, "cits-se", 5, seq, now)
+                        decoded = decode_denm(
+                            encode_denm(replace(denm, sub_cause=ICE, heading=0.0))
+                        )
+                        batches += encode_reports(decoded, "cits-se", 5, seq, now)
                     engine.intake.ingest(
                         [Message(Kind.OBSERVATION, key, body, JSON) for key, body in batches], now
                     )

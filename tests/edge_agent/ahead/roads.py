@@ -47,9 +47,9 @@ def cells(
     """Return cells with the keys `key` in the form in which a car receives them. All have the
     friction `mu`, an interval of ± `width`, and the kind of evidence `basis`, such as MEASURED.
     """
-    said = np.full(len(key), mu)
+    median = np.full(len(key), mu)
     slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
-    belief = local_map.belief_of(said - width, said, said + width, slippery)
+    belief = local_map.belief_of(median - width, median, median + width, slippery)
     return ReceivedCells(
         key,
         belief,

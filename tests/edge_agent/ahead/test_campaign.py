@@ -30,31 +30,31 @@ def test_a_longer_way_costs_more_and_a_route_less_than_none() -> None:
 def test_cars_that_reach_ice_are_counted_and_warned() -> None:
     counts = approaches.Approaches()
     approaches.drive_town(100, 60.0, 10, counts, routed=True)
-    assert counts.came > 0
+    assert counts.arrived > 0
     assert counts.warned > 0
     assert counts.metres > 1000.0
     deaf = approaches.Approaches()
     mu = [0.9] * 20 + [0.15] * 10
     track = approaches._Track([10.0 * k for k in range(30)], [10.0] * 30, mu, mu)
     approaches._count_outcome(track, deaf)
-    assert (deaf.came, deaf.warned) == (1, 0), "who is not told is not warned"
+    assert (deaf.arrived, deaf.warned) == (1, 0), "a car without the map is not warned"
     track.raised = {
         "ice": approaches._Raised(12, 80.0, 50.0),
         "nothing": approaches._Raised(2, 30.0, 20.0, ended=8),
     }
     approaches._count_outcome(track, deaf)
-    assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), (
+    assert (deaf.arrived, deaf.warned, deaf.false) == (2, 1, 1), (
         "the first in time; the second of nothing"
     )
     track.raised["ice"].ended = 18
     approaches._count_outcome(track, deaf)
-    assert (deaf.came, deaf.warned) == (3, 1), "a warning that was taken back is none"
+    assert (deaf.arrived, deaf.warned) == (3, 1), "a warning that was taken back is none"
     track.raised["ice"] = approaches._Raised(18, 20.0, 50.0)
     approaches._count_outcome(track, deaf)
-    assert (deaf.came, deaf.warned) == (4, 1), "too late"
+    assert (deaf.arrived, deaf.warned) == (4, 1), "too late"
     track.mu[16:20] = [0.3] * 4
     approaches._count_outcome(track, deaf)
-    assert deaf.came == 4, "who comes from snow is on it already"
+    assert deaf.arrived == 4, "who comes from snow is on it already"
 
 
 @pytest.mark.campaign

@@ -162,9 +162,11 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
 
 
 def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
-    said = cells(keys_on(), 0.15, width=0.05)
-    said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
-    cache = make_local_map([said])
+    received = cells(keys_on(), 0.15, width=0.05)
+    received = received._replace(
+        belief=0.9 * received.belief + 0.1 * cells(received.key, 0.8, width=0.05).belief
+    )
+    cache = make_local_map([received])
     path = straight_path(HOME, 60.0)
     share = -math.expm1(-2400.0 / CHANGE_S)
     assert 0.9 * (1.0 - share) + 0.304 * share < WARN_ABOVE
@@ -255,10 +257,10 @@ def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> N
         horizon = look_ahead(ways[0].first_metres(length), cache, pose.time)
         known_m.append(int((horizon.basis == local_map.MEASURED).sum()))
         for box in asked.missing_boxes(ways[0], pose, length):
-            heard = cells(
+            received = cells(
                 road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time
             )
-            cache.store_cells(1, heard, pose.time)
+            cache.store_cells(1, received, pose.time)
     assert min(known_m[1:]) > 100
 
 

@@ -44,9 +44,11 @@ class Driving:
         session = open_session(router.settings)
         assert session is not None
         self.session = session
-        self.told: queue.Queue[GripWarning] = queue.Queue()
+        self.warnings: queue.Queue[GripWarning] = queue.Queue()
         route = GivenRoute(*line())
-        self.lookout = Lookout([CAR], lambda _, warning: self.told.put(warning), lambda _: route)
+        self.lookout = Lookout(
+            [CAR], lambda _, warning: self.warnings.put(warning), lambda _: route
+        )
         self.lookout.attach(CAR, session)
         self.report_pose()
         self.lookout.start()
@@ -77,10 +79,10 @@ class Driving:
     def next_warning(self) -> GripWarning:
         def has_warning() -> bool:
             self.report_pose()
-            return not self.told.empty()
+            return not self.warnings.empty()
 
         until(has_warning)
-        return self.told.get()
+        return self.warnings.get()
 
 
 @contextmanager
@@ -174,22 +176,22 @@ def test_warnings_are_published_on_the_vehicles_own_key(
     town.standing = [alert(int(ICE[0]), time=NOW)]
     owner = open_session(router.settings)
     assert owner is not None
-    heard: list[zenoh.Sample] = []
+    samples: list[zenoh.Sample] = []
 
     def find_warnings() -> list[zenoh.Sample]:
-        return [sample for sample in heard if decode_ahead(sample.payload.to_bytes()).warnings]
+        return [sample for sample in samples if decode_ahead(sample.payload.to_bytes()).warnings]
 
     with owner:
-        owner.declare_subscriber(keys.ahead_key(CAR), heard.append)
+        owner.declare_subscriber(keys.ahead_key(CAR), samples.append)
         with driving(router) as car:
             assert car.next_warning().state == "raised"
             car.drive_until(lambda _: find_warnings())
     sample = find_warnings()[0]
     assert str(sample.encoding) == AHEAD_ENCODING
-    told = decode_ahead(sample.payload.to_bytes())
-    assert told.vehicle == CAR
-    assert told.warnings[0].state == "raised"
-    assert encode_ahead(told) == sample.payload.to_bytes()
+    outlook = decode_ahead(sample.payload.to_bytes())
+    assert outlook.vehicle == CAR
+    assert outlook.warnings[0].state == "raised"
+    assert encode_ahead(outlook) == sample.payload.to_bytes()
 
 
 def test_ice_during_a_router_outage_is_received_after_reconnect(
@@ -271,7 +273,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
     router: Router, town: MadeUpService
 ) -> None:
     town.mu = {int(key): 0.2 for key in keys_on()}
-    here = np.array([keys_on()[0]])
+    place = np.array([keys_on()[0]])
     flat = (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
         car.lookout.combine_beliefs(np.array([-1]), flat)
@@ -283,7 +285,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(
         def is_informed(seen: Outlook) -> bool:
             # As in the agent, `combine_beliefs` is called for each block. It skips the map while
             # another thread has locked it.
-            car.lookout.combine_beliefs(here, flat)
+            car.lookout.combine_beliefs(place, flat)
             return bool(seen.here[0] < 0.3)
 
         seen = car.drive_until(is_informed)
@@ -356,13 +358,13 @@ class Liar(MadeUpService):
     the other, ending with an empty tile.
     """
 
-    said = 0
+    answers = 0
 
     def tile_answer(self, key: IntArray, mu: FloatArray) -> bytes:
-        self.said += 1
+        self.answers += 1
         lies = [tile_payload(HERE, 0.2, NOW, **lie) for lie in LIES.values()]
         return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][
-            self.said % (len(LIES) + len(NOISE) + 1)
+            self.answers % (len(LIES) + len(NOISE) + 1)
         ]
 
 
@@ -373,11 +375,11 @@ def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> 
         driving(router) as car,
     ):
         later_s = 0.0
-        while liar.said < every:  # after REFRESH_S the car requests the map part again
-            said = liar.said
+        while liar.answers < every:  # after REFRESH_S the car requests the map part again
+            before = liar.answers
             later_s = later_s + REFRESH_S + 1.0
             car.report_pose(later_s=later_s)
-            until(lambda said=said: liar.said > said)  # type: ignore[misc]
+            until(lambda before=before: liar.answers > before)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
         assert not car.lookout.counts.total_of("cells")
         # The last pose was dated an hour ahead. Until a pose of now arrives, an alert of now would
@@ -449,8 +451,8 @@ def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
     for second in range(600):
         metre = 40.0 * second
         pose = _at(metre, second)
-        here: list[Path] = [straight_path(pose, 150.0)]
-        fresh, gone = tiles.update_subscriptions(here, pose)
+        paths: list[Path] = [straight_path(pose, 150.0)]
+        fresh, gone = tiles.update_subscriptions(paths, pose)
         begun = begun + len(fresh)
         ceased = ceased + len(gone)
         assert len(tiles.subscribed_tiles) <= MOST_TILES

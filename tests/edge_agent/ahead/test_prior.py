@@ -27,8 +27,8 @@ def sharp(mu: float, std: float = 0.06) -> FloatArray:
     """Return a map's belief about a cell: probabilities (32,) on the friction grid, with median
     `mu` and a 90 % interval of `mu` ± 1.6·`std`.
     """
-    said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
-    return np.asarray(belief_of(*said)[0])
+    values = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
+    return np.asarray(belief_of(*values)[0])
 
 
 def saying(mu: float, std: float = 0.08) -> FloatArray:
@@ -69,8 +69,8 @@ def test_map_prior_fades_with_age_and_ignores_lower_bounds() -> None:
     place = int(road[0])
     shares = []
     for age_s in (0.0, 1800.0, 4 * 3600.0):
-        said = cells(road, 0.2, at=NOW - round(age_s * NS))
-        belief = make_local_map([said._replace(map_time=np.full(len(road), NOW))]).belief_at(
+        received = cells(road, 0.2, at=NOW - round(age_s * NS))
+        belief = make_local_map([received._replace(map_time=np.full(len(road), NOW))]).belief_at(
             place, NOW
         )
         assert belief is not None

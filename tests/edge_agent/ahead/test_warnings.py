@@ -68,9 +68,9 @@ def dry_but(*ice: IntArray) -> LocalMap:
 
 def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
     car = Car(dry_but(icy()))
-    told = car.drive(450.0)
-    assert [one.state for one in told] == ["raised", "ended"]
-    raised, ended = told
+    warnings = car.drive(450.0)
+    assert [one.state for one in warnings] == ["raised", "ended"]
+    raised, ended = warnings
     assert raised.distance_m >= 14.0 * REACTION_S + MARGIN_M + 14.0**2 / (2 * 0.8 * GRAVITY)
     assert raised.distance_m <= 120.0, "not long before it matters"
     assert raised.time_s == pytest.approx(raised.distance_m / 14.0)
@@ -158,9 +158,9 @@ def test_warning_ends_when_the_car_takes_another_road() -> None:
         yaw=HOME.yaw + math.pi / 2, time=car.pose().time + round((ABSENT_S + UPDATE_S) * NS)
     )
     horizon = look_ahead(straight_path(pose, 200.0), car.cache, pose.time)
-    _, told = update_warnings(car.active, [horizon], pose, car.cache)
-    assert [one.state for one in told] == ["ended"]
-    assert told[0].reason == "the vehicle left this route"
+    _, issued = update_warnings(car.active, [horizon], pose, car.cache)
+    assert [one.state for one in issued] == ["ended"]
+    assert issued[0].reason == "the vehicle left this route"
 
 
 def test_nearly_touching_stretches_are_one_warning_distant_ones_two() -> None:
@@ -179,10 +179,10 @@ def test_stretch_behind_a_fork_is_reported_as_possible() -> None:
         look_ahead(route, cache, NOW),
         look_ahead(straight_path(pose._replace(yaw=1.6), 150.0), cache, NOW),
     ]
-    _, told = update_warnings((), ways, pose, cache)
-    assert [one.sure for one in told] == [False]
-    _, told = update_warnings((), ways[:1], pose, cache)
-    assert [one.sure for one in told] == [True]
+    _, issued = update_warnings((), ways, pose, cache)
+    assert [one.sure for one in issued] == [False]
+    _, issued = update_warnings((), ways[:1], pose, cache)
+    assert [one.sure for one in issued] == [True]
 
 
 def test_a_warning_reads_as_a_sentence() -> None:

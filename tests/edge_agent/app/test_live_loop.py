@@ -166,12 +166,12 @@ def test_a_simulated_source_hands_its_context_to_the_observations(
     assert set(flag[whose > 0].tolist()) == {-1}
     filled = np.isfinite(basket.column(Kind.OBSERVATION, "air_temperature"))
     assert filled.mean() >= 0.9
-    told = [
+    messages = [
         record.getMessage()
         for record in caplog.records
         if "is treated as unknown" in record.getMessage()
     ]
-    assert told == [
+    assert messages == [
         (
             "vehicle 1: abs_active has been on since the start: it is treated as unknown; "
             "correct the profile"

@@ -66,9 +66,9 @@ def test_both_engines_write_the_same_bytes_and_errors(
             ESTIMATOR,
         ]
         assert main([*words, "--engine", engine]) == 2
-        said = capsys.readouterr().err
-        assert f"error: {bad}: log:" in said
-        assert f"4 of 4 logs, {DRIVES * 200} samples" in said
+        stderr = capsys.readouterr().err
+        assert f"error: {bad}: log:" in stderr
+        assert f"4 of 4 logs, {DRIVES * 200} samples" in stderr
     assert len(contents(tmp_path / "local")) == DRIVES
     assert contents(tmp_path / "spark") == contents(tmp_path / "local")
 
@@ -81,10 +81,10 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
     (tmp_path / "spark").mkdir()
     work = partial(estimate_atomically, estimator=ESTIMATOR, memberships=None)
     dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tmp_path / "tries")
-    told = spark.run_tasks(session, tasks_of(drives, None, tmp_path / "spark"), dying)
+    outcomes = spark.run_tasks(session, tasks_of(drives, None, tmp_path / "spark"), dying)
     assert sorted(path.name for path in (tmp_path / "tries").iterdir()) == [
         path.name for path in drives
     ], "all died"
-    assert [outcome.samples for outcome in told] == [200] * DRIVES
+    assert [outcome.samples for outcome in outcomes] == [200] * DRIVES
     list(estimate_drives(tasks_of(drives, None, tmp_path / "local"), ESTIMATOR, 1))
     assert contents(tmp_path / "spark") == contents(tmp_path / "local")

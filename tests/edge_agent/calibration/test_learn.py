@@ -78,7 +78,7 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
 def test_correction_removes_the_learned_errors(smooth: Recorded) -> None:
     bad = spoil_drive(smooth)
     calibration = learn_calibration(parts(bad, 3), bad.vehicle)
-    mended = correct_log(
+    corrected = correct_log(
         bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration})
     )
     for channel, off in (
@@ -86,7 +86,7 @@ def test_correction_removes_the_learned_errors(smooth: Recorded) -> None:
         (S.YAW_RATE, OFF["yaw_rate"]),
         (S.DELTA, OFF["steer_offset"]),
     ):
-        left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
+        left = np.nanmedian(corrected[:, channel] - smooth.signals[:, channel])
         assert abs(left) < 0.35 * off
     assert correct_log(bad.t, bad.signals, bad.vehicle) is bad.signals
 
@@ -149,8 +149,8 @@ def test_torque_determines_its_gain_times_the_mass() -> None:
     vehicle = drive.vehicle.model_copy(
         update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))}
     )
-    mended = correct_log(drive.t, scale_columns(torques, 1.1)(drive).signals, vehicle)
-    assert np.allclose(mended[:, torques], drive.signals[:, torques], equal_nan=True)
+    corrected = correct_log(drive.t, scale_columns(torques, 1.1)(drive).signals, vehicle)
+    assert np.allclose(corrected[:, torques], drive.signals[:, torques], equal_nan=True)
     unsaid = drive.signals.copy()
     unsaid[:, torques] = np.nan
     assert learn_calibration([(drive.t, unsaid)], drive.vehicle).force_gain is None
@@ -182,7 +182,7 @@ def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(
     assert abs(one[0]) < 3.0 * one[1]
     known = Calibration.model_validate({"drives": 1, name: (seconds, 0.001)})
     vehicle = bad.vehicle.model_copy(update={"calibration": known})
-    mended = correct_log(bad.t, bad.signals, vehicle)
+    corrected = correct_log(bad.t, bad.signals, vehicle)
     both = [
         *WHEELS_AND_STEERING["wheel_lag"],
         *WHEELS_AND_STEERING["steer_lag"],
@@ -190,7 +190,7 @@ def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(
         S.AY,
         S.YAW_RATE,
     ]
-    assert np.array_equal(mended[LATE:, both], smooth.signals[:-LATE, both], equal_nan=True)
+    assert np.array_equal(corrected[LATE:, both], smooth.signals[:-LATE, both], equal_nan=True)
 
 
 def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> None:
@@ -262,14 +262,14 @@ def test_a_calibrated_file_is_written_read_and_heeded(
     learned = load_vehicle(better)
     assert learned.calibration is not None
     assert learned.model_copy(update={"calibration": None}) == load_vehicle(car)
-    said = []
+    estimates = []
     for number, file in enumerate((car, better)):
         out = tmp_path / f"{number}.parquet"
         assert main(
             ["replay", log, "--vehicle", str(file), "--estimator", "ckf", "--out", str(out)]
         ) in (0, 3)
-        said.append(pq.read_table(out))
-    assert not said[0].equals(said[1])
+        estimates.append(pq.read_table(out))
+    assert not estimates[0].equals(estimates[1])
     wrong = write(tmp_path / "b.parquet", scale_columns([S.AY], -1.0)(smooth))
     assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better)]) == 2
     assert "ay sign" in capsys.readouterr().err

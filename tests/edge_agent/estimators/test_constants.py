@@ -301,8 +301,8 @@ def mean_of_known(values: FloatArray, where: FloatArray) -> float:
     """Return the mean of those elements of `values` for which `where` is finite, or 0 if there are
     none.
     """
-    there = np.isfinite(where)
-    return float(values[there].mean()) if there.any() else 0.0
+    is_known = np.isfinite(where)
+    return float(values[is_known].mean()) if is_known.any() else 0.0
 
 
 def geometric(values: FloatArray) -> float:

@@ -41,8 +41,8 @@ def test_every_departure_has_a_reason_and_every_element_a_home(paper: str) -> No
 def test_an_element_without_reason_or_home_is_found() -> None:
     silent = Element("(1)", "a sign", "corrected", where="dynamics")
     homeless = Element("(2)", "a filter", "as printed")
-    said = Element("(3)", "a bench", "left out", "no data")
-    assert elements_without_reason((silent, homeless, said)) == ["(1)", "(2)"]
+    explained = Element("(3)", "a bench", "left out", "no data")
+    assert elements_without_reason((silent, homeless, explained)) == ["(1)", "(2)"]
 
 
 @pytest.mark.parametrize("paper", LISTS)

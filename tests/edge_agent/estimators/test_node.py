@@ -220,8 +220,8 @@ def test_residual_noise_equals_that_of_slip_and_force_about_a_line(
     slip = rng.normal(0.0, 0.03, 100_000)
     force = rng.normal(0.0, 0.01, 100_000)
     distance = (force - slope * slip) / np.hypot(1.0, slope)
-    felt = (0.5 - slip_noise_correction(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
-    assert distance.var() == pytest.approx(felt, rel=0.02)
+    expected = (0.5 - slip_noise_correction(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
+    assert distance.var() == pytest.approx(expected, rel=0.02)
 
 
 def test_split_nodes_share_probability_with_a_friction_between_them() -> None:

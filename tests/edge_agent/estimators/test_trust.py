@@ -106,8 +106,8 @@ def test_strain_is_high_only_with_tilted_or_turned_sensors() -> None:
 @pytest.mark.parametrize("manoeuvre", ["braking", "acceleration", "slalom", "pulses"])
 def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
     t, signals, vehicle = drive(manoeuvre, 0.15)
-    trust, said = after(signals, t, vehicle)
-    assert not said.any()
+    trust, contradicts = after(signals, t, vehicle)
+    assert not contradicts.any()
     assert trust["odd"] < CONSTANTS.chosen.odd_least
 
 
@@ -149,9 +149,9 @@ def test_unexplained_side_force_contradicts_until_patience_ends() -> None:
     signals = np.zeros((len(t), 18))
     signals[:, S.OMEGA : S.OMEGA + 4] = 60.0
     signals[:, S.AY] = np.where(t < 4.0, 3.0 * np.sin(2.0 * t), 0.0)
-    said = after(signals, t, vehicle)[1]
-    began = t[said.argmax()]
-    ended = t[len(t) - 1 - said[::-1].argmax()]
+    contradicts = after(signals, t, vehicle)[1]
+    began = t[contradicts.argmax()]
+    ended = t[len(t) - 1 - contradicts[::-1].argmax()]
     assert 0.5 < began < 4.0
     assert ended - began == pytest.approx(CONSTANTS.chosen.patience, abs=0.2)
 

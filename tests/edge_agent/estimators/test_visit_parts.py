@@ -53,5 +53,5 @@ def test_evidence_is_given_only_at_visit_ends_and_jumps() -> None:
     _, estimates = one_visit("jump-braking", None, 2)
     assert estimates.jumps is not None
     assert estimates.evidence is not None
-    told = np.isfinite(estimates.evidence[:, 0]).all(axis=1)
-    assert told.sum() == estimates.jumps.sum() + 2
+    has_evidence = np.isfinite(estimates.evidence[:, 0]).all(axis=1)
+    assert has_evidence.sum() == estimates.jumps.sum() + 2

@@ -191,16 +191,16 @@ def _make_update(
     )
     other = mean.copy()
     other_root = root.copy()
-    told = update_by_downdate(mean, root, *args)
+    updated = update_by_downdate(mean, root, *args)
     plain = update(other, other_root, *args)
-    assert told[:3] == pytest.approx(plain, rel=1e-9)
-    return (mean, other, root @ root.T, other_root @ other_root.T), told
+    assert updated[:3] == pytest.approx(plain, rel=1e-9)
+    return (mean, other, root @ root.T, other_root @ other_root.T), updated
 
 
 @pytest.mark.campaign
 def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
-    (mean, other, cov, other_cov), told = _make_update(11, 0.5)
-    assert not told[3]
+    (mean, other, cov, other_cov), updated = _make_update(11, 0.5)
+    assert not updated[3]
     assert mean == pytest.approx(other, abs=1e-9)
     assert cov == pytest.approx(other_cov, abs=1e-9)
 
@@ -232,14 +232,14 @@ def test_downdate_filter_is_the_textbook_filter_on_a_linear_system() -> None:
             root,
             work,
         )
-        told = update_by_downdate(
+        updated = update_by_downdate(
             x,
             root,
             root.copy(),
             Measurement(np.ascontiguousarray(h @ root), z - h @ x, noise),
             work,
         )
-        assert not told[3]
+        assert not updated[3]
         assert x == pytest.approx(mean, abs=1e-12)
         assert root @ root.T == pytest.approx(cov, abs=1e-12)
 
@@ -248,7 +248,7 @@ def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> Non
     """The noise is so small that rounding leaves no variance in the measured direction. The filter
     must refuse the downdate of the covariance, and use the orthogonal update instead.
     """
-    (mean, other, cov, other_cov), told = _make_update(12, 1e-9)
-    assert told[3]
+    (mean, other, cov, other_cov), updated = _make_update(12, 1e-9)
+    assert updated[3]
     assert np.array_equal(mean, other)
     assert np.array_equal(cov, other_cov)

@@ -124,8 +124,10 @@ def _update_moments(
     new = mean.copy()
     factor = root.copy()
     work = np.zeros((rows + n, count + rows))
-    said = householder.update(new, factor, x, Measurement(y, z - rule.w_mean @ seen, std), work)
-    return new, factor, said
+    statistics = householder.update(
+        new, factor, x, Measurement(y, z - rule.w_mean @ seen, std), work
+    )
+    return new, factor, statistics
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
@@ -151,9 +153,9 @@ def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> No
         mean = mean + k @ nu
         cov = rest @ cov @ rest.T + k @ np.diag(std**2) @ k.T
         ours, root = _predict_moments(rule, ours, ours_cov, f, q)
-        ours, root, said = _update_moments(rule, ours, root, h, std, z)
+        ours, root, statistics = _update_moments(rule, ours, root, h, std, z)
         ours_cov = root @ root.T
-        assert said[1] == pytest.approx(expected, abs=1e-9)
+        assert statistics[1] == pytest.approx(expected, abs=1e-9)
         assert np.allclose(ours, mean, rtol=0, atol=1e-12)
         assert np.allclose(ours_cov, cov, rtol=0, atol=1e-12)
 

@@ -240,12 +240,12 @@ def live_blocks(values: dict[str, float], every: int, blocks: int, profile: Prof
     """
     clock = Steered()
     feed = Scripted("bus", clock)
-    told = iter(range(100_000))
+    numbers = iter(range(100_000))
 
     def wait(seconds: float) -> None:
         for _ in range(max(1, round(seconds * RATE))):
             clock.move(1.0 / RATE)
-            k = next(told)
+            k = next(numbers)
             feed.tell(clock.now(), ax=0.0, **(values if k % every == 0 else {}))
 
     rows = LiveRows([feed], profile, CAR, clock, wait=wait)

@@ -150,8 +150,8 @@ def test_units_that_are_all_wrong_are_all_named(
     drive = rough
     for name in ("both in g", "yaw rate in deg/s", "steering wheel in deg", wheels):
         drive = PLANTED[name].spoil(drive)
-    said = diagnose(*drive)
-    kinds = {(finding.channel, finding.kind) for finding in said.findings}
+    diagnosis = diagnose(*drive)
+    kinds = {(finding.channel, finding.kind) for finding in diagnosis.findings}
     named = {("ax", "g"), ("ay", "g"), ("yaw_rate", "deg/s"), ("delta", "steering wheel, deg")}
     assert named | {("omega", PLANTED[wheels].kind)} <= kinds
     log = write(tmp_path / "bad.parquet", drive)
@@ -163,20 +163,20 @@ def test_units_that_are_all_wrong_are_all_named(
 
 
 def test_a_sound_drive_passes_with_its_tilts_offsets_and_lags(rough: Recorded) -> None:
-    said = diagnose(*rough)
-    assert said.is_passed
-    assert set(said.sound) == {"ax", "ay", "yaw_rate", "delta", "omega", "latitude"}
+    diagnosis = diagnose(*rough)
+    assert diagnosis.is_passed
+    assert set(diagnosis.sound) == {"ax", "ay", "yaw_rate", "delta", "omega", "latitude"}
 
 
 @pytest.mark.parametrize("unit", [np.pi / 180.0, 60.0])
 def test_positions_in_another_unit_are_a_fault(rough: Recorded, unit: float) -> None:
     signals = rough.signals.copy()
     signals[:, S.LATITUDE : S.LONGITUDE + 1] *= unit
-    said = diagnose(rough.t, signals, rough.vehicle)
+    diagnosis = diagnose(rough.t, signals, rough.vehicle)
     is_beyond = unit > 1.0
     kind = "range" if is_beyond else "scale"
-    assert (said.findings[0].channel, said.findings[0].kind) == ("latitude", kind)
-    assert len(said.findings) == 1 + is_beyond
+    assert (diagnosis.findings[0].channel, diagnosis.findings[0].kind) == ("latitude", kind)
+    assert len(diagnosis.findings) == 1 + is_beyond
     even = prepare_drive(*rough)
     ground = np.interp(rough.t, even.t, np.nan_to_num(even.v))
     assert diagnose(rough.t, signals, rough.vehicle, ground).findings[0].kind == kind
@@ -185,8 +185,8 @@ def test_positions_in_another_unit_are_a_fault(rough: Recorded, unit: float) -> 
 def test_speed_over_ground_in_another_unit_is_a_fault(rough: Recorded) -> None:
     even = prepare_drive(*rough)
     ground = 3.6 * np.interp(rough.t, even.t, np.nan_to_num(even.v))
-    said = diagnose(*rough, ground)
-    assert [(one.channel, one.kind) for one in said.findings] == [("gnss_speed", "scale")]
+    diagnosis = diagnose(*rough, ground)
+    assert [(one.channel, one.kind) for one in diagnosis.findings] == [("gnss_speed", "scale")]
 
 
 @pytest.mark.parametrize(
@@ -213,21 +213,21 @@ def test_wheels_that_send_a_constant_code_are_a_fault(rough: Recorded) -> None:
     signals = rough.signals.copy()
     signals[:, S.OMEGA] = -1.0
     signals[:, S.OMEGA + 1] = 65535.0
-    said = diagnose(rough.t, signals, rough.vehicle)
-    found = {(one.channel, one.kind) for one in said.findings}
+    diagnosis = diagnose(rough.t, signals, rough.vehicle)
+    found = {(one.channel, one.kind) for one in diagnosis.findings}
     assert found == {("omega_fl", "constant"), ("omega_fr", "constant")}
 
 
 def test_time_stamps_in_whole_seconds_are_a_fault(rough: Recorded) -> None:
-    said = diagnose(np.floor(rough.t), rough.signals, rough.vehicle)
-    assert [(one.channel, one.kind) for one in said.findings] == [("t", "repeats")]
+    diagnosis = diagnose(np.floor(rough.t), rough.signals, rough.vehicle)
+    assert [(one.channel, one.kind) for one in diagnosis.findings] == [("t", "repeats")]
 
 
 @pytest.mark.parametrize("rows", [2, 3])
 def test_log_of_a_few_rows_gives_no_finding(rough: Recorded, rows: int) -> None:
-    said = diagnose(rough.t[:rows], rough.signals[:rows], rough.vehicle)
-    assert not said.findings
-    assert not said.sound
+    diagnosis = diagnose(rough.t[:rows], rough.signals[:rows], rough.vehicle)
+    assert not diagnosis.findings
+    assert not diagnosis.sound
 
 
 @pytest.mark.parametrize("row", [2, 7000])
@@ -245,8 +245,10 @@ def test_a_fault_of_a_channel_without_rule_is_not_corrected(rough: Recorded) -> 
 def test_a_diameter_given_as_the_radius_is_named(rough: Recorded) -> None:
     radius = 2.0 * rough.vehicle.wheel_radius
     vehicle = rough.vehicle.model_copy(update={"wheel_radius": radius})
-    said = diagnose(rough.t, rough.signals, vehicle)
-    assert [(finding.channel, finding.kind) for finding in said.findings] == [("omega", "radius")]
+    diagnosis = diagnose(rough.t, rough.signals, vehicle)
+    assert [(finding.channel, finding.kind) for finding in diagnosis.findings] == [
+        ("omega", "radius")
+    ]
 
 
 def test_fit_removes_the_offset_from_the_samples_of_its_plot(rough: Recorded) -> None:
@@ -259,10 +261,10 @@ def test_standing_car_gives_no_finding_and_does_not_pass(rough: Recorded) -> Non
     still = rough.signals[:3000].copy()
     still[:, : S.LATITUDE] = 0.0
     still[:, S.LATITUDE :] = np.nan
-    said = diagnose(rough.t[:3000], still, rough.vehicle)
-    assert not said.findings
-    assert set(said.unknown) == {"ax", "ay", "yaw_rate", "delta", "omega"}
-    assert not said.is_passed
+    diagnosis = diagnose(rough.t[:3000], still, rough.vehicle)
+    assert not diagnosis.findings
+    assert set(diagnosis.unknown) == {"ax", "ay", "yaw_rate", "delta", "omega"}
+    assert not diagnosis.is_passed
 
 
 @pytest.mark.parametrize(
@@ -305,9 +307,9 @@ def test_fix_of_a_fault_that_no_profile_corrects_writes_nothing(
     log = write(tmp_path / "bad.parquet", coarse)
     profile = tmp_path / "fixed.json"
     assert main(["check", *log, "--fix", str(profile)]) == 1
-    said = capsys.readouterr().err
-    assert "not corrected: t repeats" in said
-    assert f"{profile}: not written" in said
+    stderr = capsys.readouterr().err
+    assert "not corrected: t repeats" in stderr
+    assert f"{profile}: not written" in stderr
     assert not profile.exists()
 
 
@@ -335,12 +337,12 @@ def test_check_writes_findings_as_json(rough: Recorded, tmp_path: Path, capsys: 
     for name, drive in (("good", rough), ("bad", PLANTED["a_y flipped"].spoil(rough))):
         log = write(tmp_path / f"{name}.parquet", drive)
         assert main(["check", *log, "--json"]) == (1 if name == "bad" else 0)
-        said = json.loads(capsys.readouterr().out)
-        assert said["passed"] is (name == "good")
-        assert said["identities"]["lateral"]["correlation"] != 0.0
-    (found,) = said["findings"]
+        document = json.loads(capsys.readouterr().out)
+        assert document["passed"] is (name == "good")
+        assert document["identities"]["lateral"]["correlation"] != 0.0
+    (found,) = document["findings"]
     assert (found["channel"], found["scale"]) == ("ay", -1.0)
-    assert "ay" not in said["sound"]
+    assert "ay" not in document["sound"]
 
 
 @pytest.mark.parametrize(
@@ -386,10 +388,10 @@ def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsy
     assert main(["check", log, *car, "--out", page]) == 0
     publish = ["--publish", "--name", "car-one", "--config", str(tmp_path / "agent.json")]
     assert main(["replay", log, *car, "--start", "now", "--out", out, *publish]) == 0
-    said = capsys.readouterr()
-    assert "passed" in said.out
-    assert said.err.endswith("; plausible\n")
-    assert json.loads(said.out.splitlines()[-1])["observations_acknowledged"] > 50
+    captured = capsys.readouterr()
+    assert "passed" in captured.out
+    assert captured.err.endswith("; plausible\n")
+    assert json.loads(captured.out.splitlines()[-1])["observations_acknowledged"] > 50
 
 
 def test_log_that_fails_the_doctor_is_published_only_with_trust(

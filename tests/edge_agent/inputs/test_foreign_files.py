@@ -134,8 +134,8 @@ def test_a_draft_without_known_signals_is_an_error_that_lists_them(
 ) -> None:
     source = write(tmp_path / "a.csv", "time,foo,bar\n0.0,1.0,2.0\n0.1,2.0,3.0\n")
     assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 2
-    said = capsys.readouterr().err
-    assert "bar, foo" in said
+    stderr = capsys.readouterr().err
+    assert "bar, foo" in stderr
     assert not list(tmp_path.glob("*.profile.json"))
 
 
@@ -328,9 +328,9 @@ def test_a_unit_that_is_not_known_is_noted(
     text = "t,ax [mg],air_temperature [F]\n0.0,100,23\n0.1,100,23\n"
     out = tmp_path / "o.parquet"
     main(["import", str(write(tmp_path / "a.csv", text)), "--out", str(out)])
-    told = capsys.readouterr().out
-    assert "note: ax: its unit 'mg' is unknown; taken as m/s^2" in told
-    assert "note: no source has a date; replay --publish needs --start" in told
+    stdout = capsys.readouterr().out
+    assert "note: ax: its unit 'mg' is unknown; taken as m/s^2" in stdout
+    assert "note: no source has a date; replay --publish needs --start" in stdout
     assert pq.read_table(out)["air_temperature"][0].as_py() == pytest.approx(-5.0)
 
 
@@ -352,9 +352,9 @@ def test_import_names_a_misspelt_signal_of_the_profile(
     channels = {"ax": {"signal": "AccXX"}, "ay": {"signal": "AccY"}}
     profile.write_text(json.dumps({"version": 1, "name": "own", "channels": channels}))
     main(["import", str(source), "--profile", str(profile), "--out", str(tmp_path / "o.parquet")])
-    told = capsys.readouterr().out
-    assert "note: ax: no recording has the signal AccXX; did you mean AccX?" in told
-    assert "note: ay" not in told
+    stdout = capsys.readouterr().out
+    assert "note: ax: no recording has the signal AccXX; did you mean AccX?" in stdout
+    assert "note: ay" not in stdout
 
 
 def test_a_clock_that_jumps_by_years_is_refused(

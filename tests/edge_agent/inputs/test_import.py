@@ -59,9 +59,9 @@ def test_the_real_minute_becomes_a_log_in_si_with_its_provenance(tmp_path: Path)
     turning, lateral = (np.convolve(column(table, n), second, "valid") for n in ("yaw_rate", "ay"))
     assert np.corrcoef(speed[99:] * turning, lateral)[0, 1] > 0.7, "a_y and v r have one sign"
     assert str(table["timestamp"][0]).startswith("2018-08-02 16:14:48")
-    told = json.loads(table.schema.metadata[PROVENANCE])
-    assert told["sources"] == ["rav4.blf", "rav4.nmea"]
-    assert told["channels"]["ax"]["jitter_s"] > 1e-3, "arrival in bursts was straightened"
+    provenance = json.loads(table.schema.metadata[PROVENANCE])
+    assert provenance["sources"] == ["rav4.blf", "rav4.nmea"]
+    assert provenance["channels"]["ax"]["jitter_s"] > 1e-3, "arrival in bursts was straightened"
 
 
 WRITERS: dict[str, Callable[[Path, list[can.Message]], Path]] = {

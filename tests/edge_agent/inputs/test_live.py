@@ -112,10 +112,10 @@ def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_p
     key = "0/imu/sensor_msgs::msg::dds_::Imu_/RIHS01_0"
     rng = np.random.default_rng(3)
 
-    def hears(payload: bytes, heard: Callable[[], bool]) -> None:
+    def hears(payload: bytes, is_received: Callable[[], bool]) -> None:
         def has_heard() -> bool:
             session.put(key, payload)
-            return heard()
+            return is_received()
 
         until(has_heard)
 
@@ -278,9 +278,9 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
             running.send_go()
         service.wait(lambda batches: sum(batch.kind == Kind.OBSERVATION for batch in batches) >= 2)
         agent.terminate()
-        said, _ = agent.communicate(timeout=60)
+        stdout, _ = agent.communicate(timeout=60)
     assert agent.returncode == 0
-    assert json.loads(said.splitlines()[-1])["acknowledged"] > 0
+    assert json.loads(stdout.splitlines()[-1])["acknowledged"] > 0
     assert {batch.vehicle for batch in service.batches} == {"car-one"}
 
 

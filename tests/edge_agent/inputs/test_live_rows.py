@@ -118,12 +118,12 @@ def test_rows_interpolate_readings_and_are_empty_for_a_silent_source(
     t, signals = (
         np.concatenate([getattr(block, name)[:, 0] for block in got]) for name in ("t", "signals")
     )
-    told = t <= last + 1e-9
-    assert np.allclose(signals[told, S.AX], 5.0 * t[told], atol=1e-6)
-    assert np.isnan(signals[~told, S.AX]).all()
-    assert (~told).sum() > 100
+    has_reading = t <= last + 1e-9
+    assert np.allclose(signals[has_reading, S.AX], 5.0 * t[has_reading], atol=1e-6)
+    assert np.isnan(signals[~has_reading, S.AX]).all()
+    assert (~has_reading).sum() > 100
     assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
-    front = signals[told, S.DELTA : S.DELTA + 2]
+    front = signals[has_reading, S.DELTA : S.DELTA + 2]
     assert np.all(front[:, 0] > front[:, 1] + 0.08), "the inner wheel turns more"
     assert np.allclose(front.mean(axis=1), 0.4, atol=0.01)
     assert np.allclose(np.diff(t), 0.01)

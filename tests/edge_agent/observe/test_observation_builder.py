@@ -178,10 +178,10 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
     block = ground(east, np.zeros_like(east), np.zeros_like(east))
     reported = estimates(samples, 1, mu=0.9)
     used = type(reported)(**{**vars(reported), "mu_utilised": np.full((samples, 1), 0.8)})
-    told = []
-    for felt in (0.1, 0.8, np.nan):
+    utilised = []
+    for used_grip in (0.1, 0.8, np.nan):
         signals = block.signals.copy()
-        signals[..., S.AX] = -felt * GRAVITY
+        signals[..., S.AX] = -used_grip * GRAVITY
         signals[..., S.AY] = 0.0
         _, located = locate_vehicles(Watch.of(1).tracks, block.t, block.signals)
         reading = cast("Estimates", used)
@@ -193,8 +193,8 @@ def test_grip_not_felt_in_a_cell_belongs_to_the_cell_before() -> None:
             AgentConfig(),
             BlockReadings(signals),
         )
-        told.append(float(records.columns["mu_utilised"][0]))
-    assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
+        utilised.append(float(records.columns["mu_utilised"][0]))
+    assert utilised == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
 
 def observe_grip(observed: np.ndarray, east: np.ndarray, fix_every: int = 10) -> list[float]:
@@ -284,13 +284,13 @@ def test_visit_with_a_friction_jump_reports_both_and_grip_of_the_lesser(
     made = {"evidence": evidence, "jumps": jumps, "mu_utilised": np.full((samples, 1), 0.7)}
     reported = type(reported)(**{**vars(reported), **made})
     watch = Watch.of(1)
-    told = []
+    likelihoods = []
     used = []
     for rows in [slice(None)] if cut is None else [slice(0, cut), slice(cut, None)]:
         _, observations, _ = watch.step(part(block, rows), reported.part(rows))
-        told += list(observations.columns["log_likelihood"])
+        likelihoods += list(observations.columns["log_likelihood"])
         used += observations.columns["mu_utilised"].tolist()
-    assert np.array_equal(told[1], mugrid.encode_log_likelihood(np.maximum(ice, dry)))
+    assert np.array_equal(likelihoods[1], mugrid.encode_log_likelihood(np.maximum(ice, dry)))
     assert used[1] == pytest.approx(mugrid.CENTRES[ice >= -3.0].max())
     assert used[0] == pytest.approx(0.7)
 
@@ -336,7 +336,7 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
     given["wiper"] = np.where(np.arange(samples)[:, None] < first, 0.5, np.nan)
     context = context_block(samples, 1, given)
     reading = cast("Estimates", reported)
-    _, told, _ = build_records(
+    _, observations, _ = build_records(
         OpenVisits.before_any(1),
         block.time,
         located,
@@ -344,10 +344,12 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
         AgentConfig(),
         BlockReadings(block.signals, context),
     )
-    columns = told.columns
+    columns = observations.columns
     assert columns["abs_active"][:2].tolist() == [1, -1]
     assert (
-        columns["esc_active"].tolist() == columns["tcs_active"].tolist() == [-1] * len(told.vehicle)
+        columns["esc_active"].tolist()
+        == columns["tcs_active"].tolist()
+        == [-1] * len(observations.vehicle)
     )
     expected = [
         given["air_temperature"][rows, 0].mean() for rows in (slice(0, first), slice(first, second))
@@ -368,5 +370,5 @@ def test_observation_contains_controller_flags_and_context_of_its_visit() -> Non
         assert np.array_equal(
             columns[name], plain.columns[name], equal_nan=columns[name].dtype.kind == "f"
         ), name
-    assert plain.columns["abs_active"].tolist() == [-1] * len(told.vehicle)
+    assert plain.columns["abs_active"].tolist() == [-1] * len(observations.vehicle)
     assert np.isnan(plain.columns["air_temperature"]).all()

@@ -38,8 +38,8 @@ WORDS = [
 
 
 def grip(mu: float, lower: float, upper: float, used: float, seconds: float = 0.0) -> Grip:
-    told = (np.array([value]) for value in (mu, lower, upper, used))
-    return Grip._make((*told, np.array([START + round(seconds * NS)])))
+    values = (np.array([value]) for value in (mu, lower, upper, used))
+    return Grip._make((*values, np.array([START + round(seconds * NS)])))
 
 
 def names(known: dict[str, float]) -> dict[str, float]:
@@ -85,7 +85,7 @@ def test_friction_is_reported_at_the_given_rate() -> None:
 def test_subscriber_receives_the_printed_vss_value(router: Router) -> None:
     lines: list[str] = []
     output = RoadFrictionOutput(["car-one"], lines.append, 10.0)
-    heard: list[str] = []
+    received: list[str] = []
     with (
         zenoh.open(configuration(router.settings, "car-one")) as car,
         zenoh.open(configuration(router.settings, "dashboard")) as dashboard,
@@ -93,13 +93,13 @@ def test_subscriber_receives_the_printed_vss_value(router: Router) -> None:
         output.attach("car-one", car)
         output.report_grip(grip(0.3, 0.2, 0.4, 0.3))
         dashboard.declare_subscriber(
-            keys.vss_key("car-one"), lambda sample: heard.append(sample.payload.to_string())
+            keys.vss_key("car-one"), lambda sample: received.append(sample.payload.to_string())
         )
         matched(output.publishers["car-one"])
         output.report_grip(grip(0.3, 0.2, 0.4, 0.3, 1.0))
-        until(lambda: heard)
-    assert heard == lines[1:]
-    assert names(json.loads(heard[0]))["MostProbable"] == 30.0
+        until(lambda: received)
+    assert received == lines[1:]
+    assert names(json.loads(received[0]))["MostProbable"] == 30.0
 
 
 @pytest.mark.campaign
@@ -113,11 +113,11 @@ def test_the_command_prints_lines_of_the_drive(
     with Service(router):
         assert main([*WORDS, "--config", str(config)]) == 0
     *lines, _ = capsys.readouterr().out.splitlines()
-    told = [json.loads(line) for line in lines]
-    assert len(told) > 1
-    assert {one["event"] for one in told} == {"vss"}
-    assert {one["vehicle"] for one in told} == {"car-one"}
-    for one in told:
+    signals = [json.loads(line) for line in lines]
+    assert len(signals) > 1
+    assert {one["event"] for one in signals} == {"vss"}
+    assert {one["vehicle"] for one in signals} == {"car-one"}
+    for one in signals:
         known = names(one)
         assert 0.0 < known["LowerBound"] < known["UpperBound"] <= 100.0
         assert known["LowerBound"] <= known.get("MostProbable", 100.0)

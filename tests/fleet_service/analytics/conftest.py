@@ -111,11 +111,11 @@ def asked(archive: Path) -> Callable[..., pa.Table]:
     """
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
-        said: list[str] = []
+        lines: list[str] = []
         found = QUESTIONS[name].ask(
             QueryEngine(engine, archive, part),
-            Options(report=said.append, **options),  # type: ignore[arg-type]
+            Options(report=lines.append, **options),  # type: ignore[arg-type]
         )
-        return found.replace_schema_metadata({"said": "\n".join(said)})
+        return found.replace_schema_metadata({"report": "\n".join(lines)})
 
     return ask

@@ -47,9 +47,9 @@ def test_every_question_prints_a_table_and_its_input(
     )
     out = tmp_path / "answer.parquet"
     assert analyze(archive, name, *more, "--out", str(out)) == 0
-    said = capsys.readouterr()
-    assert said.err.startswith(f"{name}: 2 files, 24,000 observations\n")
-    lines = said.out.splitlines()
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"{name}: 2 files, 24,000 observations\n")
+    lines = captured.out.splitlines()
     answer = pq.read_table(out)
     flat = [f.name for f in answer.schema if not pa.types.is_nested(f.type)]
     # The printed table has the cell's centre in place of its number.
@@ -88,8 +88,8 @@ def test_empty_box_names_the_box_of_the_archive(
     archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert analyze(archive, "grip", "--bbox", "0,0,1,1") == 0
-    said = capsys.readouterr().err
-    covered = re.search(r"no cell lies in this box; the archive covers --bbox ([\d.,-]+)\n", said)
+    stderr = capsys.readouterr().err
+    covered = re.search(r"no cell lies in this box; the archive covers --bbox ([\d.,-]+)\n", stderr)
     assert covered is not None
     west, south, east, north = covered[1].split(",")
     assert analyze(archive, "grip", "--bbox", f"{south},{west},{north},{east}") == 0

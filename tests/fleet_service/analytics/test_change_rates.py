@@ -87,13 +87,13 @@ def test_few_days_have_no_interval() -> None:
 
 def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.DataFrame) -> None:
     found = asked("change-rates").to_pandas()
-    told = rows[rows["value"]].sort_values(
+    measured = rows[rows["value"]].sort_values(
         ["cell", "sector", "time", "vehicle", "boot", "seq", "row"]
     )
-    before = told.groupby(["cell", "sector"])[["time", "vehicle", "mu"]].shift()
-    apart = told["time"] - before["time"]
-    pair = (before["vehicle"] != told["vehicle"]) & (apart >= 1) & (apart <= LONGEST_S)
-    unlike = pair & ((before["mu"] < SLIPPERY_MU) != (told["mu"] < SLIPPERY_MU))
+    before = measured.groupby(["cell", "sector"])[["time", "vehicle", "mu"]].shift()
+    apart = measured["time"] - before["time"]
+    pair = (before["vehicle"] != measured["vehicle"]) & (apart >= 1) & (apart <= LONGEST_S)
+    unlike = pair & ((before["mu"] < SLIPPERY_MU) != (measured["mu"] < SLIPPERY_MU))
     hours = found[found["by"] == "hour of the day (UTC)"]
     assert hours["pairs"].sum() == pair.sum() > 500
     assert hours["unlike"].sum() == unlike.sum() > 0

@@ -40,11 +40,11 @@ def test_grip_gives_the_percentiles_of_values_per_cell_and_day(
     groups = rows.groupby(["day", *PLACE])
     assert found["observations"].to_dict() == groups.size().to_dict()
     assert found["vehicles"].to_dict() == groups["vehicle"].nunique().to_dict()
-    told = rows[rows["value"]].groupby(["day", *PLACE])["mu"]
+    measured = rows[rows["value"]].groupby(["day", *PLACE])["mu"]
     for name, q in (("mu_p10", 0.1), ("mu_p50", 0.5), ("mu_p90", 0.9)):
-        expected = told.quantile(q).reindex(found.index)
+        expected = measured.quantile(q).reindex(found.index)
         np.testing.assert_allclose(found[name].astype(float), expected, atol=1e-9)
-    first = table.schema.metadata[b"said"].decode().splitlines()[0]
+    first = table.schema.metadata[b"report"].decode().splitlines()[0]
     network = len(rows.drop_duplicates(PLACE))
     day = rows[rows["day"] == rows["day"].min()]
     share = len(day[day["value"]].drop_duplicates(PLACE)) / network
@@ -106,8 +106,8 @@ def test_the_bound_of_a_share_is_wilson_s() -> None:
 @pytest.mark.campaign
 def test_spells_are_the_runs_of_slippery_values(asked: Ask, rows: pd.DataFrame) -> None:
     expected = []
-    told = rows[rows["value"]].sort_values(["time", "vehicle", "boot", "seq", "row"])
-    for place, group in told.groupby(PLACE):
+    measured = rows[rows["value"]].sort_values(["time", "vehicle", "boot", "seq", "row"])
+    for place, group in measured.groupby(PLACE):
         run: list[Any] = []
         for row in [*group.itertuples(), None]:
             if row is not None and row.mu < 0.4:
@@ -131,8 +131,8 @@ def test_planted_change_lies_in_the_before_after_interval(
 ) -> None:
     at = START_NS + 24 * HOUR_NS
     found = asked("before-after", at=at).to_pylist()[1]
-    told = rows[rows["value"]].assign(after=lambda r: r["time"] >= at // 10**9)
-    means = told.groupby([*PLACE, "after"])["mu"].agg(["mean", "size"]).unstack().dropna()
+    measured = rows[rows["value"]].assign(after=lambda r: r["time"] >= at // 10**9)
+    means = measured.groupby([*PLACE, "after"])["mu"].agg(["mean", "size"]).unstack().dropna()
     weight = (
         means["size"][True] * means["size"][False] / (means["size"][True] + means["size"][False])
     )
@@ -189,13 +189,13 @@ def test_vehicles_shows_the_planted_bias_of_each(asked: Ask, rows: pd.DataFrame)
     met = found.loc[names]
     assert (met["meetings"] > 5).all()
     assert np.corrcoef(met["bias"].astype(float), planted)[0, 1] > 0.5
-    told = rows[rows["value"]].assign(hour=lambda r: r["time"] // 3600)
+    measured = rows[rows["value"]].assign(hour=lambda r: r["time"] // 3600)
     one = names[3]
     differences = []
-    there = [*PLACE, "hour"]
-    for _, group in told.merge(
-        told[told["vehicle"] == one][there].drop_duplicates(), on=there
-    ).groupby(there):
+    keys = [*PLACE, "hour"]
+    for _, group in measured.merge(
+        measured[measured["vehicle"] == one][keys].drop_duplicates(), on=keys
+    ).groupby(keys):
         mine = group[group["vehicle"] == one]["mu"]
         others = group[group["vehicle"] != one]["mu"]
         if len(mine) and len(others):
@@ -214,12 +214,12 @@ def test_calibration_counts_later_values_inside_published_intervals(
     asked: Ask, rows: pd.DataFrame, archive: Path
 ) -> None:
     found = asked("calibration").to_pandas()
-    told = rows[rows["value"]]
+    measured = rows[rows["value"]]
     inside: dict[tuple[str, int], list[bool]] = {}
     for path in sorted((archive / "map").rglob("*.parquet")):
         cells = pq.read_table(path, partitioning=None).to_pandas()
         since = int(cells["snapshot_time"].iloc[0].timestamp())
-        later = told[(told["time"] > since) & (told["time"] <= since + 6 * 3600)].merge(
+        later = measured[(measured["time"] > since) & (measured["time"] <= since + 6 * 3600)].merge(
             cells, on=PLACE, suffixes=("", "_map")
         )
         for row in later.itertuples():
@@ -237,11 +237,11 @@ def test_weather_takes_the_nearest_station_s_reading_of_the_hour(
     asked: Ask, rows: pd.DataFrame, stations: Path
 ) -> None:
     found = asked("weather", stations=stations).to_pandas().set_index("temperature").sort_index()
-    told = rows[rows["value"]]
+    measured = rows[rows["value"]]
     temperature = 5.0 - 8.0 * synthetic.night_factor(
-        ((told["time"] - START_NS // 10**9) // 3600 * 3600).to_numpy(float)
+        ((measured["time"] - START_NS // 10**9) // 3600 * 3600).to_numpy(float)
     )
-    groups = told.groupby(np.floor(temperature / 2) * 2)["mu"]
+    groups = measured.groupby(np.floor(temperature / 2) * 2)["mu"]
     assert found["values"].to_dict() == groups.size().to_dict()
     np.testing.assert_allclose(found["mu_p10"], groups.quantile(0.1), atol=1e-9)
     np.testing.assert_allclose(found["mu_mean"], groups.mean(), atol=1e-9)

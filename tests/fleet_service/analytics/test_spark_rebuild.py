@@ -69,12 +69,12 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
         partial(rebuild_zone, Rebuild(archive, out, UNTIL)), str, tries
     )
     zones = zones_of(archive)
-    told = spark.run_tasks(session, zones, dying)
+    outcomes = spark.run_tasks(session, zones, dying)
     assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, (
         "none was killed"
     )
     (tmp_path / "local").mkdir()
-    assert told == list(rebuild(Rebuild(archive, tmp_path / "local", UNTIL)))
+    assert outcomes == list(rebuild(Rebuild(archive, tmp_path / "local", UNTIL)))
     assert contents(out) == contents(tmp_path / "local")
 
 

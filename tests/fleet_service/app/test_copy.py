@@ -240,22 +240,23 @@ def service(
     """
     config = folder / "service.json"
     archive = {"path": str(folder / "archive"), **bucket.settings}
-    told = {
+    document = {
         "zenoh": {"connect": router.connect},
         "segment_s": 0.05,
         "archive": archive,
         "metrics_port": 0,
     }
-    config.write_text(json.dumps(told))
+    config.write_text(json.dumps(document))
     words = [sys.executable, "-m", "fleet_service.cli", "run", "--config", str(config)]
-    said = folder / "said"
-    with said.open("w") as out:
+    stdout = folder / "stdout"
+    with stdout.open("w") as out:
         process = subprocess.Popen(words, stdout=out)
     try:
         until(
-            lambda: said.read_text().startswith("ready: ") and "\n" in said.read_text(), PATIENCE_S
+            lambda: stdout.read_text().startswith("ready: ") and "\n" in stdout.read_text(),
+            PATIENCE_S,
         )
-        yield process, said.read_text().splitlines()[0].split()[-1]
+        yield process, stdout.read_text().splitlines()[0].split()[-1]
     finally:
         process.kill()
         process.wait()
@@ -380,9 +381,9 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
 
 
 def _same_in_the_bucket(bucket: BucketServer, root: Path) -> None:
-    there = bucket.read_objects()
-    here = list_copied_files(root)
-    log = {name for name in here if name.startswith(("inbox/", "keys/"))}
-    assert {name for name in there if name.startswith(("inbox/", "keys/"))} == log
-    assert all(there[name] == here[name] for name in log)
-    assert json.loads(there[OWNER]) == {"service": "shard-0"}
+    in_bucket = bucket.read_objects()
+    on_disk = list_copied_files(root)
+    log = {name for name in on_disk if name.startswith(("inbox/", "keys/"))}
+    assert {name for name in in_bucket if name.startswith(("inbox/", "keys/"))} == log
+    assert all(in_bucket[name] == on_disk[name] for name in log)
+    assert json.loads(in_bucket[OWNER]) == {"service": "shard-0"}

@@ -140,13 +140,13 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     assert pseudonyms_of(root) == theirs, "each acknowledged row of the others once, and no other"
     files = [path for path in root.rglob("*") if path.is_file()]
     number = int.from_bytes(bytes.fromhex(gone.decode()), signed=True)
-    told = (
+    traces = (
         gone,
         GONE.encode(),
         number.to_bytes(8, "little", signed=True),
         number.to_bytes(8, "big", signed=True),
     )
-    assert [path for path in files if any(one in path.read_bytes() for one in told)] == []
+    assert [path for path in files if any(one in path.read_bytes() for one in traces)] == []
     assert checkpoints.list_checkpoints(root), "what the service began from anew"
     drop_checkpoints(root)
     with closing(Engine(ServiceConfig(), root)) as engine:
@@ -249,9 +249,9 @@ def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Pa
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         answer_requests(again, tmp_path)
-        told = erasure_requests.answer_to(question)
-        assert told is not None
-        assert told["rows"] == 3
+        answer = erasure_requests.answer_to(question)
+        assert answer is not None
+        assert answer["rows"] == 3
         slots = again.state.fusion.slots_of(
             np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0])
         )

@@ -65,10 +65,10 @@ print(sorted(kernels() - warm))
 
 @pytest.mark.campaign
 def test_ready_service_compiles_no_kernel() -> None:
-    heard = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
     )
-    assert heard.stdout.strip() == "[]", heard.stdout + heard.stderr
+    assert completed.stdout.strip() == "[]", completed.stdout + completed.stderr
 
 
 def test_missing_kernels_are_compiled_once_by_a_separate_process(

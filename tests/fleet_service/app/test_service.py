@@ -284,7 +284,7 @@ def test_late_client_can_query_active_alerts(fleet: Fleet) -> None:
 
 
 def test_one_liar_raises_no_alert_however_often_it_reports(fleet: Fleet, service: Running) -> None:
-    fleet.settle(batch("sim-001", 1, now(), [0.3], told=False, used=0.1))
+    fleet.settle(batch("sim-001", 1, now(), [0.3], with_likelihood=False, used=0.1))
     for seq in range(1, 30):
         fleet.settle(batch("liar-01", seq, now(), [0.15, 0.15, 0.15]))
     assert service.service.engine.alerts.count == 0
@@ -297,7 +297,11 @@ def test_restart_gives_the_same_map_and_counts_no_row_twice(
     rng = np.random.default_rng(6)
     sent = [
         batch(
-            f"sim-{k % 7:03}", 1 + k // 7, now(), list(0.7 + 0.1 * rng.random(3)), told=k % 2 == 0
+            f"sim-{k % 7:03}",
+            1 + k // 7,
+            now(),
+            list(0.7 + 0.1 * rng.random(3)),
+            with_likelihood=k % 2 == 0,
         )
         for k in range(40)
     ]
@@ -310,12 +314,14 @@ def test_restart_gives_the_same_map_and_counts_no_row_twice(
         counts = second.service.engine.counts
         at = int(before.live.time.max())
         slots = np.arange(before.size)
-        there = after.slots_of(before.cell[slots], before.sector[slots])
-        np.testing.assert_allclose(before.beliefs(slots, at), after.beliefs(there, at), atol=1e-6)
-        heard = fleet.acks
+        slots_after = after.slots_of(before.cell[slots], before.sector[slots])
+        np.testing.assert_allclose(
+            before.beliefs(slots, at), after.beliefs(slots_after, at), atol=1e-6
+        )
+        acks = fleet.acks
         for one in sent:
             fleet.publish(one)
-        until(lambda: counts.duplicates == len(sent) and fleet.acks > heard)
+        until(lambda: counts.duplicates == len(sent) and fleet.acks > acks)
         assert counts.observations == 0
     kept = [pq.read_table(path) for path in (tmp_path / "inbox").glob("*.parquet")]
     rows = sum(table.num_rows for table in kept)
@@ -455,10 +461,12 @@ def test_two_services_share_the_world_and_a_query_gets_both(
         "cell": [int(grid.cell_of(-33.9, 18.4))],
     }
     region = int(grid.region_of(far["cell"][0]))
-    here, there = (f"{keys.chunks(place, 10).split('/')[0]}/*/*" for place in (REGION, region))
+    own_region, other_region = (
+        f"{keys.chunks(place, 10).split('/')[0]}/*/*" for place in (REGION, region)
+    )
     with (
-        running(router, tmp_path / "a", name="shard-a", regions=[here]) as a,
-        running(router, tmp_path / "b", name="shard-b", regions=[there]) as b,
+        running(router, tmp_path / "a", name="shard-a", regions=[own_region]) as a,
+        running(router, tmp_path / "b", name="shard-b", regions=[other_region]) as b,
     ):
         fleet = Fleet(session).await_services(REGION, region)
         fleet.settle(batch("sim-001", 1, now(), [0.8]))

@@ -81,14 +81,14 @@ def make_observations(turn: int, vehicle: int) -> Batch:
     mu = [(0.2 if step % 2 else 0.8) + float(x) for x in rng.normal(0.0, 0.03, 2)]
     late = 600 * SECOND if (turn, vehicle) == (9, 4) else 0
     where = {"latitude": [latitude] * 2, "longitude": [longitude] * 2, "cell": [cell] * 2}
-    told = vehicle % 3 > 0
+    with_likelihood = vehicle % 3 > 0
     one = batch(
         f"sim-{vehicle:03}",
         turn + 1,
         now_of(turn) - SECOND - late,
         mu,
-        told=told,
-        used=None if told else 0.15,
+        with_likelihood=with_likelihood,
+        used=None if with_likelihood else 0.15,
         **where,
     )
     return replace(one, region=int(grid.region_of(cell)))

@@ -22,7 +22,7 @@ class Seen(NamedTuple):
 
     rows: int
     mu: float
-    told: int
+    with_likelihood: int
     zones: int
 
 
@@ -52,9 +52,9 @@ def by_polars(root: Path) -> Seen:
     import polars as pl
 
     frame = pl.scan_parquet(root / "observations", hive_partitioning=True).collect()
-    told = len(frame) - frame["log_likelihood"].null_count()
+    with_likelihood = len(frame) - frame["log_likelihood"].null_count()
     mean = float(frame["mu"].mean())  # type: ignore[arg-type]
-    return Seen(len(frame), mean, told, frame["zone"].n_unique())
+    return Seen(len(frame), mean, with_likelihood, frame["zone"].n_unique())
 
 
 def by_duckdb(root: Path) -> Seen:
@@ -76,7 +76,10 @@ def by_ibis(root: Path) -> Seen:
         str(root / "observations/*/*/*.parquet"), hive_partitioning=True
     )
     found = t.aggregate(
-        rows=t.count(), mu=t.mu.mean(), told=t.log_likelihood.count(), zones=t.zone.nunique()
+        rows=t.count(),
+        mu=t.mu.mean(),
+        with_likelihood=t.log_likelihood.count(),
+        zones=t.zone.nunique(),
     ).to_pyarrow()
     return Seen(*(found[name][0].as_py() for name in Seen._fields))
 

@@ -31,8 +31,8 @@ from tests.fleet_service.examples import SECOND, batch, key
 MONTH = 31 * 86_400 * SECOND
 
 
-def make_message(vehicle: str, seq: int, told: bool = True) -> Message:
-    one = batch(vehicle, seq, time.time_ns() - SECOND, [0.8, 0.7], told=told)
+def make_message(vehicle: str, seq: int, with_likelihood: bool = True) -> Message:
+    one = batch(vehicle, seq, time.time_ns() - SECOND, [0.8, 0.7], with_likelihood=with_likelihood)
     return Message(
         Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION]
     )
@@ -183,7 +183,8 @@ def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
 
 def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
     engine.intake.ingest(
-        [make_message("sim-001", 1), make_message("sim-002", 1, told=False)], time.time_ns()
+        [make_message("sim-001", 1), make_message("sim-002", 1, with_likelihood=False)],
+        time.time_ns(),
     )
     engine.settlement.flush()
     (table,) = reading.read_tables(tmp_path, Kind.OBSERVATION)
@@ -198,7 +199,8 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
 
 def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
     engine.intake.ingest(
-        [make_message("sim-001", 1), make_message("sim-002", 1, told=False)], time.time_ns()
+        [make_message("sim-001", 1), make_message("sim-002", 1, with_likelihood=False)],
+        time.time_ns(),
     )
     engine.settlement.flush()
     pattern = str(tmp_path / "inbox" / "*.parquet")

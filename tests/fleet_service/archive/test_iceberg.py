@@ -34,8 +34,8 @@ def export_tables(root: Path, capsys: pytest.CaptureFixture[str], *more: str) ->
     capsys.readouterr()
     words = ["export", "iceberg", "--archive", str(root), "--catalog", uri(root), "--json", *more]
     assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    return {name: told[name] for name in ("added", "dropped", "rows")}
+    document = json.loads(capsys.readouterr().out)
+    return {name: document[name] for name in ("added", "dropped", "rows")}
 
 
 def uri(root: Path) -> str:
@@ -92,9 +92,9 @@ def test_retention_removes_rows_from_iceberg_tables_first(
     assert retention.retire_rows(root, 31, DATE + timedelta(days=32)) == (2, 4)
     # All rows can be read, so no table refers to a deleted file.
     assert rows_different(root, uri(root)) == 0
-    told = export_tables(root, capsys)
-    assert (told["added"], told["dropped"]) == (0, 0)
-    assert 0 < told["rows"] < 400
+    counts = export_tables(root, capsys)
+    assert (counts["added"], counts["dropped"]) == (0, 0)
+    assert 0 < counts["rows"] < 400
 
 
 def test_retention_waits_for_an_unreachable_catalogue(
@@ -154,13 +154,13 @@ def test_iceberg_tables_can_refer_to_the_files_of_a_mirror(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "archive"
-    there = tmp_path / "there"
+    target = tmp_path / "there"
     fill(root, 1, 50)
-    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
-    assert export_tables(root, capsys, "--at", there.as_uri())["rows"] == 100
+    assert main(["compact", "--archive", str(root), "--put-to", target.as_uri()]) == 0
+    assert export_tables(root, capsys, "--at", target.as_uri())["rows"] == 100
     paths = [task.file.file_path for task in table_of(uri(root), Kind.STATE).scan().plan_files()]
     assert paths
-    assert all(path.startswith(there.as_uri()) for path in paths)
+    assert all(path.startswith(target.as_uri()) for path in paths)
     with pytest.raises(InputError, match="^catalog: this archive is registered at "):
         iceberg.register(root, iceberg.Place(uri(root), "other", root.as_uri()))
 

@@ -24,8 +24,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
     fill(root, 3, 100)
     compact(root)
     table = pa.concat_tables(reading.read_tables(root, Kind.OBSERVATION))
-    told = table.num_rows - table["log_likelihood"].null_count
-    return root, Seen(table.num_rows, float(np.mean(table["mu"].to_numpy())), told, 2)
+    with_likelihood = table.num_rows - table["log_likelihood"].null_count
+    return root, Seen(table.num_rows, float(np.mean(table["mu"].to_numpy())), with_likelihood, 2)
 
 
 def test_at_least_these_tools_are_here() -> None:

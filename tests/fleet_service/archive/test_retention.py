@@ -100,7 +100,7 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
 
 def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: Path) -> None:
     root = tmp_path / "archive"
-    there = tmp_path / "there"
+    target = tmp_path / "there"
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
     with closing(Engine(ServiceConfig(), root)) as engine:
@@ -119,7 +119,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
             )
         engine.settlement.flush()
         snapshot = snapshots.write_snapshot(root, engine.queries.whole_map(now), now)
-    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
+    assert main(["compact", "--archive", str(root), "--put-to", target.as_uri()]) == 0
     (root / "inbox" / f"shard-0-0000000001-00000001.parquet{BAD}").write_bytes(b"who knows")
     words = [
         "forget",
@@ -128,7 +128,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
         "--period",
         month,
         "--put-to",
-        there.as_uri(),
+        target.as_uri(),
         "--yes",
         "--vehicle",
     ]
@@ -139,7 +139,7 @@ def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: P
         ("car-007", 2),
     ):
         assert main([*words, vehicle]) == 0
-        for folder in (root, there):
+        for folder in (root, target):
             table = pq.read_table(folder / snapshot.relative_to(root), partitioning=None)
             assert (table.num_rows, b"geo" in (table.schema.metadata or {})) == (cells, True)
             shared = table.filter(pc.field("vehicles") > 1)
@@ -302,16 +302,16 @@ def test_forget_refuses_an_archive_with_a_running_service(tmp_path: Path) -> Non
 
 def test_compacted_files_are_mirrored_once_per_version(tmp_path: Path) -> None:
     root = tmp_path / "archive"
-    there = tmp_path / "there"
+    target = tmp_path / "there"
     fill(root, 2, 50)
-    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
-    copies = {path.relative_to(there): path.read_bytes() for path in there.rglob("*.parquet")}
+    assert main(["compact", "--archive", str(root), "--put-to", target.as_uri()]) == 0
+    copies = {path.relative_to(target): path.read_bytes() for path in target.rglob("*.parquet")}
     originals = [path for folder in mirror.FOLDERS for path in (root / folder).rglob("*.parquet")]
     assert copies == {path.relative_to(root): path.read_bytes() for path in originals}
-    assert not [path for path in there.rglob("*") if path.name.endswith(".tmp")]
-    assert mirror.copy_new_files(root, there.as_uri()) == 0
+    assert not [path for path in target.rglob("*") if path.name.endswith(".tmp")]
+    assert mirror.copy_new_files(root, target.as_uri()) == 0
     originals[0].write_bytes(originals[1].read_bytes() + b"")
-    assert mirror.copy_new_files(root, there.as_uri()) == 1
+    assert mirror.copy_new_files(root, target.as_uri()) == 1
     with pytest.raises(InputError, match="^put_to: cannot use nonsense://x "):
         mirror.copy_new_files(root, "nonsense://x")
 
@@ -339,11 +339,11 @@ def test_parts_are_exported(
     inside = (segments.to_nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (
         rows["latitude"].to_numpy() > 57
     )
-    said = int(capsys.readouterr().out.split()[0])
-    assert 0 < said <= inside.sum()
-    assert what == "rollup" or said == inside.sum()
+    printed_rows = int(capsys.readouterr().out.split()[0])
+    assert 0 < printed_rows <= inside.sum()
+    assert what == "rollup" or printed_rows == inside.sum()
     if ending == ".parquet":
-        assert pq.read_table(out).num_rows == said
+        assert pq.read_table(out).num_rows == printed_rows
 
 
 @pytest.mark.parametrize(

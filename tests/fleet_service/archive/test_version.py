@@ -116,11 +116,11 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     compact(old)
     rollup.complete_parts(old)
     assert not any(segments.list_segments(old, kind) for kind in Kind)
-    said = Counter(
+    versions = Counter(
         str(read_content(path).version)  # type: ignore[union-attr]
         for path in files(old)
     )
-    assert said.keys() == {"1.0", str(version.VERSION)}
+    assert versions.keys() == {"1.0", str(version.VERSION)}
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:
         assert map_of(engine, now_of(ROUNDS + 2)) == before, "bit for bit"
@@ -142,14 +142,17 @@ def _identities(root: Path, kind: Kind) -> list[tuple[str, int, int]]:
 
 
 def rewrite_file(
-    path: Path, change: Callable[[pa.Table], pa.Table], said: str, encoding: Encoding = SEGMENT
+    path: Path,
+    change: Callable[[pa.Table], pa.Table],
+    footer_version: str,
+    encoding: Encoding = SEGMENT,
 ) -> None:
     """Rewrite an archive file in place as a file of another format version: `change` is applied to
-    its table, and `said` replaces the entries of its footer.
+    its table, and `footer_version` replaces the entries of its footer.
     """
     found = read_content(path)
     assert found is not None
-    write_table(change(found.table), path, encoding, {**found.entries, version.KEY: said})
+    write_table(change(found.table), path, encoding, {**found.entries, version.KEY: footer_version})
 
 
 def without_columns(table: pa.Table) -> pa.Table:
@@ -355,8 +358,8 @@ def test_reader_skips_damaged_files_and_renames_none(
         assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() < whole // 2
         past = query.parse({"at": "2024-10-05T00:01:00Z"})
         assert list(engine.queries.answer(past, lambda _: True, now_of(ROUNDS)))
-        heard = caplog.text + capfd.readouterr().err  # a separate process reads historical maps
-        assert all(f"{path} is damaged and is ignored" in heard for path in harmed)
+        log_text = caplog.text + capfd.readouterr().err  # a separate process reads historical maps
+        assert all(f"{path} is damaged and is ignored" in log_text for path in harmed)
         assert all(path.exists() for path in harmed)
         assert not list(old.rglob("*.bad"))
     compact(old)

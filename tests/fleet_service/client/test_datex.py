@@ -55,11 +55,11 @@ def schema() -> Any:  # noqa: ANN401 a type of the validator's library
 
 
 def stretches(*alerts: Alert) -> list[StretchAlert]:
-    heard = Stretches()
+    collected = Stretches()
     for one in alerts:
-        heard.apply_alert(one)
-    heard.take_changes()
-    return heard.standing
+        collected.apply_alert(one)
+    collected.take_changes()
+    return collected.standing
 
 
 def records(document: bytes) -> list[ET.Element]:
@@ -230,7 +230,10 @@ def test_vehicles_without_grip_demand_cause_no_publication(
         fleet = Fleet(session).await_services()
         now = time.time_ns() - SECOND
         fleet.settle(
-            *(batch(f"sim-{k:03}", 1, now, [0.2], told=False, used=0.02) for k in range(9))
+            *(
+                batch(f"sim-{k:03}", 1, now, [0.2], with_likelihood=False, used=0.02)
+                for k in range(9)
+            )
         )
         config = tmp_path / "reader.json"
         config.write_text(json.dumps({"zenoh": {"connect": router.connect}}))

@@ -169,7 +169,7 @@ def test_invalid_host_is_refused(host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fleet", "options", "said"),
+    ("fleet", "options", "expected"),
     [
         ({"routers": {}}, [], "error: routers: "),
         ({"routers": {"r-1": {}}, "vehicles": ["a/b"]}, [], "error: vehicles.0: "),
@@ -205,13 +205,17 @@ def test_invalid_host_is_refused(host: str) -> None:
     ],
 )
 def test_invalid_enrolment_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], fleet: object, options: list[str], said: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    fleet: object,
+    options: list[str],
+    expected: str,
 ) -> None:
     file = tmp_path / "fleet.json"
     file.write_text(json.dumps(fleet))
     assert main(["certs", "--fleet", str(file), "--out", str(tmp_path / "out"), *options]) == 2
     shown = capsys.readouterr().err
-    assert shown.startswith(said), shown
+    assert shown.startswith(expected), shown
     assert shown.count("\n") == 1
 
 

@@ -26,10 +26,10 @@ def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, 
 
 
 def test_backlog_of_an_hour_is_fused_in_any_order_of_arrival() -> None:
-    straight, told = late(np.arange(400), 4)
+    straight, updates = late(np.arange(400), 4)
     mixed, _ = late(np.random.default_rng(1).permutation(400), 37)
-    assert all(updated.late.all() for _, updated in told)
-    fused = np.concatenate([updated.late_by > 0 for _, updated in told])
+    assert all(updated.late.all() for _, updated in updates)
+    fused = np.concatenate([updated.late_by > 0 for _, updated in updates])
     assert fused.mean() > 0.95
     assert difference(straight, mixed) <= 1e-6
 
@@ -97,11 +97,11 @@ def test_report_older_than_the_forgetting_time_is_not_fused() -> None:
 
 
 def test_replay_fuses_late_reports_at_the_same_point() -> None:
-    fusion, told = late(np.random.default_rng(2).permutation(400), 5)
+    fusion, updates = late(np.random.default_rng(2).permutation(400), 5)
     o = drive(7, 400, 3000.0)
     n = 400
     found = RecordedResult(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
-    for rows, updated in told:
+    for rows, updated in updates:
         found.late[rows] = updated.late
         found.late_by[rows] = updated.late_by
         found.weight[rows] = updated.weight

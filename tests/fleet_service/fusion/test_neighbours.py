@@ -49,8 +49,8 @@ def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
         sector: heading sector of the visits.
     """
     fusion = Fusion(120.0)
-    for steps, said in found.items():
-        tell(fusion, east(steps), said, sector)
+    for steps, likelihoods in found.items():
+        tell(fusion, east(steps), likelihoods, sector)
     return fusion
 
 
@@ -62,9 +62,9 @@ def cell_at(along: int, left: int, sector: int) -> int:
     return east(along * dx + left * dy, north=left * dx - along * dy)
 
 
-def tell(fusion: Fusion, cell: int, said: FloatArray, sector: int = 0) -> None:
-    vehicles = cell % 1000 * 100 + np.arange(len(said))
-    o = observations(5.0 * np.arange(len(said)), vehicles, said, cell)
+def tell(fusion: Fusion, cell: int, likelihoods: FloatArray, sector: int = 0) -> None:
+    vehicles = cell % 1000 * 100 + np.arange(len(likelihoods))
+    o = observations(5.0 * np.arange(len(likelihoods)), vehicles, likelihoods, cell)
     o.sector[:] = sector
     fusion.update(o)
 
@@ -95,20 +95,20 @@ def test_an_untested_cell_between_snow_is_probably_slippery() -> None:
 
 
 def test_many_visits_without_a_value_weaken_a_message_to_unsure() -> None:
-    told = [
+    p_slippery = [
         slippery(belief(road({0: at_least([0.05] * visits), 1: snow(9)}))) for visits in (1, 4, 9)
     ]
-    assert np.all(np.diff(told) < 0.0)
-    assert told[0] > 0.6
-    assert told[-1] == pytest.approx(UNSURE, abs=0.05)
+    assert np.all(np.diff(p_slippery) < 0.0)
+    assert p_slippery[0] > 0.6
+    assert p_slippery[-1] == pytest.approx(UNSURE, abs=0.05)
 
 
 def test_influence_of_a_neighbour_falls_with_distance() -> None:
-    told = [
+    p_slippery = [
         slippery(belief(road({0: UNTESTED, steps: snow()}))) for steps in range(1, NEIGHBOURS + 2)
     ]
-    assert np.all(np.diff(told) < 0.0)
-    assert told[-1] == slippery(belief(road({0: UNTESTED})))
+    assert np.all(np.diff(p_slippery) < 0.0)
+    assert p_slippery[-1] == slippery(belief(road({0: UNTESTED})))
 
 
 def test_snow_in_the_opposite_direction_lowers_the_belief() -> None:
@@ -158,11 +158,11 @@ def one_report_of_ice(grip_s: float, ice_s: float) -> float:
     """
     fusion = Fusion(120.0)
     four = 20.0 * np.arange(4)
-    told = value([0.85] * 4 + [0.15] * 5, 0.03)
+    likelihoods = value([0.85] * 4 + [0.15] * 5, 0.03)
     seconds = np.concatenate([grip_s + four, ice_s + four, [900.0]])
     cells = np.array([CELL] * 4 + [east(1)] * 4 + [CELL])
     order = np.argsort(seconds)
-    o = observations(seconds[order], np.arange(9)[order], told[order])
+    o = observations(seconds[order], np.arange(9)[order], likelihoods[order])
     o.cell[:] = cells[order]
     fusion.update(o)
     return slippery(belief(fusion))

@@ -52,8 +52,8 @@ def fold_in(
     o: Observations, order: IntArray, parts: int
 ) -> tuple[Fusion, list[tuple[IntArray, Updated]]]:
     fusion = Fusion(LATENESS_S)
-    told = [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
-    return fusion, told
+    updates = [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
+    return fusion, updates
 
 
 def difference(a: Fusion, b: Fusion) -> float:
@@ -61,9 +61,9 @@ def difference(a: Fusion, b: Fusion) -> float:
     probabilities.
     """
     assert a.size == b.size
-    there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
+    slots = b.slots_of(a.cell[: a.size], a.sector[: a.size])
     now = int(max(a.live.time.max(), b.live.time.max()))
-    return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(there, now)).max())
+    return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(slots, now)).max())
 
 
 @settings(max_examples=25)
@@ -72,8 +72,8 @@ def difference(a: Fusion, b: Fusion) -> float:
 def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: int) -> None:
     o = drive(seed, 400, 900.0)
     straight, _ = fold_in(o, np.arange(400), 400)
-    mixed, told = fold_in(o, delay_arrivals(o, 110.0, seed), parts)
-    assert not any(updated.late.any() for _, updated in told)
+    mixed, updates = fold_in(o, delay_arrivals(o, 110.0, seed), parts)
+    assert not any(updated.late.any() for _, updated in updates)
     assert difference(straight, mixed) <= 1e-6
     order = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
     np.testing.assert_array_equal(straight.live.visits[: straight.size], mixed.live.visits[order])
@@ -85,11 +85,11 @@ def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: in
 def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     o = drive(3, 3000, 4000.0)
     order = delay_arrivals(o, 300.0, 4)
-    fusion, told = fold_in(o, order, 300)
+    fusion, updates = fold_in(o, order, 300)
     late = np.zeros(3000, bool)
     weight = np.zeros(3000, np.float32)
     late_by = np.zeros(3000, np.int64)
-    for rows, updated in told:
+    for rows, updated in updates:
         late[rows] = updated.late
         weight[rows] = updated.weight
         late_by[rows] = updated.late_by

@@ -74,8 +74,10 @@ def disputed_cell(values: int, silent: int, *, used: float = 0.5, states: bool =
     """
     fusion = Fusion(120.0)
     n = values + silent
-    told = np.concatenate([value(np.full(values, 0.57), 0.08), at_least(np.full(silent, used))])
-    visits = observations(60.0 * np.arange(n), np.arange(n), told)
+    likelihoods = np.concatenate(
+        [value(np.full(values, 0.57), 0.08), at_least(np.full(silent, used))]
+    )
+    visits = observations(60.0 * np.arange(n), np.arange(n), likelihoods)
     limited = np.full(n, -int(states), np.int8)
     fusion.update(dataclasses.replace(visits, used=np.full(n, used, np.float32), limited=limited))
     return fusion
@@ -149,8 +151,8 @@ def test_fleet_with_few_values_causes_no_false_grip(mu: float) -> None:
         used = 0.95 * mu * (1.0 + 0.03 * rng.standard_normal(n))
         reading = np.maximum(mu * (1.0 + 0.08 * rng.standard_normal(n)), used)
         gives_value = rng.random(n) < 0.1
-        told = np.where(gives_value[:, None], value(reading, 0.08 * mu), at_least(used))
-        visits = observations(60.0 * np.arange(n), np.arange(n), told)
+        likelihoods = np.where(gives_value[:, None], value(reading, 0.08 * mu), at_least(used))
+        visits = observations(60.0 * np.arange(n), np.arange(n), likelihoods)
         fusion = Fusion(120.0)
         fusion.update(dataclasses.replace(visits, used=used.astype(np.float32)))
         assert interval(belief(fusion))[0] < mu

@@ -49,8 +49,8 @@ def test_share_matches_simulated_visits_with_normal_position_error() -> None:
 
 def test_good_or_unknown_position_has_full_weight_and_a_poor_one_less() -> None:
     assert weight(1.5) == weight(np.nan) == weight(0.0) == 1.0
-    here = space.own_share(np.array([20.0]), np.array([WIDTH_M]))[0]
-    assert weight(20.0) == pytest.approx(here / (1.0 - constants.CONTAMINATION), rel=0.01)
+    share = space.own_share(np.array([20.0]), np.array([WIDTH_M]))[0]
+    assert weight(20.0) == pytest.approx(share / (1.0 - constants.CONTAMINATION), rel=0.01)
     assert weight(20.0, np.nan) == weight(20.0)
     # A cell is longer along its diagonal.
     assert weight(20.0, np.pi / 4) > weight(20.0)

@@ -224,10 +224,10 @@ def test_settling_has_no_effect_on_any_cell_in_any_order(seed: int, parts: int) 
         if kept.forgotten_at:
             kept.state = settle_pairs(kept.state, kept.names, mixed.size, kept.forgotten_at)
     assert len(mixed.store.state.settled) > 50
-    there = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
+    slots = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
     for name in ("belief", "visits", "vehicles", "values", "untrusted"):
         np.testing.assert_array_equal(
-            getattr(straight.live, name)[: straight.size], getattr(mixed.live, name)[there]
+            getattr(straight.live, name)[: straight.size], getattr(mixed.live, name)[slots]
         )
 
 

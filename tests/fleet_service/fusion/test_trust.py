@@ -70,13 +70,13 @@ def test_an_enrolled_vehicle_starts_like_one_that_agreed_with_all_others() -> No
 
 
 def test_two_enrolled_witnesses_outweigh_two_dry_visits_of_the_last_minute() -> None:
-    told = []
+    p_slippery = []
     for enrolled in (False, True):
         fusion = Fusion(120.0, enrolled=enrolled)
         fusion.update(observations(np.arange(2.0), np.arange(2), value(np.full(2, 0.8))))
         fusion.update(observations(20.0 + np.arange(2), 10 + np.arange(2), value(np.full(2, 0.15))))
-        told.append(slippery(belief(fusion)))
-    assert told[0] < 0.9 < told[1]
+        p_slippery.append(slippery(belief(fusion)))
+    assert p_slippery[0] < 0.9 < p_slippery[1]
 
 
 def test_enrolled_liars_still_lose_their_vote() -> None:

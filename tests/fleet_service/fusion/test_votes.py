@@ -186,10 +186,10 @@ def test_flood_of_one_vehicle_is_bounded_and_reported_as_not_fused() -> None:
     fusion.update(observations([70.0], [8], value([0.5])))
     assert fusion.waiting == constants.WAITING_MOST + 1
     again = Fusion(120.0)
-    told = (
+    recorded = (
         np.concatenate(of)
         for of in zip(*((f.late, f.late_by, f.weight) for f in updated), strict=True)
     )
-    again.update(o, RecordedResult(*told))
+    again.update(o, RecordedResult(*recorded))
     again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

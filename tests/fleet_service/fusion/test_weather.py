@@ -127,9 +127,9 @@ def test_dry_value_fades_faster_in_frost_and_slower_in_warmth() -> None:
 
 def test_unknown_road_fades_to_its_regions_prior_which_is_half_uniform() -> None:
     icy = np.where(mugrid.CENTRES < 0.4, 1.0, 0.0)
-    told = dataclasses.replace(reports((0.0, STEADY)), prior=(icy / icy.sum())[None])
+    forecast = dataclasses.replace(reports((0.0, STEADY)), prior=(icy / icy.sum())[None])
     fusion = Fusion(120.0)
-    fusion.update_weather(told)
+    fusion.update_weather(forecast)
     fusion.update(observations([60.0], [1], value([0.5], std=30.0)))
     assert slippery(belief(fusion)) == pytest.approx(0.5 + 0.5 * 0.3, abs=0.02)
     assert belief(fusion).min() > 0.4 / mugrid.BINS
@@ -144,19 +144,21 @@ def test_weather_for_the_open_window_gives_the_map_of_known_weather() -> None:
         value(rng.uniform(0.3, 0.9, n)),
     )
     known = Fusion(120.0)
-    told = Fusion(120.0)
+    informed = Fusion(120.0)
     arriving = [reports((0.0, RAIN)), reports((0.0, FREEZING)), reports((0.0, STEADY))]
     used = []
     for part, rows in enumerate(np.array_split(np.arange(n), 3)):
-        acting = dataclasses.replace(arriving[part], time=np.array([max(told.next_epoch, START)]))
-        told.update_weather(acting)
+        acting = dataclasses.replace(
+            arriving[part], time=np.array([max(informed.next_epoch, START)])
+        )
+        informed.update_weather(acting)
         used.append(acting)
-        told.update(o.take(rows))
+        informed.update(o.take(rows))
     for one in used:
         known.update_weather(one)
     known.update(o)
     now = START + 4 * HOUR
-    np.testing.assert_allclose(belief(told, now=now), belief(known, now=now), atol=1e-6)
+    np.testing.assert_allclose(belief(informed, now=now), belief(known, now=now), atol=1e-6)
     plain = Fusion(120.0)
     plain.update(o)
     assert np.abs(belief(plain, now=now) - belief(known, now=now)).max() > 1e-3

@@ -119,10 +119,12 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     stream.boot = sent[0].boot
     acks.record_durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
-    told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
+    stream_acks = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
     assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES
-    assert [seq for part in told for seq, _, _ in part.rejected] == list(range(1, 3001, 2))
-    assert [first for part in told for first, _ in part.durable] == list(range(5001, 9001, 2))
+    assert [seq for part in stream_acks for seq, _, _ in part.rejected] == list(range(1, 3001, 2))
+    assert [first for part in stream_acks for first, _ in part.durable] == list(
+        range(5001, 9001, 2)
+    )
 
 
 def test_service_ignores_unlisted_vehicles_and_excess_data(
@@ -134,9 +136,9 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
         router, tmp_path / "archive", fleet=file, vehicle_kb_s=1.0, vehicle_burst_kb=64.0
     ) as run:
         counts = run.service.engine.counts
-        heard: list[bytes] = []
+        received: list[bytes] = []
         session.declare_subscriber(
-            "gripmap/v1/ack/*", lambda sample: heard.append(sample.payload.to_bytes())
+            "gripmap/v1/ack/*", lambda sample: received.append(sample.payload.to_bytes())
         )
         publisher = session.declare_publisher(key("car-1"))
         matched(publisher)
@@ -147,10 +149,10 @@ def test_service_ignores_unlisted_vehicles_and_excess_data(
         until(lambda: counts.limited + counts.observations == 100)
         assert counts.refused["unknown"] == 100
         assert 60 <= counts.observations < 100
-        until(lambda: heard)
+        until(lambda: received)
         rejected = [
             refusal
-            for payload in heard
+            for payload in received
             for stream in wire.decode_ack(payload)[1]
             for refusal in stream.rejected
         ]

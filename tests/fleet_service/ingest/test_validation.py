@@ -148,17 +148,17 @@ def test_absent_values_and_values_just_outside_are_admitted(
 
 
 def test_controllers_and_surroundings_are_taken_as_they_were_sent(desk: Desk) -> None:
-    told: dict[str, Any] = {
+    context: dict[str, Any] = {
         "abs_active": [1, -1],
         "esc_active": [0, 1],
         "wiper": [0.5, np.nan],
         "air_temperature": [-3.5, np.nan],
     }
     accepted = desk.intake.accept(
-        [message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **told))], CLOCK
+        [message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **context))], CLOCK
     )
     rows = accepted[Kind.OBSERVATION].rows
-    for name, values in told.items():
+    for name, values in context.items():
         np.testing.assert_array_equal(rows[name], np.array(values, rows[name].dtype))
     assert rows["tcs_active"].tolist() == [-1, -1], "left out: unknown"
 

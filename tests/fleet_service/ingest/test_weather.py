@@ -148,11 +148,11 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     config = ServiceConfig(weather=path)
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
-    told = weather.encode_report(
+    payload = weather.encode_report(
         Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0)
     )
     engine.intake.weather.enqueue(
-        WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+        WeatherMessage(keys.weather_key(REGION), payload, wire.WEATHER_ENCODING)
     )
     engine.intake.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
     engine.intake.update_weather(start + 1300 * SECOND)
@@ -180,11 +180,11 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     root = tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
-            told = weather.encode_report(
+            payload = weather.encode_report(
                 Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2))
             )
             engine.intake.weather.enqueue(
-                WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+                WeatherMessage(keys.weather_key(REGION), payload, wire.WEATHER_ENCODING)
             )
             engine.intake.update_weather(start + 600 * k * SECOND)
             drive(engine, start + 600 * k * SECOND, 1 + k)
@@ -216,9 +216,9 @@ def test_weather_that_no_longer_matters_is_not_loaded_or_kept(tmp_path: Path) ->
     recent = (now // SECOND - 7200) * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq, begin in enumerate((old, recent), 1):
-            told = weather.encode_report(Report(begin, road_temperature=-1.0))
+            payload = weather.encode_report(Report(begin, road_temperature=-1.0))
             engine.intake.weather.enqueue(
-                WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING)
+                WeatherMessage(keys.weather_key(REGION), payload, wire.WEATHER_ENCODING)
             )
             engine.intake.update_weather(begin)
             drive(engine, begin, seq)

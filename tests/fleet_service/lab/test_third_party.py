@@ -39,10 +39,10 @@ def test_columns_hold_no_optional_fact_and_fixes_are_right() -> None:
 def test_changing_cells_are_dry_then_white_then_dry() -> None:
     drive = third_party.drive_change(np.random.default_rng(3), 0.3)
     v = drive.visits
-    here = v.place < third_party.CHANGE_CELLS
+    before_change = v.place < third_party.CHANGE_CELLS
     for k, mu in enumerate((third_party.DRY, third_party.WHITE, third_party.DRY)):
         now = v.seconds // (60.0 * third_party.MINUTES) == k
-        assert set(v.mu[here & now].tolist()) == {mu}
+        assert set(v.mu[before_change & now].tolist()) == {mu}
     assert v.excited.mean() == pytest.approx(0.3, abs=0.02)
     assert len(np.unique(drive.cells)) == len(drive.cells)
 

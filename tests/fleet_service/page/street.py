@@ -88,7 +88,7 @@ def _report(
     bound = np.isnan(mu)
     found = np.where(bound[:, None], at_least(np.full(len(mu), ROLLED)), value(np.nan_to_num(mu)))
     used = np.where(bound, ROLLED, np.nan_to_num(mu))
-    told = batch(
+    message = batch(
         car,
         seq,
         int(time[-1]),
@@ -105,7 +105,7 @@ def _report(
         used_longitudinal=used * WAYS[CARS.index(car) % 3][0],
         used_lateral=used * WAYS[CARS.index(car) % 3][1],
     )
-    send(session, told)
+    send(session, message)
 
 
 def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:

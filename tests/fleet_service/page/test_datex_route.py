@@ -60,7 +60,7 @@ def made_up_service(session: zenoh.Session) -> Iterator[None]:
 def put(session: zenoh.Session, cells: list[int], *, raised: bool, at: int = START) -> None:
     for cell in cells:
         latitude, longitude = (float(v) for v in grid.centre(cell))
-        told = Alert(
+        warning = Alert(
             cell,
             0,
             raised,
@@ -74,7 +74,7 @@ def put(session: zenoh.Session, cells: list[int], *, raised: bool, at: int = STA
             longitude,
             "P(mu < 0.4) = 0.95 > 0.9",
         )
-        session.put(keys.alert_key(TILE), wire.encode_alert(told))
+        session.put(keys.alert_key(TILE), wire.encode_alert(warning))
 
 
 def test_pulled_publication_follows_alerts_and_continues_after_restart(

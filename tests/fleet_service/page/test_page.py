@@ -188,7 +188,7 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
         (mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)
     ]
     with open_map(page) as seen:
-        there: list[int] = seen.page.evaluate(
+        page_kinds: list[int] = seen.page.evaluate(
             "async triples => { const { kindOf, setColours } = await import('/static/colours.js'); "
             "setColours(gripmap.settings); return triples.map(([m, l, u]) => kindOf(1, m, l, u)) }",
             triples,
@@ -198,9 +198,9 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
             "160, 150, 170) }"
         )
     names = [*palette.FOUR, *palette.TWO, palette.LITTLE]
-    assert [names[k] for k in there] == [colour_of(*(v / 200 for v in one)) for one in triples]
+    assert [names[k] for k in page_kinds] == [colour_of(*(v / 200 for v in one)) for one in triples]
     assert hollow == HOLLOW
-    assert len(set(there)) == 7
+    assert len(set(page_kinds)) == 7
 
 
 def test_place_panel_shows_interval_basis_vehicles_and_safe_speed(
@@ -219,12 +219,12 @@ def test_place_panel_shows_interval_basis_vehicles_and_safe_speed(
             "[data-value=observations]')]"
             f".some(one => one.textContent === '{len(street.CARS)}')",
         )
-        told = read(seen, street.EAST)
-        assert told["basis"] == "measured"
-        assert told["vehicles"] == str(len(street.CARS)) == told["observations"]
-        assert "km/h with 50 m of sight" in told["speed"]
-        alert = re.match(r"(\d+) vehicles found it slippery, (over )?\d+ % sure", told["alert"])
-        assert alert is not None, told["alert"]
+        panel = read(seen, street.EAST)
+        assert panel["basis"] == "measured"
+        assert panel["vehicles"] == str(len(street.CARS)) == panel["observations"]
+        assert "km/h with 50 m of sight" in panel["speed"]
+        alert = re.match(r"(\d+) vehicles found it slippery, (over )?\d+ % sure", panel["alert"])
+        assert alert is not None, panel["alert"]
         assert 2 <= int(alert[1]) <= len(street.CARS), (
             "as many as had been heard when it was raised"
         )
@@ -237,10 +237,10 @@ def test_place_panel_shows_interval_basis_vehicles_and_safe_speed(
             seen,
             "document.querySelector('[data-value=basis]')?.textContent.startsWith('only passed')",
         )
-        told = read(seen, street.EAST)
-        assert told["speed"] == "unknown: no vehicle measured here"
-        assert told["grip"].startswith("at least 0.")
-        assert "slippery" not in told
+        panel = read(seen, street.EAST)
+        assert panel["speed"] == "unknown: no vehicle measured here"
+        assert panel["grip"].startswith("at least 0.")
+        assert "slippery" not in panel
         assert seen.page.locator(".chart .density").count() == 0
         seen.page.evaluate("gripmap.choose(0, 0); gripmap.panels.open('cell')")
         assert (
@@ -265,10 +265,10 @@ def test_page_receives_changes_and_shows_an_alert_with_its_reason(
         waits(seen, ICE_DRAWN)
         waits(seen, "document.getElementById('live').dataset.state === 'live'")
         seen.page.locator("#tab-alerts").click()
-        said = seen.page.locator("[data-alert]").inner_text()
-        assert re.search(r"Ice, eastbound and westbound, at [\d.]+° N", said)
-        assert re.search(r"\d+ % sure that it is slippery", said)
-        assert " vehicles" in said
+        text = seen.page.locator("[data-alert]").inner_text()
+        assert re.search(r"Ice, eastbound and westbound, at [\d.]+° N", text)
+        assert re.search(r"\d+ % sure that it is slippery", text)
+        assert " vehicles" in text
         assert not seen.page.evaluate("gripmap.state.show.sound"), "off unless it was asked for"
         seen.page.evaluate("gripmap.map.view.go(.1, .1, 5)")
         seen.page.get_by_role("button", name="show on the map").click()

@@ -48,20 +48,20 @@ def test_a_record_is_accurate_and_never_narrower_or_drier(table: pa.Table) -> No
     place = (table["cell"].to_numpy() & 0x3FFF) * 4 + table["sector"].to_numpy()
     row = {key: k for k, key in enumerate(place.tolist())}
     order = [row[key] for key in found["place"].tolist()]
-    told = {
+    expected = {
         name: table[name].to_numpy()[order]
         for name in ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles")
     }
     known = found["basis"] == MEASURED
     assert 0.2 < known.mean() < 0.9
-    assert np.abs(found["mu"][known] / 200 - told["mu"][known]).max() <= 0.0025 + 1e-6
-    assert (found["lower"] / 200 <= told["mu_lower"] + 1e-6).all()
-    assert (found["upper"] / 200 >= told["mu_upper"] - 1e-6).all()
-    assert (found["slippery"] / 254 >= told["p_slippery"] - 1e-6).all()
+    assert np.abs(found["mu"][known] / 200 - expected["mu"][known]).max() <= 0.0025 + 1e-6
+    assert (found["lower"] / 200 <= expected["mu_lower"] + 1e-6).all()
+    assert (found["upper"] / 200 >= expected["mu_upper"] - 1e-6).all()
+    assert (found["slippery"] / 254 >= expected["p_slippery"] - 1e-6).all()
     assert np.array_equal(
         found["last"], table["last_time"].cast(pa.int64()).to_numpy()[order] // 10**9
     )
-    assert np.array_equal(found["vehicles"], told["vehicles"])
+    assert np.array_equal(found["vehicles"], expected["vehicles"])
 
 
 def test_bound_has_no_value_to_colour_by(table: pa.Table) -> None:

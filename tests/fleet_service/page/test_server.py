@@ -251,15 +251,15 @@ def test_cell_route_returns_the_values_of_the_service(page: RunningPage, drive: 
 
     # Wait until all cars are on the map.
     until(lambda: fetch_cell().get("observations") == len(street.CARS))
-    told = fetch_cell()
-    assert told["mu_lower"] < told["mu"] < 0.25
-    assert told["safe_speed"]["50"] < told["safe_speed"]["100"] < 15.0
-    assert told["observations"] == len(street.CARS)
+    detail = fetch_cell()
+    assert detail["mu_lower"] < detail["mu"] < 0.25
+    assert detail["safe_speed"]["50"] < detail["safe_speed"]["100"] < 15.0
+    assert detail["observations"] == len(street.CARS)
     bound = json.loads(ask(page.address, f"/cell/{passed}/{street.EAST}")[2])
     assert (bound["mu"], bound["safe_speed"], bound["basis"]) == (None, None, "bound")
     assert json.loads(ask(page.address, f"/cell/{ice}/{street.NORTH}")[2]) is None
-    middle = (told["south"] + told["north"]) / 2
-    points = f"{told['west'] - 0.001},{middle}|{told['east'] + 0.001},{middle}"
+    middle = (detail["south"] + detail["north"]) / 2
+    points = f"{detail['west'] - 0.001},{middle}|{detail['east'] + 0.001},{middle}"
     found = json.loads(ask(page.address, f"/route?points={points}")[2])
     assert 0 < found["share"]["measured"] < 1
     assert found["share"]["unknown"] > 0

@@ -43,13 +43,13 @@ def test_fusion_from_its_checkpoint_continues_bit_for_bit(cut: int) -> None:
             fusion.update(o.take(part))
     assert again.size == whole.size > 6
     now = int(o.time.max()) + 10**12
-    there = again.slots_of(whole.cell, whole.sector)
+    slots = again.slots_of(whole.cell, whole.sector)
     np.testing.assert_array_equal(
-        again.beliefs(there, now), whole.beliefs(np.arange(whole.size), now)
+        again.beliefs(slots, now), whole.beliefs(np.arange(whole.size), now)
     )
     for name in ("visits", "vehicles", "values", "returned", "untrusted"):
         np.testing.assert_array_equal(
-            getattr(again.live, name)[there], getattr(whole.live, name)[: whole.size]
+            getattr(again.live, name)[slots], getattr(whole.live, name)[: whole.size]
         )
     assert [again.trust(v) for v in range(13)] == [whole.trust(v) for v in range(13)]
 

@@ -159,15 +159,15 @@ class Machine:
     ) -> None:
         root.mkdir(exist_ok=True)
         self.root = root
-        told = {"standby": standby, "lease_s": LEASE_S, "archive": bucket.settings}
-        self.config = ServiceConfig.model_validate(told)
+        settings = {"standby": standby, "lease_s": LEASE_S, "archive": bucket.settings}
+        self.config = ServiceConfig.model_validate(settings)
         # A router is reachable, and no token is active.
-        there = (
+        router_signs = (
             lambda: True,
             lambda _: False,
             lambda: None,
         )
-        signs = there if standby else None
+        signs = router_signs if standby else None
         held = acquire_archive(self.config, root, threading.Event(), say, signs)
         assert held is not None
         self.holding: Ownership = held
@@ -367,19 +367,19 @@ def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
 ) -> None:
     holder = Machine(tmp_path / "one", bucket)
     with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified,
         open_hosts(
             tmp_path, ["two"], router.connect[0], bucket, lease_s=LEASE_S, metrics_port=0
         ) as (two,),
     ):
-        told.bind(str(tmp_path / "notify"))
-        told.settimeout(PATIENCE_S)
+        notified.bind(str(tmp_path / "notify"))
+        notified.settimeout(PATIENCE_S)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", "1000000")
         two.part.start()
         address = two.part.line_with("standby: shard-0 ").rpartition(", ")[2]
         for _ in range(3):
-            assert told.recv(100) == b"READY=1\nWATCHDOG=1"
+            assert notified.recv(100) == b"READY=1\nWATCHDOG=1"
         assert (
             'gripmap_serves{regions="*/*/*"} 0.0'
             in fetch_page(f"{address}/metrics")[2].splitlines()

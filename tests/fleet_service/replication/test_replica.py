@@ -281,11 +281,11 @@ def test_unreachable_bucket_at_the_start_is_reported_without_hanging(
     bucket.take_away(kind)
     with (
         closing(BucketReplica(tmp_path, bucket.url, bucket.store)) as copy,
-        pytest.raises(InputError) as told,
+        pytest.raises(InputError) as raised,
     ):
         copy.sync_without_lease(NAME)
-    assert told.value.field == "archive.copy"
-    assert SECRET not in str(told.value)
+    assert raised.value.field == "archive.copy"
+    assert SECRET not in str(raised.value)
 
 
 def test_folder_of_this_machine_serves_as_a_bucket_for_trials(tmp_path: Path) -> None:
@@ -314,10 +314,10 @@ def test_unusable_settings_are_named_with_the_reason(
         ("s3://", {}, "archive.copy"),
         ("s3://bucket", {"endpiont": SECRET}, "archive.store"),
     ]:
-        with pytest.raises(InputError) as told:
+        with pytest.raises(InputError) as raised:
             BucketReplica(tmp_path, url, store)
-        assert told.value.field == field
-        assert SECRET not in str(told.value)
+        assert raised.value.field == field
+        assert SECRET not in str(raised.value)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(InputError, match="obstore, which is not installed.*\\[objects\\]"):
         BucketReplica(tmp_path, "s3://bucket", {})
@@ -328,14 +328,14 @@ def test_bucket_works_by_environment_alone_and_errors_are_stable_lines(
 ) -> None:
     for name, value in bucket.store.items():
         monkeypatch.setenv(f"AWS_{name.upper()}", value)
-    there = ObjectBucket(bucket.url, {}, 5.0)
-    there.put("some/thing", b"1")
-    assert there.get("some/thing") == b"1"
+    copy = ObjectBucket(bucket.url, {}, 5.0)
+    copy.put("some/thing", b"1")
+    assert copy.get("some/thing") == b"1"
     bucket.stop()
     lines = set()
     for _ in range(3):
         with pytest.raises(CopyError) as raised:
-            there.list_names("some")
+            copy.list_names("some")
         lines.add(str(raised.value))
     assert len(lines) == 1
 
@@ -354,9 +354,9 @@ def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) ->
     again = ServiceConfig.model_validate_json(config.model_dump_json())
     assert again.archive.second == "s3://b/c", "what is written can be read"
     path.write_text(json.dumps({"archive": {"store": {"secret_access_key": [SECRET]}}}))
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as raised:
         load_config(path, ServiceConfig)
-    assert SECRET not in str(told.value)
+    assert SECRET not in str(raised.value)
 
 
 def test_a_journal_of_a_long_run_is_rewritten_and_loses_no_entry(

@@ -63,16 +63,16 @@ def test_alert_is_judged_by_the_belief_about_the_road() -> None:
     slots = np.arange(fusion.size)
     believed = fusion.beliefs_at_last_report(slots) @ mugrid.SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
-    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
+    shares = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.update(slots)}
     known = {
         int(c): round(float(p), 2)
         for c, p in zip(fusion.cell, believed, strict=True)
         if p > RAISE_ABOVE
     }
-    assert told.items() <= known.items()
+    assert shares.items() <= known.items()
     # Evidence below 1 nat supports no alert.
-    assert {cell for cell, p in known.items() if p > 0.95} <= set(told)
-    assert 0 < len(told) < fusion.size
+    assert {cell for cell, p in known.items() if p > 0.95} <= set(shares)
+    assert 0 < len(shares) < fusion.size
 
 
 def test_one_vehicle_with_many_unexcited_others_raises_nothing() -> None:

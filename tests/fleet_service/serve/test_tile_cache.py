@@ -127,9 +127,9 @@ def test_a_box_gets_exactly_the_cells_that_it_touches() -> None:
             and cell["vehicles"] >= asked.min_vehicles
         }
         replies = dict(answer_query(made, asked, lambda tile: tile == TILE, NOW, TILE))
-        told = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
-        assert set(told) == wanted
-        assert len(told) == len(wanted)
+        shown = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
+        assert set(shown) == wanted
+        assert len(shown) == len(wanted)
         lengths.add(len(wanted))
     assert {0, len(cells)} < lengths
 

@@ -38,7 +38,7 @@ class Machine:
 
     def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
         archive = {"path": str(root), **bucket.settings}
-        told = {
+        settings = {
             "name": name,
             "zenoh": router,
             "standby": True,
@@ -46,7 +46,7 @@ class Machine:
             "archive": archive,
             "segment_s": 0.1,
         }
-        self._config = ServiceConfig.model_validate(told)
+        self._config = ServiceConfig.model_validate(settings)
         self._root = root
         self.lines: list[str] = []
         self.stop = threading.Event()
@@ -100,9 +100,9 @@ def test_a_region_is_handed_over_with_all_that_was_known(
         two.start("standby: north-a ")
         until(make_driver(fleet, sent), PATIENCE_S)
         assert main(["hand-over", EVERYWHERE, "--to", "north-b", *connect]) == 0
-        told = capsys.readouterr().out.splitlines()
-        assert told[0] == f"north-a hands over: {EVERYWHERE}"
-        assert told[1].startswith(f"north-b serves {EVERYWHERE}; the handover took ")
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[0] == f"north-a hands over: {EVERYWHERE}"
+        assert lines[1].startswith(f"north-b serves {EVERYWHERE}; the handover took ")
         former = one.end()
         assert former.exit_code == 0
         until(lambda: two.has_said("ready: "), PATIENCE_S)

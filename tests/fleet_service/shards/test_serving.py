@@ -366,8 +366,8 @@ def test_unserved_area_is_named_with_the_fewest_regions() -> None:
 
 def test_service_token_round_trips_and_invalid_tokens_raise() -> None:
     for region in ("*/*/*", NAMES[0], "1202/*/*"):
-        told = keys.ServiceToken(region, "shard-0", "1f")
-        assert keys.parse_served(told.key) == told
+        token = keys.ServiceToken(region, "shard-0", "1f")
+        assert keys.parse_served(token.key) == token
     for key in (
         "gripmap/v1/shard/shard-0",
         f"{keys.SERVES}/1202/all/x/a/b",

@@ -70,12 +70,12 @@ def _link_messages(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) -> None:
-    with open_network(tmp_path, protocol="quic") as there:
-        quic = there.endpoints[ROUTERS[0]]
-        tls = there.between[ROUTERS[0]]
+    with open_network(tmp_path, protocol="quic") as network:
+        quic = network.endpoints[ROUTERS[0]]
+        tls = network.between[ROUTERS[0]]
         closed = "quic/127.0.0.1:9"
         for first, used in ((quic, "quic"), (closed, "tls")):
-            with there.session_at(READER, [first, tls]) as session:
+            with network.session_at(READER, [first, tls]) as session:
                 watch = LinkWatch(session, READER)
                 until(lambda watch=watch: watch.protocols)  # type: ignore[misc]
                 assert watch.protocols == [used]
@@ -84,20 +84,20 @@ def test_session_prefers_quic_and_takes_tls_where_udp_is_closed(tmp_path: Path) 
 @pytest.mark.parametrize("capped", [True, False])
 def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: bool) -> None:
     sent = 200
-    heard: Counter[tuple[str, bytes]] = Counter()  # messages by vehicle and payload
+    received: Counter[tuple[str, bytes]] = Counter()  # messages by vehicle and payload
 
     def count_message(sample: zenoh.Sample) -> None:
-        heard[str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes()] += 1
+        received[str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes()] += 1
 
     def has_reached(payload: bytes, session: zenoh.Session, name: str) -> bool:
         session.put(key(name), payload)
-        return bool(heard[name, payload])
+        return bool(received[name, payload])
 
     with (
-        open_network(tmp_path, protocol="quic", capped=capped) as there,
-        there.open_session("shard-0") as service,
-        there.open_session(VEHICLES[0]) as car,
-        there.open_session(VEHICLES[1]) as other,
+        open_network(tmp_path, protocol="quic", capped=capped) as network,
+        network.open_session("shard-0") as service,
+        network.open_session(VEHICLES[0]) as car,
+        network.open_session(VEHICLES[1]) as other,
     ):
         service.declare_subscriber("gripmap/v1/obs/**", count_message)
         for session, name in ((car, VEHICLES[0]), (other, VEHICLES[1])):
@@ -106,6 +106,6 @@ def test_router_drops_messages_of_a_vehicle_that_floods(tmp_path: Path, capped: 
             car.put(key(VEHICLES[0]), b"flood", congestion_control=zenoh.CongestionControl.BLOCK)
         until(partial(has_reached, b"after", other, VEHICLES[1]))
         if capped:
-            assert heard[VEHICLES[0], b"flood"] < sent / 2
+            assert received[VEHICLES[0], b"flood"] < sent / 2
         else:
-            until(lambda: heard[VEHICLES[0], b"flood"] == sent)
+            until(lambda: received[VEHICLES[0], b"flood"] == sent)

@@ -48,10 +48,10 @@ def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
         assert (
             subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7
         )
-    heard = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", TALK], capture_output=True, text=True, check=False
     )
-    assert heard.stderr == "hello\n" * 3
+    assert completed.stderr == "hello\n" * 3
 
 
 def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:

@@ -71,10 +71,10 @@ def test_waiting_for_a_router_is_reported_once_without_build_paths(
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     with caplog.at_level(logging.WARNING):
         assert zenoh_session.open_session(ZenohSettings(connect=[endpoint]), stop) is None
-    (said,) = caplog.messages
+    (message,) = caplog.messages
     assert len(tries) == 3
-    assert said.startswith(f"no session at {endpoint} yet: ")
-    assert "/" not in said.replace("tcp/127.0.0.1", "")
+    assert message.startswith(f"no session at {endpoint} yet: ")
+    assert "/" not in message.replace("tcp/127.0.0.1", "")
 
 
 class LentSession:

@@ -31,8 +31,8 @@ def drives() -> dict[str, PlottedDrive]:
 def test_title_states_manoeuvre_speed_friction_vehicle_and_seed(
     drives: dict[str, PlottedDrive],
 ) -> None:
-    said = plots.title("004.dlc", drives["ckf"], 7)
-    assert said == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
+    title = plots.title("004.dlc", drives["ckf"], 7)
+    assert title == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
     assert plots.title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
 
 

@@ -153,8 +153,8 @@ def test_cars_stand_still_on_a_slope() -> None:
     for batch in batches:
         assert not batch.truth["true_vx"].any()
         assert (np.abs(batch.signals[..., S.OMEGA : S.OMEGA + 4]) < 0.2).all()
-    felt = np.array([batch.signals[..., S.AX].mean() for batch in batches])
-    assert np.abs(felt[:3] / GRAVITY - 0.05).max() < 0.015
+    mean_ax = np.array([batch.signals[..., S.AX].mean() for batch in batches])
+    assert np.abs(mean_ax[:3] / GRAVITY - 0.05).max() < 0.015
     assert np.isnan(batches[-1].signals[..., S.TORQUE]).all()
 
 

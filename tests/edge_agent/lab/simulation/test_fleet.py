@@ -127,12 +127,12 @@ def test_ice_is_under_the_wheels_only_after_it_appeared(
 ) -> None:
     fleet, t, _, truth = drive
     (event,) = fleet.scenario.events
-    there = (np.abs(truth.x - event.x) < event.length / 2 - 3) & (
+    in_event = (np.abs(truth.x - event.x) < event.length / 2 - 3) & (
         np.abs(truth.y - event.y) < event.width / 2 - 2
     )
-    assert (truth.mu_wheel[there & (t < event.start)] > 0.8).all()
-    assert (truth.mu_wheel[there & (t >= event.start)] == ICE).all()
-    assert (there & (t >= event.start)).any(axis=0).sum() >= 3
+    assert (truth.mu_wheel[in_event & (t < event.start)] > 0.8).all()
+    assert (truth.mu_wheel[in_event & (t >= event.start)] == ICE).all()
+    assert (in_event & (t >= event.start)).any(axis=0).sum() >= 3
 
 
 def test_patchy_sensors_fall_silent_now_and_then() -> None:

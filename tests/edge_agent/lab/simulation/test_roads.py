@@ -68,9 +68,9 @@ def test_every_lane_can_be_reached_again_from_itself(scenario: Scenario) -> None
 def test_one_keeps_to_the_right_four_metres_from_the_other_lane(scenario: Scenario) -> None:
     network = scenario.network
     for k in range(0, network.roads, 2):
-        there = network.lane(k)
+        lane = network.lane(k)
         back = network.lane(k + 1)
-        for point in there[10:-10]:
+        for point in lane[10:-10]:
             offset = back[:, :2] - point[:2]
             nearest = offset[np.hypot(*offset.T).argmin()]
             # The opposite lane lies 4 m to the left.

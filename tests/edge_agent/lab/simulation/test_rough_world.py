@@ -203,10 +203,10 @@ def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name not in ("level", "cobbled"))
         east, north = slopes[7].tolist()
-        there = slope_in_body(east, north, 0.3)
+        expected = slope_in_body(east, north, 0.3)
         back = slope_in_body(east, north, 0.3 + np.pi)
         # A slope that rises in one direction falls in the other.
-        np.testing.assert_allclose(there, np.negative(back), atol=1e-15)
+        np.testing.assert_allclose(expected, np.negative(back), atol=1e-15)
 
 
 def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:

@@ -248,8 +248,8 @@ def test_options_out_of_range_are_refused_by_name(option: str, value: str) -> No
 def test_progress_line_has_iteration_best_mean_elapsed_and_remaining() -> None:
     lines: list[str] = []
     now = iter([100.0, 102.0])
-    tell = tune.progress_printer("colony", 5, lambda: next(now), lines.append)
-    tell(Iteration(1, -1.25, -2.5, 12))
+    print_progress = tune.progress_printer("colony", 5, lambda: next(now), lines.append)
+    print_progress(Iteration(1, -1.25, -2.5, 12))
     words = " ".join(lines[0].split())
     assert words == "colony 1/5 best -1.2500 mean -2.5000 evaluations 12 elapsed 2 s left 8 s"
 

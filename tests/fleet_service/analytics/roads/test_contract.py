@@ -92,8 +92,8 @@ def test_contract_lists_exactly_the_links_with_readings(
 ) -> None:
     found = asked("contract", roads=links, level=LEVEL, within_s=1.0 * HOUR).to_pandas()
     roads = pq.read_table(links).to_pandas()
-    told = rows[rows["value"]].merge(roads, on=["cell", "sector"])
-    worst = told.groupby(["link", "direction"])["mu"].min()
+    measured = rows[rows["value"]].merge(roads, on=["cell", "sector"])
+    worst = measured.groupby(["link", "direction"])["mu"].min()
     assert set(zip(found["link"], found["direction"], strict=True)) == set(worst.index)
     assert "nobody" not in set(found["link"])
     broken = found[found["verdict"] == BROKEN]
@@ -109,7 +109,7 @@ def test_contract_lists_exactly_the_links_with_readings(
     ]
     assert len(dry)
     assert (dry["least_s"] == 0).all()
-    counts = told.groupby(["link", "direction"]).agg(
+    counts = measured.groupby(["link", "direction"]).agg(
         values=("mu", "size"), vehicles=("vehicle", "nunique")
     )
     for row in found.itertuples():
@@ -153,7 +153,7 @@ def test_roads_elsewhere_are_reported(asked: Ask, links: Path, tmp_path: Path) -
     assert roads.column_names[0] == "cell"
     found = asked("contract", roads=elsewhere, level=LEVEL, within_s=3600.0)
     assert not found.num_rows
-    assert b"no measured friction lies on a road of" in found.schema.metadata[b"said"]
+    assert b"no measured friction lies on a road of" in found.schema.metadata[b"report"]
 
 
 def test_contract_command_reads_an_archive(

@@ -38,9 +38,9 @@ def road(
     name: str, *points: tuple[float, float], both: bool = True, kind: str = "primary"
 ) -> list[DirectedLink]:
     latitude, longitude = np.array([place(*point) for point in points]).T
-    there = DirectedLink(name, "forward", name, kind, latitude, longitude)
+    forward = DirectedLink(name, "forward", name, kind, latitude, longitude)
     back = DirectedLink(name, "backward", name, kind, latitude[::-1], longitude[::-1])
-    return [there, back] if both else [there]
+    return [forward, back] if both else [forward]
 
 
 def on(frame: pd.DataFrame, x: float, y: float, sector: int) -> list[tuple[str, str]]:

@@ -50,10 +50,10 @@ def test_an_extract_gives_each_direction_that_cars_may_drive(tmp_path: Path) -> 
         ("3", "backward", "service"),
         ("4", "forward", "tertiary"),
     ]
-    there, back = network.links[:2]
-    assert there.name == "First"
-    assert np.array_equal(there.longitude, back.longitude[::-1])
-    assert there.longitude[0] == pytest.approx(11.97)
+    forward, backward = network.links[:2]
+    assert forward.name == "First"
+    assert np.array_equal(forward.longitude, backward.longitude[::-1])
+    assert forward.longitude[0] == pytest.approx(11.97)
     assert network.source["extract"] == "town.osm"
     assert "OpenStreetMap" in network.source["licence"]
 

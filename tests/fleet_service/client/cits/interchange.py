@@ -30,10 +30,10 @@ class Interchange:
 
 class _Handler(MessagingHandler):
     def __init__(
-        self, there: Interchange, offered: Sequence[proton.Message], injector: EventInjector
+        self, peer: Interchange, offered: Sequence[proton.Message], injector: EventInjector
     ) -> None:
         super().__init__(prefetch=500)
-        self._there = there
+        self._peer = peer
         self._offered = deque(offered)
         self._injector = injector
         self.listening = threading.Event()
@@ -41,11 +41,11 @@ class _Handler(MessagingHandler):
     def on_start(self, event: Any) -> None:  # noqa: ANN401
         self._container = event.container
         event.container.selectable(self._injector)
-        event.container.listen(self._there.url)
+        event.container.listen(self._peer.url)
         self.listening.set()
 
     def on_message(self, event: Any) -> None:  # noqa: ANN401
-        self._there.received.append((bytes(event.message.body), dict(event.message.properties)))
+        self._peer.received.append((bytes(event.message.body), dict(event.message.properties)))
 
     def on_sendable(self, event: Any) -> None:  # noqa: ANN401
         while self._offered and event.sender.credit > 0:
@@ -65,14 +65,14 @@ def interchange(url: str, offered: Sequence[proton.Message] = ()) -> Iterator[In
     """Yield a simulated interchange (message broker) that listens at an address and delivers the
     messages `offered`.
     """
-    there = Interchange(url)
+    peer = Interchange(url)
     injector = EventInjector()
-    handler = _Handler(there, offered, injector)
+    handler = _Handler(peer, offered, injector)
     thread = threading.Thread(target=Container(handler).run, daemon=True)
     thread.start()
     assert handler.listening.wait(30.0)
     try:
-        yield there
+        yield peer
     finally:
         injector.trigger(ApplicationEvent("leave"))
         thread.join(10.0)
@@ -96,9 +96,9 @@ def separate_interchange(url: str) -> Iterator[Connection]:
 
 
 def _serve(url: str, requests: Connection) -> None:
-    with interchange(url) as there:
+    with interchange(url) as peer:
         while requests.recv():
-            requests.send([(body, _plain(given)) for body, given in there.received])
+            requests.send([(body, _plain(given)) for body, given in peer.received])
 
 
 def _plain(given: dict[str, Any]) -> dict[str, Any]:

@@ -243,9 +243,9 @@ class Run:
     def start(self) -> None:
         self.output = DenmOutput(4711, OURS, self.path, self.sent.append, lambda: self.now)
 
-    def step(self, *standing: StretchAlert, heard: bool = True) -> list[Denm]:
+    def step(self, *standing: StretchAlert, is_received: bool = True) -> list[Denm]:
         before = len(self.sent)
-        self.output.keep_up(standing, lambda *_: heard)
+        self.output.keep_up(standing, lambda *_: is_received)
         fresh = self.sent[before:]
         for parcel in fresh if self.settles else ():
             self.output.mark_accepted(parcel.name)
@@ -268,7 +268,7 @@ def test_an_event_keeps_its_number_over_restarts_until_it_is_cancelled(tmp_path:
         one.sequence for one in run.step(stretch("a", cells=5), stretch("b", place=(57.8, 11.9)))
     } == {0, 1}
     run.start()
-    assert run.step(stretch("b", place=(57.8, 11.9)), heard=False) == [], (
+    assert run.step(stretch("b", place=(57.8, 11.9)), is_received=False) == [], (
         "no service answers there: nothing ends"
     )
     (ended,) = run.step(stretch("b", place=(57.8, 11.9)))
@@ -317,11 +317,11 @@ def test_a_quadtree_selector_finds_all_events_of_a_square_and_no_other() -> None
 def test_denm_reach_a_late_interchange_and_foreign_ones_are_received(tmp_path: Path) -> None:
     url = free_url()
     settled = list[str]()
-    came = list[bytes]()
+    received = list[bytes]()
     foreign = encode_denm(replace(random_denm(np.random.default_rng(3)), termination=None))
 
     def keep(body: bytes, _: Mapping[str, Any]) -> None:
-        came.append(body)
+        received.append(body)
 
     link = AmqpLink(
         url, "deliveries", "subscriptions", on_accepted=settled.append, on_message=keep
@@ -330,15 +330,15 @@ def test_denm_reach_a_late_interchange_and_foreign_ones_are_received(tmp_path: P
     run.step(stretch("a"), stretch("b", place=(57.8, 11.9)))
     for parcel in run.sent:
         link.send(parcel)
-    with interchange(url, [proton.Message(body=foreign, inferred=True)]) as there:
-        until(lambda: len(settled) == 2 and came)
+    with interchange(url, [proton.Message(body=foreign, inferred=True)]) as peer:
+        until(lambda: len(settled) == 2 and received)
         link.close()
     assert sorted(settled) == sorted(parcel.name for parcel in run.sent)
-    assert [body for body, _ in there.received] == [parcel.body for parcel in run.sent]
+    assert [body for body, _ in peer.received] == [parcel.body for parcel in run.sent]
     assert all(
-        given["messageType"] == "DENM" and given["causeCode"] == 6 for _, given in there.received
+        given["messageType"] == "DENM" and given["causeCode"] == 6 for _, given in peer.received
     )
-    assert came == [foreign]
+    assert received == [foreign]
 
 
 @pytest.mark.campaign
@@ -416,8 +416,8 @@ def test_batches_of_an_event_are_numbered_and_short() -> None:
 
 def test_denm_without_grip_makes_no_report() -> None:
     denm = Denm(99, 1, 99, START, START, None, PLACE, 5.0, 600, sub_cause=ICE, heading=0.0)
-    said = json.loads(encode_reports(denm, "cits-se", 5, 1, START)[0][1])
-    assert said["mu"] == [0.12]
+    report = json.loads(encode_reports(denm, "cits-se", 5, 1, START)[0][1])
+    assert report["mu"] == [0.12]
     for other in (
         replace(denm, termination="isCancellation"),
         replace(denm, cause=1),
