@@ -17,7 +17,7 @@ from pathlib import Path
 
 import zenoh
 
-from fleet_service.enrolment.enrol import Registry, Terms
+from fleet_service.enrolment.enrol import Registry, ValidityPeriods
 from fleet_service.enrolment.fleet import Enrolment, Router
 from schemas import keys
 from schemas.config import ZenohSettings
@@ -62,7 +62,7 @@ def open_registry(folder: Path) -> Registry:
     """Open a certificate registry with a new certificate authority in a folder, valid from now
     on.
     """
-    return Registry(folder, Terms(), datetime.now(UTC))
+    return Registry(folder, ValidityPeriods(), datetime.now(UTC))
 
 
 def settings(endpoint: str, folder: Path, **changed: object) -> ZenohSettings:

@@ -126,4 +126,4 @@ class SteadyClock:
         This is the size of a wall-clock jump that the service does not follow.
         """
         now = self.now()
-        return max(now, self._seen if self._seen > now else now) - self._wall()
+        return max(now, self._seen) - self._wall()

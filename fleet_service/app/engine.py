@@ -24,7 +24,7 @@ from fleet_service.archive.identity.vehicle_ids import remove_damaged_lines
 from fleet_service.archive.segment_log import SegmentLog
 from fleet_service.counts import ServiceCounts
 from fleet_service.ingest.dedup import BatchId
-from fleet_service.ingest.weather import weather_files as weather_files
+from fleet_service.ingest.weather import weather_files
 from fleet_service.replay import checkpoints
 from fleet_service.replication.ownership import Ownership, open_exclusive
 from schemas.config import ServiceConfig

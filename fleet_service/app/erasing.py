@@ -51,21 +51,19 @@ def handle_requests(
     """
     rows = 0
     answered = 0
-    for question in erasure_requests.open_requests(root):
+    for path in erasure_requests.open_requests(root):
         try:
-            outcome = _run_erasure(
-                engine, config, root, erasure_requests.read_request(question), stop
-            )
+            outcome = _run_erasure(engine, config, root, erasure_requests.read_request(path), stop)
         except InputError as error:
-            erasure_requests.answer_request(question, error)
+            erasure_requests.answer_request(path, error)
             continue
         if outcome is None:  # the service is stopping; it carries out the request after a restart
             break
         if engine.copy is not None:
             outcome["copy"] = _erase_in_copy(engine.copy)
-        erasure_requests.answer_request(question, outcome)
-        rows = rows + outcome["rows"]
-        answered = answered + 1
+        erasure_requests.answer_request(path, outcome)
+        rows += outcome["rows"]
+        answered += 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
 
 

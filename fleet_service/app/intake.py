@@ -154,7 +154,7 @@ class Intake:
         self._counts.implausible_moves += int(beyond.sum())
         slots = self._shared.state.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64))
         new = vehicles[(slots < 0)[vehicles] & ~beyond[vehicles]]
-        over = self._places.beyond(
+        over = self._places.find_excess(
             witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS
         )
         beyond[new[over]] = True

@@ -217,7 +217,7 @@ class BackgroundJobs:
         self.failed: dict[str, int] = {}
         self._stop = threading.Event()
         self._busy: tuple[str, float] | None = None
-        self._thread = threading.Thread(target=self._run_due_jobs, name="upkeep")
+        self._thread = threading.Thread(target=self._run_due_jobs, name="jobs")
 
     def health_problems(self) -> list[str]:
         """Return one message per background job (such as compaction) that has failed or does not

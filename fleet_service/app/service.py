@@ -34,8 +34,7 @@ from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.replication.ownership import Ownership
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
-from fleet_service.shards.serving import announce_regions as serving_regions
-from fleet_service.shards.serving import claim_regions, watch_successors
+from fleet_service.shards.serving import announce_regions, claim_regions, watch_successors
 from schemas.config import ServiceConfig, load_config
 from schemas.runtime import watchdog, zenoh_session
 from schemas.runtime.metrics import serve_metrics
@@ -107,7 +106,7 @@ class Service:
         self._endpoints = Endpoints(config, self.engine, self.inbox, self._replies)
         self.engine.settlement.call_when_written(self.inbox.wake)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
-        self._upkeep = BackgroundJobs(jobs, self.engine.counts, events.info)
+        self._jobs = BackgroundJobs(jobs, self.engine.counts, events.info)
         # Exception that ended the worker. Closing the session after it may hang.
         self.failure: BaseException | None = None
         self._session: zenoh.Session | None = None
@@ -155,11 +154,11 @@ class Service:
             session,
             claim_regions(
                 session, config.name, config.regions, stop, self.engine.holding.all_holders
-            ) as mine,
-            watch_successors(session, mine) as came,
-            self._upkeep,
+            ) as claims,
+            watch_successors(session, claims) as has_successor,
+            self._jobs,
             self._endpoints.declare_all(session),
-            serving_regions(session, mine),
+            announce_regions(session, claims),
         ):
             self._session = session
             self._events.info(
@@ -169,7 +168,9 @@ class Service:
             watchdog.notify_alive()
             try:
                 while not (
-                    stop.is_set() or self._has_lost_archive(came) or self.engine.holding.leaves
+                    stop.is_set()
+                    or self._has_lost_archive(has_successor)
+                    or self.engine.holding.leaves
                 ):
                     self._step(session, stop)
                 self._shut_down(session, stop)
@@ -178,15 +179,15 @@ class Service:
                 stop.set()
                 raise
 
-    def _has_lost_archive(self, came: Callable[[], bool]) -> bool:
+    def _has_lost_archive(self, has_successor: Callable[[], bool]) -> bool:
         """Return True if another service has taken over the archive.
 
         Normally this service learns this from the lease, which is stored in the bucket (object
-        store) with the archive's copy. If the bucket does not answer, this service calls `came`,
-        which returns True if another service has announced the same regions.
+        store) with the archive's copy. If the bucket does not answer, this service calls
+        `has_successor`, which returns True if another service has announced the same regions.
         """
         holding = self.engine.holding
-        if not holding.may_acknowledge and came():
+        if not holding.may_acknowledge and has_successor():
             holding.mark_lost()
         return holding.is_lost
 
@@ -201,7 +202,7 @@ class Service:
             )
         if self._replies.hangs_s >= HANGS_S:
             return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
-        return "upkeep has ended" if self._upkeep.has_ended else None
+        return "the thread of background jobs has ended" if self._jobs.has_ended else None
 
     def _is_working(self) -> bool:
         """Return True if this service can serve its regions: a router is connected, and the worker
@@ -232,7 +233,7 @@ class Service:
             config.metrics_host,
             config.metrics_port,
             lambda: collect_metrics(engine, pulse(), config, root),
-            lambda: health_problems(engine, pulse(), config) + self._upkeep.health_problems(),
+            lambda: health_problems(engine, pulse(), config) + self._jobs.health_problems(),
         )
 
     def _step(self, session: zenoh.Session, stop: threading.Event) -> None:

@@ -111,7 +111,6 @@ class SharedState:
     def __init__(self, state: ServiceState, public_vehicles: int) -> None:
         self.guard = threading.Lock()
         self._public_vehicles = public_vehicles
-
         self._adopt(state)
 
     def _adopt(self, state: ServiceState) -> None:
@@ -163,12 +162,13 @@ def _load_public(
 
 def _load_streams(
     root: Path,
-    is_new: bool,
     streams: SequenceTrackers,
     begin: Begin,
     damaged: Callable[[Path, str], None],
+    *,
+    is_new: bool,
 ) -> list[tuple[Kind, ArchivedRows]]:
-    """Read which batches were admitted. If `streams` is new (no checkpoint), record them there.
+    """Read which batches were admitted. If `is_new` (no checkpoint), record them in `streams`.
     Otherwise return the rows after the checkpoint, which are few. The caller adds them when the
     replay is complete, because the replay needs `streams` as it was at the checkpoint.
     """
@@ -206,19 +206,19 @@ def load_state(
         archived_reports(root, known=begin.weather, damaged=damaged, acts_since=acts_since)
     )
     shown.mark_all_changed()
-    matters = Begin(first, begin.cut, until)
+    relevant = Begin(first, begin.cut, until)
     listener = ignore_observations if public is None else public.follow
     updates = replay(
-        root, fusion, Since(matters, streams if begin.cut else None), damaged, listener
+        root, fusion, Since(relevant, streams if begin.cut else None), damaged, listener
     )
     with ThreadPoolExecutor(1, "streams") as thread:
-        later = thread.submit(_load_streams, root, not begin.cut, streams, matters, damaged)
+        later = thread.submit(_load_streams, root, streams, relevant, damaged, is_new=not begin.cut)
         for updated in updates:
             alerts.update(updated.slots)
             shown.mark_changed(updated.slots)
         for kind, rows in later.result():
             streams.restore(kind, rows)
     pa.default_memory_pool().release_unused()  # memory from reading the archive
-    memory = ServiceState(fusion, shown, alerts, streams, begin.refused, public)
-    memory.drop_old()
-    return memory
+    state = ServiceState(fusion, shown, alerts, streams, begin.refused, public)
+    state.drop_old()
+    return state

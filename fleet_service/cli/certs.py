@@ -91,13 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
         )
     fleet = load_config(arguments.fleet, Enrolment, "fleet")
     try:
-        from fleet_service.enrolment.enrol import Registry, Terms
+        from fleet_service.enrolment.enrol import Registry, ValidityPeriods
     except ImportError as error:
         raise InputError(
             "certs", "the package cryptography is missing", install_command("certs")
         ) from error
     try:
-        registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
+        registry = Registry(out, ValidityPeriods(*days), datetime.now(UTC), arguments.at)
         leaving = registry.list_leaving(fleet)
         if arguments.dry_run:
             print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'none'}")

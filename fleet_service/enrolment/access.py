@@ -31,7 +31,7 @@ from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 
 # Largest size [bytes] of payload and attachment of a query; valid queries have neither.
-QUESTION_BYTES: Final = 1024
+QUERY_BYTES: Final = 1024
 # Largest size [bytes] of a picture of the map ahead, or of the signals: ten times the largest
 # measured.
 PRIVATE_BYTES: Final = 256 * 1024
@@ -162,25 +162,28 @@ def _shared_rules() -> list[Section]:
         _allow_rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
         _allow_rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*"))
         | {"permission": "deny"},
-        _allow_rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
-        _allow_rule("told", ("egress",), ("put", "reply"), PUBLIC),
+        _allow_rule("map-request", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
+        _allow_rule("map-delivery", ("egress",), ("put", "reply"), PUBLIC),
         # Until Zenoh tells a declared publisher or querier that a subscriber exists, it sends
         # nothing and reports no error.
         _allow_rule(
-            "listened",
+            "report-subscribers",
             ("egress",),
             ("declare_subscriber",),
             [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
         ),
         _allow_rule("weather", ("ingress",), ("put",), [WEATHER]),
-        _allow_rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
+        _allow_rule("weather-subscribers", ("egress",), ("declare_subscriber",), [WEATHER]),
         # Readers may see which services serve a region. Otherwise a region without a service looks
         # like a region without grip reports.
         _allow_rule(
-            "who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]
+            "service-request",
+            ("ingress",),
+            ("liveliness_query", "declare_liveliness_subscriber"),
+            [SERVED],
         ),
-        _allow_rule("there", ("egress",), ("liveliness_token",), [SERVED]),
-        _allow_rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
+        _allow_rule("service-delivery", ("egress",), ("liveliness_token",), [SERVED]),
+        _allow_rule("map-queryables", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
     ]
 
 
@@ -210,11 +213,17 @@ def _role_policies(fleet: Enrolment) -> list[Section]:
         (["everything"], ["role/routers", *services]),
         (["private"], services),
         (
-            ["ask", "told", "answered", "who", "there"],
+            [
+                "map-request",
+                "map-delivery",
+                "map-queryables",
+                "service-request",
+                "service-delivery",
+            ],
             [*readers, *fleet.vehicles, *fleet.owners],
         ),
-        (["weather", "weathered"], weather),
-        (["listened"], fleet.vehicles),
+        (["weather", "weather-subscribers"], weather),
+        (["report-subscribers"], fleet.vehicles),
     ]
     return [{"rules": rules, "subjects": subjects} for rules, subjects in assigned if subjects]
 
@@ -228,18 +237,25 @@ def _own_rules(name: str) -> list[Section]:
             [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), *keys.private_keys(name)],
         ),
         # A declared publisher sends nothing until Zenoh tells it that the vehicle has subscribed.
-        _allow_rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
+        _allow_rule(
+            f"private-subscribers/{name}",
+            ("egress",),
+            ("declare_subscriber",),
+            keys.private_keys(name),
+        ),
         *_subscriber_rules(name, keys.private_keys(name)),
         _allow_rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
-        _allow_rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
-        _allow_rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
+        _allow_rule(
+            f"ack-request/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]
+        ),
+        _allow_rule(f"ack-delivery/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
     ]
 
 
 def _subscriber_rules(name: str, expressions: list[str]) -> list[Section]:
     return [
-        _allow_rule(f"look/{name}", ("ingress",), ("declare_subscriber",), expressions),
-        _allow_rule(f"private/{name}", ("egress",), ("put",), expressions),
+        _allow_rule(f"private-request/{name}", ("ingress",), ("declare_subscriber",), expressions),
+        _allow_rule(f"private-delivery/{name}", ("egress",), ("put",), expressions),
     ]
 
 
@@ -286,11 +302,11 @@ def _no_payload() -> Section:
     consists of its key and parameters only. It applies at the router to which the sender connects.
     """
     return {
-        "id": "questions",
+        "id": "queries",
         "flows": ["ingress"],
         "messages": ["query"],
         "key_exprs": [f"{keys.ROOT}/**"],
-        "size_limit": QUESTION_BYTES,
+        "size_limit": QUERY_BYTES,
     }
 
 

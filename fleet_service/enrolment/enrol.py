@@ -24,7 +24,7 @@ PRIVATE: Final = 0o700  # file mode of the authority's folder
 
 
 @dataclass(frozen=True)
-class Terms:
+class ValidityPeriods:
     """Validity periods of certificates and authorities [days].
 
     Attributes:
@@ -55,16 +55,16 @@ class Registry:
     Args:
         folder: folder for the authority's keys, all certificates and the routers' configurations;
             created if it does not exist.
-        terms: validity periods.
+        periods: validity periods.
         now: current time, with time zone.
         used_at: folder in which the routers will find their files (default: `folder`).
     """
 
     def __init__(
-        self, folder: Path, terms: Terms, now: datetime, used_at: Path | None = None
+        self, folder: Path, periods: ValidityPeriods, now: datetime, used_at: Path | None = None
     ) -> None:
         self._folder = folder
-        self._terms = terms
+        self._periods = periods
         self._now = now
         self._used_at = used_at or folder
         self._authority = folder / "authority"
@@ -92,7 +92,7 @@ class Registry:
                 done.kept.append(name)
             else:
                 self._refuse_revoked(name)
-                ca.issue_certificate(signer, name, hosts, self._terms.days, self._now).write(
+                ca.issue_certificate(signer, name, hosts, self._periods.days, self._now).write(
                     self._folder / name
                 )
                 done.made.append(name)
@@ -107,7 +107,7 @@ class Registry:
         current = self._authority / "ca"
         coming = self._authority / "next"
         if step == "next" and ca.read_pair(coming) is None:
-            ca.new_authority(self._terms.ca_days, self._now).write(coming)
+            ca.new_authority(self._periods.ca_days, self._now).write(coming)
         if step == "switch":
             self._switch_authority()
         if step == "drop":
@@ -120,7 +120,7 @@ class Registry:
                     f"{self._authority} lacks the authority's key",
                     "restore ca.key from its backup",
                 )
-            signer = ca.new_authority(self._terms.ca_days, self._now)
+            signer = ca.new_authority(self._periods.ca_days, self._now)
             signer.write(current)
         return signer
 
@@ -148,7 +148,7 @@ class Registry:
             return False
         found = pair.certificate
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        soon = self._now + timedelta(days=self._terms.renew_days)
+        soon = self._now + timedelta(days=self._periods.renew_days)
         return (
             ca.is_signed_by(found, signer)
             and found.not_valid_after_utc > soon

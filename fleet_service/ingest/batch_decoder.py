@@ -49,7 +49,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
         payload if encoding in usual and len(payload) <= MAX_BYTES else b""
         for payload, encoding in payloads
     ]
-    data, walked = _scan_messages(kind, plain, True)
+    data, walked = _scan_messages(kind, plain, strict=True)
     indices = list(range(len(plain)))
     if not walked.understood.all():
         for index in np.flatnonzero(~walked.understood).tolist():
@@ -59,7 +59,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
                 errors.append((index, error))
         wrong = {index for index, _ in errors}
         indices = [index for index in indices if index not in wrong]
-        data, walked = _scan_messages(kind, [plain[index] for index in indices], False)
+        data, walked = _scan_messages(kind, [plain[index] for index in indices], strict=False)
         assert walked.understood.all(), "the protobuf library writes what we do not read"
     fields = _Fields(kind, data, walked)
     return complete(
@@ -68,12 +68,11 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
 
 
 def _scan_messages(
-    kind: Kind, messages: list[bytes], strict: bool
+    kind: Kind, messages: list[bytes], *, strict: bool
 ) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
-    return data, walk_fields(
-        kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict
-    )
+    sizes = np.fromiter(map(len, messages), np.int64, len(messages))
+    return data, walk_fields(kind, data, np.cumsum(sizes), strict=strict)
 
 
 def _reencode_message(kind: Kind, payload: bytes, encoding: str) -> bytes:

@@ -31,7 +31,7 @@ HOUR: Final = 3600.0
 WEEK_HOURS: Final = 168.0
 
 
-class Bucket:
+class TokenBuckets:
     """Token buckets, one per vehicle. A vehicle may use the amount in its bucket at once; the
     bucket is refilled at a constant rate per hour.
     """
@@ -60,10 +60,10 @@ class NewCells:
     """
 
     def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
-        self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)
-        self._week = Bucket(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
+        self._budgets = TokenBuckets(at_once, NEW_CELLS_PER_HOUR)
+        self._week = TokenBuckets(NEW_CELLS_PER_WEEK, NEW_CELLS_PER_WEEK / WEEK_HOURS)
 
-    def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
+    def find_excess(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
         """Return a mask of rows (n,): True if the row is beyond its vehicle's limit on new cells at
         the time `now` [s]. All given rows must be in new cells, that is, cells that no vehicle has
         visited before. Each new cell within the limit reduces the vehicle's remaining allowance.

@@ -58,7 +58,7 @@ class SequenceTracker:
         self.newest = 0
         self.runs: list[int] | tuple[int, ...] = _NONE
 
-    def accepted(self, seq: int) -> bool:
+    def has_accepted(self, seq: int) -> bool:
         """Return True if the batch of this stream with this sequence number was accepted before."""
         # An odd number of limits up to `seq` means that it lies in a run.
         return seq <= self.low or bisect_right(self.runs, seq) % 2 == 1
@@ -156,7 +156,7 @@ class SequenceTrackers:
         """Return the time of the newest accepted batch [ns], or 0."""
         return max((stream.newest for stream in self._streams.values()), default=0)
 
-    def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
+    def find_accepted(self, kind: Kind, names: IntArray) -> BoolArray:
         """Return a mask (n,): True for batches that were accepted before. `names` is (n, 4):
         numbers of the vehicle, of the vehicle's start and of the region, and sequence number.
         """
@@ -164,7 +164,7 @@ class SequenceTrackers:
         found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
         return np.array(
             [
-                one is not None and one.accepted(seq)
+                one is not None and one.has_accepted(seq)
                 for one, seq in zip(found, names[:, 3].tolist(), strict=True)
             ],
             bool,

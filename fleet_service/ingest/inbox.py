@@ -28,7 +28,7 @@ from fleet_service.counts import ServiceCounts
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.batch_decoder import decode_many
-from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket
+from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, TokenBuckets
 from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock, Refusal
@@ -184,7 +184,7 @@ class BatchIntake:
         self._publishers = publishers
         self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read_erasures(pseudonyms.folder)
-        self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
+        self._budget = TokenBuckets(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # batches that are accepted but not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {
             kind: {} for kind in Kind
@@ -328,7 +328,7 @@ class BatchIntake:
                 continue
             stream.raise_to(first_held)
             batch = stream, seq
-            if stream.accepted(seq):
+            if stream.has_accepted(seq):
                 again += 1
                 if batch not in pending:
                     self._acks.record_durable([batch])

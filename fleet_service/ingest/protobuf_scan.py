@@ -99,7 +99,9 @@ def _make_layout(kind: Kind) -> _Layout:
     )
 
 
-def walk_fields(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
+def walk_fields(
+    kind: Kind, data: ByteArray, ends: IntArray, *, strict: bool = True
+) -> ScannedFields:
     """Scan messages that are concatenated in `data`; return the positions of their fields.
 
     Args:

@@ -101,7 +101,7 @@ def novel_deliveries(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -
     seq = rows["seq"].tolist()
     for k, row in enumerate(which.tolist()):
         stream = streams[int(vehicle[row]), boot[row], Kind.OBSERVATION, region[row]]
-        if not stream.accepted(seq[row]):
+        if not stream.has_accepted(seq[row]):
             stream.accept(seq[row])
             kept.append(k)
     return np.array(kept, np.int64)

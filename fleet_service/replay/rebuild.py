@@ -241,7 +241,7 @@ def _are_known(rows: segments.Rows, known: SequenceTrackers) -> BoolArray:
     stream, _ = group_rows(vehicle.copy(), boot, region)
     batch, first = group_rows(stream.astype(np.int64), seq, seq)
     names = np.stack([rows[name][first] for name in IDENTITY], axis=1)
-    return known.accepted(Kind.OBSERVATION, names)[batch]
+    return known.find_accepted(Kind.OBSERVATION, names)[batch]
 
 
 def _recorded_result(rows: segments.Rows) -> RecordedResult:

@@ -16,7 +16,7 @@ import zenoh
 from deploy.router import open_router
 from fleet_service.enrolment import authority as ca
 from fleet_service.enrolment.access import PRIVATE_BYTES
-from fleet_service.enrolment.enrol import Registry, Terms
+from fleet_service.enrolment.enrol import Registry, ValidityPeriods
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 from schemas.config import ZenohSettings
@@ -516,7 +516,7 @@ def revoked_vehicle(ground: Ground) -> bool:
         (ground.folder / f"lost.{end}").write_bytes((ground.folder / f"{ROGUE}.{end}").read_bytes())
     (ground.folder / "lost.pem").rename(ground.folder / "lost.crt")
     lost["connect_certificate"] = str(ground.folder / "lost.crt")
-    again = Registry(ground.folder, Terms(), datetime.now(UTC))
+    again = Registry(ground.folder, ValidityPeriods(), datetime.now(UTC))
     again.enrol(make_enrolment(vehicles=[HONEST]))
     for router in ROUTERS[::-1]:
         network.stop(router)

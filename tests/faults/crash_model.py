@@ -135,7 +135,9 @@ class History(Lives[Batch]):
         for kind in Kind:
             stream = streams[VEHICLE, 1, kind, 1]
             new = [
-                b for b in dict.fromkeys(batches) if b.kind is kind and not stream.accepted(b.seq)
+                b
+                for b in dict.fromkeys(batches)
+                if b.kind is kind and not stream.has_accepted(b.seq)
             ]
             if new:
                 for batch in new:
@@ -169,7 +171,7 @@ class History(Lives[Batch]):
             found += [
                 f"{kind} {b.seq} only counts as held"
                 for b in self.sent
-                if b.kind is kind and stream.accepted(b.seq) and b.seq not in held
+                if b.kind is kind and stream.has_accepted(b.seq) and b.seq not in held
             ]
         return found
 

@@ -351,7 +351,7 @@ class ServiceHistory(Lives[Sent]):
             names = np.array([[*name, REGION, one.seq]], np.int64)
             for memory, by in ((begun, "the checkpoint"), (whole, "the log")):
                 held = bool(rows[one.time])
-                if bool(memory.streams.accepted(Kind.OBSERVATION, names)[0]) != held:
+                if bool(memory.streams.find_accepted(Kind.OBSERVATION, names)[0]) != held:
                     found.append(f"{one.vehicle} {one.seq} is {'un' if held else ''}known by {by}")
         return found
 

@@ -128,7 +128,7 @@ def _count_lost(root: Path, batches: Sequence[Batch]) -> int:
     owed = [
         b
         for place, b in enumerate(batches)
-        if place < len(batches) - BATCHES or stream.accepted(b.seq)
+        if place < len(batches) - BATCHES or stream.has_accepted(b.seq)
     ]
     return len(_list_expected(owed) - held) + len(held - _list_expected(batches))
 

@@ -138,6 +138,7 @@ def _bounding_boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatA
     out = []
     for side, least in zip(grid.bounds(cell), (True, True, False, False), strict=True):
         extreme = np.full(count, np.inf if least else -np.inf)
-        (np.minimum if least else np.maximum).at(extreme, label, side)
+        choose = np.minimum if least else np.maximum
+        choose.at(extreme, label, side)
         out.append(extreme)
     return tuple(out)

@@ -226,11 +226,8 @@ def _link_marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
         dy = np.diff(link.latitude) * METRES_PER_DEGREE
         run = np.concatenate([[0.0], np.cumsum(np.hypot(dx, dy))])
         lengths[k] = run[-1]
-        at = (
-            (np.arange(max(int(run[-1] / STEP_M), 1)) + 0.5)
-            * run[-1]
-            / max(int(run[-1] / STEP_M), 1)
-        )
+        count = max(int(run[-1] / STEP_M), 1)
+        at = (np.arange(count) + 0.5) * run[-1] / count
         piece = np.minimum(np.searchsorted(run, at, side="right") - 1, len(dx) - 1)
         parts.append(
             (

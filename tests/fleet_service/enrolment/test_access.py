@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from fleet_service.enrolment.access import access_control
-from fleet_service.enrolment.enrol import Registry, Terms
+from fleet_service.enrolment.enrol import Registry, ValidityPeriods
 from schemas import keys
 from schemas.errors import InputError
 from schemas.runtime import presence
@@ -192,7 +192,7 @@ def test_new_vehicle_is_admitted_during_a_rolling_router_restart(running: Networ
 def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: Network) -> None:
     with running.open_session(SERVICE) as service, running.open_session(HONEST) as honest:
         assert is_heard(honest, HONEST, service)
-        much_later = Registry(running.folder, Terms(renew_days=364.9), datetime.now(UTC))
+        much_later = Registry(running.folder, ValidityPeriods(renew_days=364.9), datetime.now(UTC))
         for step in ("next", "switch", "drop"):
             much_later.enrol(make_enrolment(), step)
         for router in ROUTERS:

@@ -13,7 +13,7 @@ from cryptography import x509
 
 from fleet_service.cli import main
 from fleet_service.enrolment import authority as ca
-from fleet_service.enrolment.enrol import Registry, Terms
+from fleet_service.enrolment.enrol import Registry, ValidityPeriods
 from schemas.errors import InputError
 from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, WEATHER, make_enrolment
 
@@ -23,7 +23,7 @@ EVERYONE = {*ROUTERS, SERVICE, READER, WEATHER, *VEHICLES}
 
 def at(folder: Path, days: float = 0.0, **terms: float) -> Registry:
     """Return the certificate registry of a folder, opened as if `days` days had passed."""
-    return Registry(folder, Terms(**terms), NOW + timedelta(days=days))
+    return Registry(folder, ValidityPeriods(**terms), NOW + timedelta(days=days))
 
 
 def certificate(folder: Path, name: str) -> x509.Certificate:

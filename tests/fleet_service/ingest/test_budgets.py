@@ -22,7 +22,7 @@ from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_numb
 from fleet_service.archive.identity.vehicle_ids import VehicleIds, read_numbers
 from fleet_service.archive.maintenance.retention import drop_checkpoints, forget_period
 from fleet_service.ingest import dedup
-from fleet_service.ingest.budgets import STREAMS_AT_ONCE, Bucket, NewCells
+from fleet_service.ingest.budgets import STREAMS_AT_ONCE, NewCells, TokenBuckets
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
@@ -285,7 +285,7 @@ def test_new_cells_are_counted_once_and_by_vehicle() -> None:
     budgets = NewCells(3)
     vehicle = np.array([2, 1, 1, 2, 1, 1, 1])
     cell = np.array([5, 1, 2, 5, 1, 3, 4])
-    assert budgets.beyond(vehicle, cell, 0.0).tolist() == [
+    assert budgets.find_excess(vehicle, cell, 0.0).tolist() == [
         False,
         False,
         False,
@@ -294,17 +294,17 @@ def test_new_cells_are_counted_once_and_by_vehicle() -> None:
         False,
         True,
     ]
-    assert budgets.beyond(np.array([1, 2, 2, 2]), np.array([9, 6, 7, 8]), 0.0).tolist() == [
+    assert budgets.find_excess(np.array([1, 2, 2, 2]), np.array([9, 6, 7, 8]), 0.0).tolist() == [
         True,
         False,
         False,
         True,
     ]
-    assert not len(budgets.beyond(vehicle[:0], cell[:0], 0.0))
+    assert not len(budgets.find_excess(vehicle[:0], cell[:0], 0.0))
 
 
 def test_a_budget_fills_again() -> None:
-    bucket = Bucket(10, 3600)
+    bucket = TokenBuckets(10, 3600)
     assert [
         bucket.take(1, 6, 0.0),
         bucket.take(1, 6, 0.0),

@@ -29,11 +29,11 @@ def test_sequence_tracker_knows_accepted_and_skipped_numbers(
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
         stream.raise_to(min(held, seq))
-        assert stream.accepted(seq) == (seq <= floor or seq in accepted)
+        assert stream.has_accepted(seq) == (seq <= floor or seq in accepted)
         stream.accept(seq)
         accepted.add(seq)
     for seq in range(1, 62):
-        assert stream.accepted(seq) == (seq <= floor or seq in accepted)
+        assert stream.has_accepted(seq) == (seq <= floor or seq in accepted)
     assert all(limit > stream.low + 1 for limit in stream.runs)
     assert all(before < after for before, after in pairwise(stream.runs))
 
@@ -51,7 +51,7 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
     stream = SequenceTracker(KEY)
     assert [stream.accept(2**62 - 2 * k) for k in range(4)] == [True, True, True, False]
-    assert not stream.accepted(2**62 - 6)
+    assert not stream.has_accepted(2**62 - 6)
     assert stream.accept(1)
     assert stream.low == 1
 
@@ -66,9 +66,9 @@ def test_a_sender_without_first_held_is_accepted_in_a_new_month(
         assert streams[KEY].accept(seq)
     again = SequenceTrackers.of(*streams.columns())
     for kept in (streams, again):
-        assert all(kept[KEY].accepted(seq) for seq in range(1001, 2001))
-        assert not kept[KEY].accepted(1000)
-        assert not kept[KEY].accepted(2001)
+        assert all(kept[KEY].has_accepted(seq) for seq in range(1001, 2001))
+        assert not kept[KEY].has_accepted(1000)
+        assert not kept[KEY].has_accepted(2001)
     assert len(again[KEY].runs) == 2
 
 
@@ -102,4 +102,4 @@ def test_streams_too_old_to_be_let_in_again_are_forgotten() -> None:
     both[2, 1, Kind.STATE, 1].accept(2, 150)
     both.forget(101)
     assert len(both) == 1
-    assert both[2, 1, Kind.STATE, 1].accepted(2)
+    assert both[2, 1, Kind.STATE, 1].has_accepted(2)
