@@ -7,13 +7,13 @@ A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` matches 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from schemas import grid, keys
 from schemas.errors import InputError
-from schemas.numeric import IntArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.query import MapQuery
 from schemas.thresholds import METRES_PER_DEGREE
 
@@ -110,32 +110,62 @@ class Rank:
         return np.argsort(np.array(ranks, np.int64), kind="stable")
 
 
-def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Return the keys (cell · 4 + sector) of the places on a route, in order and without
-    repetitions. The points of the route are (longitude, latitude) [deg].
+class RouteSamples(NamedTuple):
+    """Points along a route in driving order, at most ROUTE_STEP_M apart; each attribute is (n,).
+
+    Attributes:
+        longitude, latitude: position [deg]; beyond the 180° meridian, the longitude exceeds 180°.
+        along: distance from the start [m].
+        sector: heading sector.
+    """
+
+    longitude: FloatArray
+    latitude: FloatArray
+    along: FloatArray
+    sector: IntArray
+
+    @property
+    def keys(self) -> IntArray:
+        """Return the key (cell · 4 + sector) of the place of each point."""
+        return grid.cell_of(self.latitude, self.longitude) * grid.SECTORS + self.sector
+
+
+def sample_route(
+    route: Sequence[tuple[float, float]], most_m: float = ROUTE_MOST_M
+) -> RouteSamples:
+    """Return points along a route. The corners of the route are (longitude, latitude) [deg].
 
     Raises:
-        InputError: the route is longer than ROUTE_MOST_M.
+        InputError: the route is longer than `most_m` [m].
     """
-    points = np.array(route)
-    points[:, 0] = np.unwrap(points[:, 0], period=360.0)  # the short way over the 180° meridian
-    scale = np.cos(np.radians(points[:-1, 1].mean()))
-    steps = np.diff(points, axis=0) * [METRES_PER_DEGREE * scale, METRES_PER_DEGREE]
-    lengths = np.hypot(*steps.T)
-    if lengths.sum() > ROUTE_MOST_M:
+    corners = np.array(route)
+    corners[:, 0] = np.unwrap(corners[:, 0], period=360.0)  # the short way over the 180° meridian
+    scale = METRES_PER_DEGREE * np.cos(np.radians(corners[:, 1].mean()))
+    steps = np.diff(corners, axis=0)
+    legs = steps * [scale, METRES_PER_DEGREE]
+    lengths = np.hypot(*legs.T)
+    if not lengths.sum() <= most_m:
         raise InputError(
             "route",
             f"is {lengths.sum() / 1e3:.0f} km long",
-            f"give at most {ROUTE_MOST_M / 1e3:.0f} km",
+            f"give at most {most_m / 1e3:.0f} km",
         )
     counts = np.maximum(np.ceil(lengths / ROUTE_STEP_M), 1).astype(np.int64)
     leg = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(len(leg)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[leg]
-    longitude, latitude = (points[leg] + share[:, None] * np.diff(points, axis=0)[leg]).T
-    cell = np.append(grid.cell_of(latitude, longitude), grid.cell_of(points[-1, 1], points[-1, 0]))
-    sector = grid.sector_of(np.arctan2(steps[:, 1], steps[:, 0]))[np.append(leg, leg[-1])].astype(
-        np.int64
-    )
-    keys = cell * grid.SECTORS + sector
+    places = np.append(corners[leg] + share[:, None] * steps[leg], corners[-1:], axis=0)
+    along = np.append((np.cumsum(lengths) - lengths)[leg] + share * lengths[leg], lengths.sum())
+    sector = grid.sector_of(np.arctan2(legs[:, 1], legs[:, 0]))[np.append(leg, leg[-1])]
+    return RouteSamples(places[:, 0], places[:, 1], along, sector.astype(np.int64))
+
+
+def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
+    """Return the keys (cell · 4 + sector) of the places on a route, in order and without
+    repetitions. The corners of the route are (longitude, latitude) [deg].
+
+    Raises:
+        InputError: the route is longer than ROUTE_MOST_M.
+    """
+    keys = sample_route(route).keys
     _, first = np.unique(keys, return_index=True)
     return np.asarray(keys[np.sort(first)])

@@ -7,7 +7,6 @@ length is counted.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -16,10 +15,9 @@ import pyarrow as pa
 
 from schemas import grid
 from schemas.errors import InputError
+from schemas.regions import sample_route
 from schemas.stopping import stopping_speed
-from schemas.thresholds import METRES_PER_DEGREE
 
-STEP_M: Final = 4.0  # [m] step along a route, much less than the side of a cell
 MOST_M: Final = 200_000.0  # [m] longest route that can be displayed
 UNKNOWN: Final = "unknown"
 SIGHTS_M: Final = (50, 100)
@@ -46,8 +44,14 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
     Raises:
         InputError: the route is too long or not valid.
     """
-    longitude, latitude, along, sector = _sample_route(points)
-    keys = grid.cell_of(latitude, longitude) * grid.SECTORS + sector
+    if len(points) < 2:
+        raise InputError("route", "needs two points", "click two or more")
+    samples = sample_route(points, MOST_M)
+    along = samples.along
+    length = float(along[-1])
+    if length == 0.0:
+        raise InputError("route", "has no length", "click two different points")
+    keys = samples.keys
     known = {
         int(cell) * grid.SECTORS + int(heading): row
         for row, (cell, heading) in enumerate(
@@ -61,7 +65,6 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
     ends = np.append(runs[1:], len(keys) - 1)
     cells = table.to_pylist()
     stretches: list[dict[str, Any]] = []
-    length = float(along[-1])
     share = dict.fromkeys(("measured", "bound", "borrowed", UNKNOWN), 0.0)
     for first, last in zip(runs.tolist(), ends.tolist(), strict=True):
         if along[last] <= along[first]:
@@ -70,8 +73,8 @@ def grip_profile(points: Points, table: pa.Table) -> dict[str, Any]:
         place = {
             "from_m": round(float(along[first]), 1),
             "to_m": round(float(along[last]), 1),
-            "longitude": float(longitude[middle]),
-            "latitude": float(latitude[middle]),
+            "longitude": (float(samples.longitude[middle]) + 180.0) % 360.0 - 180.0,
+            "latitude": float(samples.latitude[middle]),
         }
         stretches.append(
             place | (_describe_cell(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN})
@@ -97,30 +100,3 @@ def _describe_cell(cell: dict[str, Any]) -> dict[str, Any]:
         "cell": str(cell["cell"]),
         "safe_speed": safe_speeds(cell["mu_lower"]) if measured else None,
     }
-
-
-def _sample_route(points: Points) -> tuple[Any, Any, Any, Any]:
-    """Return longitude and latitude [deg], distance from the start [m] and heading sector of points
-    along the route.
-    """
-    corners = np.array(points)
-    if corners.ndim != 2 or len(corners) < 2:
-        raise InputError("route", "needs two points", "click two or more")
-    corners[:, 0] = np.unwrap(corners[:, 0], period=360.0)  # the short way over the 180° meridian
-    scale = METRES_PER_DEGREE * math.cos(math.radians(float(corners[:, 1].mean())))
-    legs = np.diff(corners, axis=0) * [scale, METRES_PER_DEGREE]
-    lengths = np.hypot(*legs.T)
-    if not 0.0 < lengths.sum() <= MOST_M:
-        raise InputError(
-            "route",
-            f"is {lengths.sum() / 1e3:.1f} km long",
-            f"draw at most {MOST_M / 1e3:.0f} km",
-        )
-    counts = np.maximum(np.ceil(lengths / STEP_M), 1).astype(np.int64)
-    leg = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)
-    begun = np.cumsum(counts) - counts
-    share = np.append((np.arange(counts.sum()) - begun[leg[:-1]]) / counts[leg[:-1]], 1.0)
-    place = corners[leg] + share[:, None] * np.diff(corners, axis=0)[leg]
-    along = (np.cumsum(lengths) - lengths)[leg] + share * lengths[leg]
-    heading = grid.sector_of(np.arctan2(legs[:, 1], legs[:, 0]))[leg].astype(np.int64)
-    return (place[:, 0] + 180.0) % 360.0 - 180.0, place[:, 1], along, heading
