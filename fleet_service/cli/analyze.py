@@ -62,6 +62,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="duckdb|spark",
         help="engine of the query (default %(default)s)",
     )
+    _add_question_arguments(parser)
+    parser.add_argument(
+        "--as-it-lies",
+        action="store_true",
+        help="do not compact the log; read compacted files only",
+    )
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one per line")
+
+
+def _add_question_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that only some questions use."""
     parser.add_argument(
         "--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map"
     )
@@ -95,12 +106,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="contract: time within which it must be restored, e.g. 4h or 90min",
     )
-    parser.add_argument(
-        "--as-it-lies",
-        action="store_true",
-        help="do not compact the log; read compacted files only",
-    )
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one per line")
 
 
 def run(arguments: argparse.Namespace) -> int:

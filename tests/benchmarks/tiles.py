@@ -14,9 +14,11 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import zenoh
@@ -195,16 +197,28 @@ def _collect_counts(reader: subprocess.Popen[str], got: list[int]) -> None:
     got.extend(int(line) for line in reader.stdout or ())
 
 
-def tiles() -> list[Figure]:
-    """Send 1 500 observations/s in 8 000 tiles to a service, and measure three delays: that of the
-    acknowledgements, the age of published tiles, and the time of a small query while other clients
-    send large queries.
+class _Measured(NamedTuple):
+    """Measurements of a service that updates 8 000 tiles.
+
+    Attributes:
+        sender: values by name that the sending process measured.
+        puts: number of publications of each tile, by Zenoh key.
+        small_s: times of a small query while other clients query the whole map [s].
+        received: number of tiles that the slower of these clients received.
     """
-    puts: dict[str, int] = {}
+
+    sender: dict[str, float]
+    puts: Counter[str]
+    small_s: list[float]
+    received: int
+
+
+def _drive_service() -> _Measured:
+    """Run a service, send observations in 8 000 tiles to it, and query its map."""
+    puts = Counter[str]()
 
     def count_put(sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        puts[key] = puts.get(key, 0) + 1
+        puts[str(sample.key_expr)] += 1
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -233,10 +247,19 @@ def tiles() -> list[Figure]:
             f"from tests.benchmarks.tiles import drive; drive({endpoint!r})",
         ]
         done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
-        found = json.loads(done.stdout.splitlines()[-1])
+        sender = json.loads(done.stdout.splitlines()[-1])
         small, got = _time_answers(
             endpoint, client, keys.map_key(int(grid.tile_of(make_visit(0).columns["cell"][0])))
         )
+    return _Measured(sender, puts, small, got)
+
+
+def tiles() -> list[Figure]:
+    """Send 1 500 observations/s in 8 000 tiles to a service, and measure three delays: that of the
+    acknowledgements, the age of published tiles, and the time of a small query while other clients
+    send large queries.
+    """
+    found, puts, small, got = _drive_service()
     return [
         Figure(
             "bench.tiles.ack_p99_s", found["p99"], "s, publish to acknowledgement, 8 000 tiles", 1

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -268,24 +268,11 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
     )
 
 
-@pytest.mark.campaign
-def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site) -> None:
-    """Two routers, a service, the live page and an agent must work together, and a client must be
-    able to read the map. They are started by the commands of the systemd units, with new
-    certificates.
-
-    At the end each process receives SIGTERM, as from systemd, and must end within ten seconds.
+@contextmanager
+def running_units(site: Site) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Yield the processes that the commands of the systemd units start, in the order of their
+    start. Those that run after the `with` block are killed.
     """
-    etc = site.root / "etc"
-    enrol = [
-        str(BIN / "fleet-service"),
-        "certs",
-        "--fleet",
-        str(etc / "fleet.json"),
-        "--out",
-        str(etc / "certs"),
-    ]
-    subprocess.run(enrol, check=True, stdout=subprocess.DEVNULL)
     running: list[subprocess.Popen[bytes]] = []
     with ExitStack() as stack:
         for unit, instance in sorted(
@@ -302,6 +289,22 @@ def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site
             )
             running.append(stack.enter_context(process))
             stack.callback(process.kill)
+        yield running
+
+
+@pytest.mark.campaign
+def test_processes_of_the_systemd_units_work_together_and_end_in_time(site: Site) -> None:
+    """Two routers, a service, the live page and an agent must work together, and a client must be
+    able to read the map. They have new certificates.
+
+    At the end each process receives SIGTERM, as from systemd, and must end within ten seconds.
+    """
+    etc = site.root / "etc"
+    options = ["--fleet", str(etc / "fleet.json"), "--out", str(etc / "certs")]
+    subprocess.run(
+        [str(BIN / "fleet-service"), "certs", *options], check=True, stdout=subprocess.DEVNULL
+    )
+    with running_units(site) as running:
 
         def count_rows() -> float:
             lines = fetch_page(f"{site.address}/metrics")[2].splitlines() if is_listening() else []

@@ -20,6 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 from unittest.mock import patch
@@ -117,47 +118,64 @@ def _refuse_writes(*names: str) -> Iterator[None]:
             setattr(os, name, function)
 
 
+@dataclass
+class _Count:
+    """Counts of a run: sent batches of each vehicle, acknowledged batches, times that more batches
+    were acknowledged than stored, times that the service did not continue, and times that the disk
+    was full.
+    """
+
+    seq: int = 0
+    acknowledged: int = 0
+    false_acks: int = 0
+    stuck: int = 0
+    times_full: int = 0
+
+
+def _fill_once(engine: Engine, disk: Path, count: _Count, *, mounted: bool) -> None:
+    """Let the vehicles drive, fill the disk, make room again, and add the results to `count`."""
+    count.acknowledged += _drive(engine, count.seq, 3)
+    count.seq += 3
+    failures = engine.counts.failures["segment"]
+    with fill_disk(disk, mounted):
+        for _ in range(6):
+            count.acknowledged += _drive(engine, count.seq, 1)
+            count.seq += 1
+            if mounted:  # a job may have removed files
+                _fill_up(disk)
+        count.times_full += engine.counts.failures["segment"] > failures
+        count.false_acks += count.acknowledged > _count_rows(disk / "archive")
+    count.acknowledged += _until_settled(engine)
+    count.stuck += engine.settlement.unsettled > 0
+
+
 def run(site: Site) -> list[Figure]:
     """Fill the disk several times, at different stages of the background jobs. Return figures, such
     as rows acknowledged without being stored, and parts that do not continue when the disk has
     space again.
     """
-    false = 0
-    stuck = 0
-    refused = 0
-    room = 0
-    runs = Counter[str]()
-    with small_disk(site.folder / "disk") as mounted:
-        root = site.folder / "disk" / "archive"
+    disk = site.folder / "disk"
+    count = _Count()
+    with small_disk(disk) as mounted:
+        root = disk / "archive"
         with closing(Engine(CONFIG, root)) as engine:
             jobs = archive_jobs(engine, CONFIG, root, SteadyClock().moment)
             with BackgroundJobs(jobs, engine.counts, lambda _: None):
-                acknowledged = 0
-                seq = 0
                 for _ in range(site.choose_amount(10, 3)):
-                    acknowledged += _drive(engine, seq, 3)
-                    seq += 3
-                    failures = engine.counts.failures["segment"]
-                    with fill_disk(site.folder / "disk", mounted):
-                        for _ in range(6):
-                            acknowledged += _drive(engine, seq, 1)
-                            seq += 1
-                            if mounted:  # a job may have removed files
-                                _fill_up(site.folder / "disk")
-                        refused += engine.counts.failures["segment"] > failures
-                        false += acknowledged > _count_rows(root)
-                    acknowledged += _until_settled(engine)
-                    stuck += engine.settlement.unsettled > 0
-                acknowledged += _until_done(engine)
-            runs += engine.counts.runs
-            false += acknowledged > _count_rows(root)
-            room = _room_made(engine, site.folder / "disk") if mounted else 0
-        stuck += not _outbox_recovers(site.folder / "disk", mounted)
-    site.say(f"{'mounted' if mounted else 'injected'}; {acknowledged} acknowledged, {dict(runs)}")
+                    _fill_once(engine, disk, count, mounted=mounted)
+                count.acknowledged += _until_done(engine)
+            runs = Counter(engine.counts.runs)
+            count.false_acks += count.acknowledged > _count_rows(root)
+            room = _room_made(engine, disk) if mounted else 0
+        count.stuck += not _outbox_recovers(disk, mounted)
+    site.say(
+        f"{'mounted' if mounted else 'injected'}; {count.acknowledged} acknowledged, {dict(runs)}"
+    )
+    lacks_acks = count.acknowledged != VEHICLES * count.seq
     return [
-        make_figure("faults.disk.false_acks", false),
-        make_figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
-        make_figure("faults.disk.times_full", refused),
+        make_figure("faults.disk.false_acks", count.false_acks),
+        make_figure("faults.disk.stuck", count.stuck + lacks_acks),
+        make_figure("faults.disk.times_full", count.times_full),
         make_figure("faults.disk.jobs_run", min(runs[job] for job in JOBS)),
         make_figure("faults.disk.room_made", room)
         if mounted

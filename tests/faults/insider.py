@@ -69,27 +69,25 @@ def run(site: Site) -> list[Figure]:
         config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at
     )
     with closing(Engine(config, site.folder / "archive")) as engine:
+        _warm_up(engine, start - NS, random_)
         warm = 0.0
-        for first in range(6):  # warm up: compilation at first use is not damage by the attacker
-            engine.intake.ingest([_make_attack(first, 0, start - NS, random_)], start - NS)
         for second in range(seconds):
             at = float(second)
             now = start + second * NS
             honest = [_make_message(_make_visit(name, second + 1, now, second)) for name in HONEST]
             attack: list[Message] = []
             while True:
-                again = sent % 7 == 6 and bool(queued)
-                one = (
-                    queued[int(random_.integers(len(queued)))]
-                    if again
-                    else _make_attack(sent, second, now, random_)
-                )
+                is_repeated = sent % 7 == 6 and bool(queued)
+                if is_repeated:
+                    one = queued[int(random_.integers(len(queued)))]
+                else:
+                    one = _make_attack(sent, second, now, random_)
                 if not limits.allows(one.key, len(one.payload), one.encoding):
                     break
                 attack.append(one)
                 queued.append(one)
-                sent = sent + 1
-                replayed = replayed + again
+                sent += 1
+                replayed += is_repeated
             began = time.perf_counter()
             engine.intake.ingest(attack + honest, now)
             engine.settlement.flush()
@@ -112,6 +110,14 @@ def run(site: Site) -> list[Figure]:
         make_figure("faults.insider.replayed", replayed),
         make_figure("faults.insider.honest_lost", int(settled < len(HONEST) * seconds)),
     ]
+
+
+def _warm_up(engine: Engine, now: int, random_: np.random.Generator) -> None:
+    """Ingest one message of each kind, because compilation at first use is not damage by the
+    attacker.
+    """
+    for number in range(6):
+        engine.intake.ingest([_make_attack(number, 0, now, random_)], now)
 
 
 def _make_attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:

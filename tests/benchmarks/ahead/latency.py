@@ -92,12 +92,10 @@ def measure_alerts(
     the share of a processor core that each car takes, and the number of alerts without a warning.
     """
     names = [f"car-{k:04d}" for k in range(vehicles)]
-    warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {
-        name: queue.Queue() for name in names
-    }
+    warned: dict[str, queue.Queue[float]] = {name: queue.Queue() for name in names}
 
-    def receive_warning(name: str, warning: GripWarning) -> None:
-        warned[name].put((time.perf_counter(), warning))
+    def receive_warning(name: str, _: GripWarning) -> None:
+        warned[name].put(time.perf_counter())
 
     places = [to_degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
 
@@ -132,21 +130,24 @@ def measure_alerts(
             lookout.set_poses(current_poses())
             put = time.perf_counter()
             service.put(_ice_alert(places[k], raised=True))
-            try:
-                at, _ = warned[names[k]].get(timeout=PATIENCE_S)
+            if (at := _await_warning(warned[names[k]])) is not None:
                 waited.append(at - put)
-            except queue.Empty:
-                lost += 1
             service.put(_ice_alert(places[k], raised=False))
-            try:
-                warned[names[k]].get(timeout=PATIENCE_S)
-            except queue.Empty:
-                lost += 1
+            has_ended = _await_warning(warned[names[k]]) is not None
+            lost += (at is None) + (not has_ended)
         seconds = time.perf_counter() - began
         share = (lookout.counts.busy_s - busy) / max(seconds * vehicles, 1e-9)
         if lookout.counts.looks == looks:
             lost += 1
     return waited, share, lost
+
+
+def _await_warning(warned: queue.Queue[float]) -> float | None:
+    """Return the time of the next warning [s]; None if there is none within PATIENCE_S."""
+    try:
+        return warned.get(timeout=PATIENCE_S)
+    except queue.Empty:
+        return None
 
 
 def _ice_alert(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:

@@ -149,17 +149,6 @@ def simulate_nation(
         sent = _last_line(sender)
         counts = [one.read_metrics() for one in services]
         codes = [one.part.stop() for one in services]
-        archived = sum(one.count_archived() for one in services)
-        size = sum(
-            file.stat().st_size
-            for one in services
-            for file in one.archive.glob("observations/**/*.parquet")
-        )
-        compacted = sum(
-            pq.read_metadata(file).num_rows
-            for one in services
-            for file in one.archive.glob("observations/**/*.parquet")
-        )
     _save_course(folder, looks)
     if any(codes):
         raise RuntimeError(f"services left with {codes}")
@@ -169,6 +158,21 @@ def simulate_nation(
         *found,
         *_make_growth_figures(looks, coefficients),
         *_make_share_figures(looks, int(sent["observations"])),
+        *_make_archive_figures(services, sent, counts),
+    ]
+
+
+def _make_archive_figures(
+    services: Sequence[Service], sent: dict[str, float], counts: list[dict[str, float]]
+) -> list[Figure]:
+    """Return the figures of lost batches and observations, and of the size of the archives, after
+    the services have ended. `sent` is the sender's summary, and `counts` the services' metrics.
+    """
+    archived = sum(one.count_archived() for one in services)
+    files = [file for one in services for file in one.archive.glob("observations/**/*.parquet")]
+    size = sum(file.stat().st_size for file in files)
+    compacted = sum(pq.read_metadata(file).num_rows for file in files)
+    return [
         Figure(
             "country.unacknowledged",
             sent["unacknowledged"],

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_service.client import routing
+from schemas.numeric import FloatArray
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.thresholds import METRES_PER_DEGREE
@@ -55,30 +56,8 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
             ],
         )
     )
-    closed = [{"lat": a, "lon": b} for a, b in middles.tolist()]
-    cases = 0
-    avoided = 0
-    error_s = 0.0
-    longer = list[float]()
-    for _ in range(20 if quick else 60):
-        # The ends lie in the middle of streets. A trip that ends at a crossing would have a last
-        # turn without length.
-        ends = draw.choice(len(town.streets), 2, replace=False).tolist()
-        trip = np.array([town.crossings[list(town.streets[k])].mean(axis=0) for k in ends])
-        request = {"locations": [{"lat": a, "lon": b} for a, b in trip.tolist()], "costing": "auto"}
-        plain = _route(engine, request)
-        if plain is None or not _meets(plain["shape"], middles):
-            continue
-        free = _route(engine, request | {"exclude_locations": closed})
-        if free is None or _meets(free["shape"], middles) or free["time"] > SLOWER * plain["time"]:
-            continue
-        cases += 1
-        found = _route(engine, request | costs)
-        assert found is not None
-        spent = _time(engine, found["shape"])
-        error_s = max(error_s, abs(_time(engine, plain["shape"]) - plain["time"]))
-        longer.append(spent / plain["time"])
-        avoided += not _meets(found["shape"], middles) and spent <= SLOWER * plain["time"]
+    trips = 20 if quick else 60
+    cases, avoided, error_s, longer = _drive_trips(engine, town, middles, costs, draw, trips)
     return [
         Figure(
             "route.avoids_ice",
@@ -100,6 +79,47 @@ def measure_routes(folder: Path, quick: bool) -> list[Figure]:
             "of the quickest route",
         ),
     ]
+
+
+def _drive_trips(
+    engine: routes.Valhalla,
+    town: routes.StreetTown,
+    middles: FloatArray,
+    costs: dict[str, Any],
+    draw: np.random.Generator,
+    trips: int,
+) -> tuple[int, int, float, list[float]]:
+    """Compute the routes of random trips. Return the number of trips whose quickest route meets ice
+    and that have a way round; how many of them avoid the ice with `costs`; the largest error of a
+    route's time [s]; and the time with `costs` relative to the quickest route, for each trip.
+
+    `middles` (n, 2) are the positions [deg] of the ice.
+    """
+    closed = [{"lat": a, "lon": b} for a, b in middles.tolist()]
+    cases = 0
+    avoided = 0
+    error_s = 0.0
+    longer = list[float]()
+    for _ in range(trips):
+        # The ends lie in the middle of streets. A trip that ends at a crossing would have a last
+        # turn without length.
+        ends = draw.choice(len(town.streets), 2, replace=False).tolist()
+        trip = np.array([town.crossings[list(town.streets[k])].mean(axis=0) for k in ends])
+        request = {"locations": [{"lat": a, "lon": b} for a, b in trip.tolist()], "costing": "auto"}
+        plain = _route(engine, request)
+        if plain is None or not _meets(plain["shape"], middles):
+            continue
+        free = _route(engine, request | {"exclude_locations": closed})
+        if free is None or _meets(free["shape"], middles) or free["time"] > SLOWER * plain["time"]:
+            continue
+        cases += 1
+        found = _route(engine, request | costs)
+        assert found is not None
+        spent = _time(engine, found["shape"])
+        error_s = max(error_s, abs(_time(engine, plain["shape"]) - plain["time"]))
+        longer.append(spent / plain["time"])
+        avoided += not _meets(found["shape"], middles) and spent <= SLOWER * plain["time"]
+    return cases, avoided, error_s, longer
 
 
 def _route(engine: routes.Valhalla, request: dict[str, Any]) -> dict[str, Any] | None:

@@ -80,6 +80,21 @@ def count_shown(session: zenoh.Session) -> dict[int, int]:
     return found
 
 
+def files_with_traces(root: Path, pseudonym: str) -> list[Path]:
+    """Return the files of an archive that contain the name GONE or its pseudonym, as text or as a
+    number.
+    """
+    number = int.from_bytes(bytes.fromhex(pseudonym), signed=True)
+    traces = (
+        pseudonym.encode(),
+        GONE.encode(),
+        number.to_bytes(8, "little", signed=True),
+        number.to_bytes(8, "big", signed=True),
+    )
+    files = [path for path in root.rglob("*") if path.is_file()]
+    return [path for path in files if any(one in path.read_bytes() for one in traces)]
+
+
 @pytest.mark.campaign
 def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
@@ -133,20 +148,11 @@ def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
         process.terminate()
         assert process.wait(PATIENCE_S) == 0
     names = Pseudonyms(root / "keys")
-    gone = names.of(GONE, time.time_ns()).encode()
     theirs = sorted(
         names.of(vehicle, time.time_ns()) for vehicle in OTHERS for _ in range(3 * (seq + 1))
     )
     assert pseudonyms_of(root) == theirs, "each acknowledged row of the others once, and no other"
-    files = [path for path in root.rglob("*") if path.is_file()]
-    number = int.from_bytes(bytes.fromhex(gone.decode()), signed=True)
-    traces = (
-        gone,
-        GONE.encode(),
-        number.to_bytes(8, "little", signed=True),
-        number.to_bytes(8, "big", signed=True),
-    )
-    assert [path for path in files if any(one in path.read_bytes() for one in traces)] == []
+    assert files_with_traces(root, names.of(GONE, time.time_ns())) == []
     assert checkpoints.list_checkpoints(root), "what the service began from anew"
     drop_checkpoints(root)
     with closing(Engine(ServiceConfig(), root)) as engine:

@@ -334,30 +334,20 @@ def test_every_option_of_the_command_has_its_effect(
     pq.write_table(pa.table({"cell": [7, 7], "sector": [1, 1], "mu": [0.2, 0.4]}), overlay)
     config.write_text(json.dumps({"zenoh": router.model_dump()}))
     to = ["--connect", router.connect[0]] if way == "connect" else ["--config", str(config)]
-    words = [
-        "--archive",
-        str(archive),
-        "--host",
-        "127.0.0.1",
-        "--port",
-        "0",
-        "--name",
-        "map.example",
-        "--metrics",
-        "http://127.0.0.1:1",
-        "--overlay",
-        str(overlay),
-        "--base-map",
-        "https://t.example/{z}/{x}/{y}.png",
-        "--datex",
-        str(tmp_path / "situations.xml"),
-        "--country",
-        "se",
-        "--supplier",
-        "GripMap test",
-        "--status",
-        "technicalExercise",
-    ]
+    options = {
+        "--archive": archive,
+        "--host": "127.0.0.1",
+        "--port": 0,
+        "--name": "map.example",
+        "--metrics": "http://127.0.0.1:1",
+        "--overlay": overlay,
+        "--base-map": "https://t.example/{z}/{x}/{y}.png",
+        "--datex": tmp_path / "situations.xml",
+        "--country": "se",
+        "--supplier": "GripMap test",
+        "--status": "technicalExercise",
+    }
+    words = [str(word) for option in options.items() for word in option]
     page = Part("page", [sys.executable, "-m", "fleet_service.cli", "page", *words, *to], tmp_path)
     page.start()
     try:
