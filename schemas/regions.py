@@ -21,7 +21,6 @@ from schemas.thresholds import METRES_PER_DEGREE
 # that no cell on the route is missed.
 ROUTE_STEP_M: Final = 4.0
 ROUTE_MOST_M: Final = 500_000.0
-EVERYWHERE: Final = "*/*/*"
 # Zoom of the region that an expression of one, two or three chunks denotes.
 _ZOOMS: Final = (4, 7, grid.REGION_ZOOM)
 

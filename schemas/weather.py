@@ -1,5 +1,4 @@
-"""Road weather reports: validation rules, and encoding as bytes. An unknown temperature or
-precipitation is NaN.
+"""Road weather reports: decoding and validation. An unknown temperature or precipitation is NaN.
 
 A report applies to a region (grid square of zoom 10) from a time on. Each value is optional, but at
 least one must be given.
@@ -40,13 +39,6 @@ class Report:
     road_temperature: float = np.nan
     precipitation: float = np.nan
     prior: NDArray[np.float64] | None = None
-
-
-def encode_report(report: Report) -> bytes:
-    """Return the protobuf bytes of a weather report."""
-    known = {name: getattr(report, name) for name in RANGES if not np.isnan(getattr(report, name))}
-    prior = [] if report.prior is None else np.asarray(report.prior).tolist()
-    return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()
 
 
 def decode_report(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:

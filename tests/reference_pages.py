@@ -39,7 +39,7 @@ SETTINGS: Final[dict[str, type[BaseModel]]] = {
     "fleet-service": ServiceConfig,
 }
 TABLES: Final = {
-    "Signal log": tables.SIGNAL_LOG,
+    "Signal log": (*tables.SIGNAL_LOG, *tables.SIGNAL_LOG_CONTEXT),
     "Estimates": tables.ESTIMATES,
     "Observation, as reported": tables.OBSERVATION,
     "State, as reported": tables.STATE,

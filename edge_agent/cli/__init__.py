@@ -18,7 +18,6 @@ from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 FAILED: Final = commandline.FAILED
-BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "fleet")  # commands that run for hours
 
 COMMANDS: Final = (

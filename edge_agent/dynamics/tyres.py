@@ -35,19 +35,6 @@ def magic_formula(theta: float, c: float, e: float) -> float:
 
 
 @compiled
-def magic_formula_inverse(rho: float, c: float) -> float:
-    """Return the normalised slip `theta` on the rising branch of the Magic Formula with shape `c`
-    where the force over its largest value is `rho`: magic_formula(theta, c, 0) = rho. The result is
-    infinite at and beyond the peak, |rho| >= 1.
-    """
-    if rho >= 1.0:
-        return math.inf
-    if rho <= -1.0:
-        return -math.inf
-    return c * math.tan(math.asin(rho) / c)
-
-
-@compiled
 def brush(theta: float) -> float:
     """Return the tyre force over its largest value by the brush model with parabolic pressure, at
     the normalised slip theta: theta - theta|theta|/3 + theta^3/27 up to theta = 3, then 1. The

@@ -18,7 +18,6 @@ from fleet_service.app import UNUSED
 from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
-BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "watch", "page", "cits", "router")  # commands that run until a signal arrives
 
 COMMANDS: Final = (

@@ -36,7 +36,6 @@ FREEZING_C: Final = -1.0
 CARS = 60
 CURVES = 20
 WET = 0.60
-GENTLE = 0.30
 WINTER: Final = agent.CLEAN._replace(share=(0.25, 0.35), low=0.65, tyres=-0.05, usual_share=1.0)
 # Share of these passes that look like values; with common tyres it is a tenth to a third.
 VALUED: Final = 0.3

@@ -42,10 +42,11 @@ from fleet_service.replay import checkpoints
 from schemas import grid, keys, tables, wire
 from schemas.config import LEAST_RAW_DAYS, ServiceConfig
 from schemas.errors import InputError
-from schemas.weather import Report, encode_report
+from schemas.weather import Report
 from schemas.wire import Kind
 from tests.faults.crash_lives import Lives
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, SECOND, batch, key
+from tests.schemas.examples import encode_weather
 
 STEPS: Final = 14
 START: Final = 1_698_500_000 * SECOND  # 2023-10-28: months end within the histories
@@ -243,7 +244,7 @@ class ServiceHistory(Lives[Sent]):
         failures = engine.counts.failures["weather"]
         engine.intake.weather.enqueue(
             weather.WeatherMessage(
-                keys.weather_key(REGION), encode_report(report), wire.WEATHER_ENCODING
+                keys.weather_key(REGION), encode_weather(report), wire.WEATHER_ENCODING
             )
         )
         engine.intake.update_weather(self._now)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import grid, wire
+from schemas import grid, weather, wire
+from schemas.proto import gripmap_pb2 as pb
 from schemas.wire import Alert, Batch, Kind, StreamAck
 
 DATA = Path(__file__).parent / "data"
@@ -25,6 +26,14 @@ LATER = (
     "wiper",
     "p_slippery",
 )
+
+
+def encode_weather(report: weather.Report) -> bytes:
+    """Return the protobuf bytes of a weather report."""
+    values = {name: getattr(report, name) for name in weather.RANGES}
+    known = {name: value for name, value in values.items() if not np.isnan(value)}
+    prior = [] if report.prior is None else np.asarray(report.prior).tolist()
+    return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:

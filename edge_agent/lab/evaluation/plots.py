@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 SCENARIOS: Final = {**PAPERS, **OTHERS, **VEHICLES}
 DPI: Final = 110  # resolution of PNG files: 1000 points wide; SVG and PDF are for print
 NEARLY_ALIKE: Final = 0.02  # a smaller range of friction is shown as one value
-FORMS: Final = ("png", "svg", "pdf")
 
 
 def draw(
@@ -42,7 +41,7 @@ def draw(
     """Draw all plots and write them into `folder`; return the paths of the files.
 
     `seed` is the seed of the displayed drive, which the titles state. `form` is the file format,
-    one of FORMS.
+    png, svg or pdf.
     """
     import matplotlib as mpl
 

@@ -39,7 +39,6 @@ from schemas.runtime.figures import Figure
 ANTS: Final = 10
 ITERATIONS: Final = 12
 POSITIONS: Final = 7  # positions per vertex of the graph
-LEAST_SEEDS: Final = 15
 GIVEN: Final = {"fixed": Memberships(outputs=(0.0,) * SETS), "untuned": Memberships()}
 PAIRS: Final = (
     ("colony", "untuned"),

@@ -50,14 +50,6 @@ def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
     assert dugoff(3.0) == pytest.approx(1.0 - 1.0 / 12.0)
 
 
-def test_inverse_curve_inverts_the_curve_up_to_its_peak() -> None:
-    for rho in (-0.95, -0.2, 0.0, 0.5, 0.99):
-        assert tyres.magic_formula(
-            tyres.magic_formula_inverse(rho, 1.4), 1.4, 0.0
-        ) == pytest.approx(rho, abs=1e-12)
-    assert tyres.magic_formula_inverse(1.0, 1.4) == math.inf
-
-
 def test_slip_stiffness_does_not_depend_on_friction() -> None:
     icy = tyres.combined_magic((1e-6, 2e-6), (6e4, 5e4), 0.1, 3000.0, 1.4, 0.0)
     dry = tyres.combined_magic((1e-6, 2e-6), (6e4, 5e4), 1.0, 3000.0, 1.4, 0.0)

@@ -42,6 +42,7 @@ from schemas.config import ServiceConfig
 from schemas.wire import Batch, Kind
 from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.examples import SECOND, batch
+from tests.schemas.examples import encode_weather
 
 DATA: Final = Path(__file__).parent / "data"
 MIDNIGHT: Final = 20_001 * 86_400 * SECOND
@@ -143,7 +144,7 @@ def make(root: Path) -> dict[str, Any]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if turn == 2:
-                report = weather.encode_report(
+                report = encode_weather(
                     weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0)
                 )
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))

@@ -44,13 +44,14 @@ from schemas.wire import Kind
 from tests.fleet_service.checkpoint_writer import save_checkpoint
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import REGION, SECOND, batch, key
+from tests.schemas.examples import encode_weather
 from tests.waiting import matched, until
 
 
 def test_weather_report_round_trips_and_missing_values_are_unknown() -> None:
     prior = np.full(mugrid.BINS, 1.0 / mugrid.BINS)
     got = weather.decode_report(
-        weather.encode_report(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))
+        encode_weather(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior))
     )
     assert (got.time, got.road_temperature, got.precipitation) == (17, -2.5, 0.25)
     assert np.isnan(got.air_temperature)
@@ -75,7 +76,7 @@ def test_weather_report_round_trips_and_missing_values_are_unknown() -> None:
 )
 def test_a_report_that_breaks_a_rule_is_refused_by_name(report: Report, field: str) -> None:
     with pytest.raises(WireError, match=f"^{field}: .*; "):
-        weather.decode_report(weather.encode_report(report))
+        weather.decode_report(encode_weather(report))
 
 
 def file(path: Path, **columns: object) -> Path:
@@ -148,7 +149,7 @@ def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> 
     config = ServiceConfig(weather=path)
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
-    payload = weather.encode_report(
+    payload = encode_weather(
         Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0)
     )
     engine.intake.weather.enqueue(
@@ -180,7 +181,7 @@ def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -
     root = tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):
-            payload = weather.encode_report(
+            payload = encode_weather(
                 Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2))
             )
             engine.intake.weather.enqueue(
@@ -216,7 +217,7 @@ def test_weather_that_no_longer_matters_is_not_loaded_or_kept(tmp_path: Path) ->
     recent = (now // SECOND - 7200) * SECOND
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq, begin in enumerate((old, recent), 1):
-            payload = weather.encode_report(Report(begin, road_temperature=-1.0))
+            payload = encode_weather(Report(begin, road_temperature=-1.0))
             engine.intake.weather.enqueue(
                 WeatherMessage(keys.weather_key(REGION), payload, wire.WEATHER_ENCODING)
             )
@@ -243,12 +244,10 @@ def test_a_running_service_takes_weather_over_its_key(
     matched(publisher)
     publisher.put(bytes(wire.MAX_BYTES + 1), encoding=wire.WEATHER_ENCODING)
     publisher.put(
-        weather.encode_report(Report(time.time_ns(), precipitation=2.0)),
+        encode_weather(Report(time.time_ns(), precipitation=2.0)),
         encoding=wire.WEATHER_ENCODING,
     )
-    publisher.put(
-        weather.encode_report(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING
-    )
+    publisher.put(encode_weather(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     counts = service.service.engine.counts
     until(lambda: counts.weather == 1 and counts.refused["weather"] == 2)
     publisher.undeclare()
@@ -261,7 +260,7 @@ def test_inbox_keeps_a_limited_number_of_reports_the_newest(tmp_path: Path) -> N
     many = WAITING + 50
     key = keys.weather_key(REGION)
     for k in range(many):
-        payload = weather.encode_report(Report(now + k * 1000, precipitation=2.0))
+        payload = encode_weather(Report(now + k * 1000, precipitation=2.0))
         inbox.enqueue(WeatherMessage(key, payload, wire.WEATHER_ENCODING))
     taken = inbox.take(now)
     assert taken is not None

@@ -18,6 +18,7 @@ from fleet_service.ingest.weather import archived_reports as archived_weather
 from schemas import keys, weather, wire
 from tests.buckets import BucketServer
 from tests.fleet_service.replication.test_lease import Machine
+from tests.schemas.examples import encode_weather
 from tests.standbys import restore_archive
 
 
@@ -35,7 +36,7 @@ def test_late_uploads_of_a_former_lease_holder_overwrite_nothing(
 
     def hears(one: Machine, region: int) -> None:
         inbox = WeatherInbox(one.root, one.config.name, fusion, ServiceCounts())
-        report = weather.encode_report(weather.Report(time.time_ns(), precipitation=1.0))
+        report = encode_weather(weather.Report(time.time_ns(), precipitation=1.0))
         inbox.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
         assert inbox.take(time.time_ns()) is not None
 

@@ -30,7 +30,7 @@ def test_progress_is_shown_while_the_drawing_library_still_loads(
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)
     monkeypatch.setattr(progress_messages, "TICK_S", 0.01)
-    monkeypatch.setattr(progress_messages, "_load_drawing", loaded.wait)
+    monkeypatch.setattr(progress_messages, "_import_spinner", loaded.wait)
     progress_messages.enable_messages()
     try:
         with progress_messages.show_status("replay"):

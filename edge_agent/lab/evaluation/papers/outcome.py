@@ -13,7 +13,6 @@ from schemas.runtime.figures import Figure
 COLUMNS: Final = ("printed", "matched", "own plant", "realistic sensors", "default estimator")
 NONE: Final = math.nan  # value of a cell that does not exist
 Values = dict[str, float]  # measure -> value
-Table = dict[str, Values]  # column -> measures
 
 
 class PaperRow(NamedTuple):
