@@ -357,9 +357,8 @@ def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
     token = ground.honest.session.liveliness().declare_token(keys.alive_key(HONEST))
     asked = f"{keys.ROOT}/alive/*"
     until(lambda: any(reply.ok for reply in ground.monitor.session.liveliness().get(asked)))
-    is_visible = any(
-        reply.ok for reply in ground.open_session(ROGUE, ROUTERS[1]).liveliness().get(asked)
-    )
+    rogue = ground.open_session(ROGUE, ROUTERS[1])
+    is_visible = any(reply.ok for reply in rogue.liveliness().get(asked))
     token.undeclare()
     return is_visible
 
@@ -390,9 +389,7 @@ def as_router(ground: Ground, mode: str) -> bool:
         received = json.loads(process.stdout.readline())
     ground.await_effects(ground.honest.session)
     own = set(task["put"])  # a client also receives its own messages
-    overheard = [
-        name for name in received if not name.startswith(f"{keys.ROOT}/map/") and name not in own
-    ]
+    overheard = [name for name in received if "/map/" not in name and name not in own]
     return (
         bool(overheard)
         or received.count(key(HONEST)) > 1
