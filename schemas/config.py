@@ -298,7 +298,7 @@ def parse_moment(text: str, field: str) -> int:
         InputError: `text` is not a time, or lies outside the range of 64-bit nanoseconds.
     """
     try:
-        found = nanoseconds(datetime.fromisoformat(text))
+        found = to_nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
         raise InputError(
             field, f"{text[:60]!r} is not a time", "write it like 2026-01-31T07:00:00Z"
@@ -310,7 +310,7 @@ def parse_moment(text: str, field: str) -> int:
     return found
 
 
-def nanoseconds(time: datetime) -> int:
+def to_nanoseconds(time: datetime) -> int:
     """Return a datetime as ns since 1970, without rounding; a datetime without a zone is UTC."""
     since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - _EPOCH
     return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000

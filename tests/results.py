@@ -144,7 +144,7 @@ class Table(NamedTuple):
 
 
 def _render_study(values: dict[str, float]) -> str:
-    return study_report.markdown(
+    return study_report.results_table(
         [Figure(name, value, "") for name, value in values.items()]
     ).rstrip()
 
@@ -178,7 +178,7 @@ TABLES: Final = (
         "edge",
         "The papers' figures: printed, of our implementation, with realistic sensors, and of the "
         "default estimator with realistic sensors",
-        re.compile(f"({'|'.join(map(re.escape, printed.names()))})$"),
+        re.compile(f"({'|'.join(map(re.escape, printed.compared_names()))})$"),
         report.paper_table,
     ),
     Table(

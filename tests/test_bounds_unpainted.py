@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics import output, synthetic
-from fleet_service.analytics.plots import paint
+from fleet_service.analytics.plots import paint_cells
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.archive.format import readme, snapshots
 from fleet_service.archive.maintenance import rollup
@@ -164,7 +164,7 @@ def test_unmeasured_cells_are_hatched_in_a_picture() -> None:
 
     axes = Figure().subplots()
     shapes = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]] * 3)
-    colours = paint(axes, shapes, np.array([0.2, np.nan, np.nan]))
+    colours = paint_cells(axes, shapes, np.array([0.2, np.nan, np.nan]))
     hatched = next(one for one in axes.collections if one is not colours)
     assert len(colours.get_paths()) == 1
     assert len(hatched.get_paths()) == 2

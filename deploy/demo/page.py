@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deploy.demo.compare import MapComparison
-from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render_page
 from schemas import grid
 from schemas.runtime.figures import Figure, format_row
 
@@ -50,7 +50,9 @@ def write_page(comparison: MapComparison, figures: list[Figure], path: Path) -> 
     )
     table = [["figure", "value", "bar", ""], *(format_row(figure) for figure in figures)]
     path.write_text(
-        render("GripMap: the map next to the truth", drawn, GRIP_SCALE, about=about, table=table)
+        render_page(
+            "GripMap: the map next to the truth", drawn, GRIP_SCALE, about=about, table=table
+        )
     )
 
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from deploy.demo.compare import LostGrip, MapComparison
-from fleet_service.analytics.plots import MU, cell_shapes, paint
+from fleet_service.analytics.plots import MU, cell_shapes, paint_cells
 from schemas.numeric import IntArray
 from schemas.runtime.palette import SURFACES, UNKNOWN
 
@@ -29,9 +29,9 @@ def draw_maps(comparison: MapComparison, path: Path, grip: LostGrip | None = Non
     upper = cells["mu_upper"].to_numpy()
     figure = Figure(figsize=(17, 5.4), layout="constrained")
     truth, found, width = figure.subplots(1, 3, sharex=True, sharey=True)
-    paint(truth, shapes, comparison.truth)
-    colours = paint(found, shapes, comparison.values)
-    wide = paint(width, shapes, upper - lower, (0.0, 1.1))
+    paint_cells(truth, shapes, comparison.truth)
+    colours = paint_cells(found, shapes, comparison.values)
+    wide = paint_cells(width, shapes, upper - lower, (0.0, 1.1))
     truth.set_title("truth")
     if grip is not None and len(grip.cell):
         _mark_passes(truth, grip, cells["cell"].to_numpy())

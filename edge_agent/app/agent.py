@@ -40,7 +40,7 @@ from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from schemas.config import AgentConfig
 from schemas.runtime import progress_messages
-from schemas.runtime.logs import event_logger, log_warnings, print_line, values
+from schemas.runtime.logs import event_logger, json_values, log_warnings, print_line
 from schemas.runtime.metrics import Metric, serve_metrics
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
@@ -176,7 +176,7 @@ class Agent:
         events.info(
             f"{label}: driving; a line of counts every {STATUS_EVERY_S:.0f} s; records wait in "
             f"{publisher.status.outbox_path} until they are acknowledged",
-            extra=values(
+            extra=json_values(
                 event="ready", vehicles=len(options.names), outbox=str(publisher.status.outbox_path)
             ),
         )

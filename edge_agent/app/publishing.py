@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from schemas.config import AgentConfig
 from schemas.errors import InputError
-from schemas.runtime.logs import print_line, values
+from schemas.runtime.logs import json_values, print_line
 
 if TYPE_CHECKING:
     import zenoh
@@ -146,4 +146,4 @@ def print_status(progress: Progress, publisher: Publisher, events: logging.Logge
         f"{sum(counts.published.values())} records published, {sum(counts.acknowledged.values())} "
         f"acknowledged, {publisher.count_unsettled()} unsettled{late}"
     )
-    events.info(text, extra=values(event="status", **final_counts(progress, publisher)))
+    events.info(text, extra=json_values(event="status", **final_counts(progress, publisher)))

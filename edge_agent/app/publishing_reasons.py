@@ -12,7 +12,7 @@ import numpy as np
 
 from edge_agent.inputs.block import Block
 from edge_agent.publish.ack_settlement import Counts
-from schemas.runtime.logs import values
+from schemas.runtime.logs import json_values
 from schemas.signals import S
 
 # [s] time from the first block to the first check. Meanwhile a session opens and a receiver finds
@@ -177,4 +177,4 @@ class ReasonReporter:
         self._last_printed = without_numbers
         text = f"not published: {'; '.join(found)}" if found else "publishing: records are sent"
         event = "unpublished" if found else "publishing"
-        self._events.info(text, extra=values(event=event, reasons=found))
+        self._events.info(text, extra=json_values(event=event, reasons=found))

@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
-    from edge_agent.lab.evaluation.bars import figures as figures_of
+    from edge_agent.lab.evaluation.bars import evaluation_figures as figures_of
     from edge_agent.lab.evaluation.campaign import run_campaign
     from edge_agent.lab.evaluation.report import evaluation_report
     from edge_agent.lab.seeds import FIGURES
@@ -124,22 +124,22 @@ def _evaluate_estimators(args: argparse.Namespace, count: int) -> int:
     text = evaluation_report(figures, seeds=count)
     (args.out / "report.md").write_text(text, encoding="utf-8")
     if not args.no_plots:
-        from edge_agent.lab.evaluation.plots import draw
+        from edge_agent.lab.evaluation.plots import draw_plots
 
-        draw(results, figures, args.out, seed=seeds[0], form=args.plots)
+        draw_plots(results, figures, args.out, seed=seeds[0], form=args.plots)
     print(text.partition("## The papers' figures")[0].rstrip())
     return 0 if _all_hold(figures) else 1
 
 
 def _evaluate_paper(args: argparse.Namespace, count: int) -> int:
-    from edge_agent.lab.evaluation.papers.page import markdown_tables, summary
+    from edge_agent.lab.evaluation.papers.page import markdown_tables, summary_sentence
     from edge_agent.lab.evaluation.papers.reproductions import write_paper
     from edge_agent.lab.seeds import FIGURES
 
     done = write_paper(
         args.paper, range(FIGURES, FIGURES + count), args.out, plots=not args.no_plots
     )
-    print(f"{markdown_tables(done.tables)}\n\n{summary(done)}")
+    print(f"{markdown_tables(done.tables)}\n\n{summary_sentence(done)}")
     return 1 if done.missed_rows else 0
 
 
@@ -165,7 +165,7 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
     from schemas.runtime.figures import format_table, write_figures
 
     seeds = range(FIGURES, FIGURES + count)
-    scores = worth.campaign(seeds, quick=args.quick, log_line=_print_progress)
+    scores = worth.compare_variants(seeds, quick=args.quick, log_line=_print_progress)
     figures = worth.barred_figures(scores)
     part = " --quick" if args.quick else ""
     measured = list(seeds)[: len(scores["fuzzy"]["all"])]
@@ -182,13 +182,13 @@ def _evaluate_worth(args: argparse.Namespace, count: int) -> int:
 
 
 def _evaluate_real_logs(args: argparse.Namespace) -> int:
-    from edge_agent.lab.evaluation.real_logs import judge_folder, summarise, table
+    from edge_agent.lab.evaluation.real_logs import judge_folder, results_table, summary_figures
     from schemas.runtime.figures import format_table, write_figures
 
     found = judge_folder(args.logs, _print_progress)
-    figures = summarise(found)
+    figures = summary_figures(found)
     write_figures(args.out / "figures.json", "edge-agent evaluate --only real", [], figures)
-    text = f"# Real cars\n\n{table(found)}\n\n{format_table(figures)}\n"
+    text = f"# Real cars\n\n{results_table(found)}\n\n{format_table(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if _all_hold(figures) else 1
@@ -196,13 +196,13 @@ def _evaluate_real_logs(args: argparse.Namespace) -> int:
 
 def _evaluate_detection(args: argparse.Namespace, count: int) -> int:
     from edge_agent.lab.evaluation.detection_bars import detection_figures
-    from edge_agent.lab.evaluation.detection_campaign import campaign
+    from edge_agent.lab.evaluation.detection_campaign import run_detection_campaign
     from edge_agent.lab.evaluation.report import detection_report
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write_figures
 
     seeds = range(FIGURES, FIGURES + count)
-    results = campaign(seeds, _timed_printer(), quick=args.quick)
+    results = run_detection_campaign(seeds, _timed_printer(), quick=args.quick)
     figures = detection_figures(results)
     part = " --quick" if args.quick else ""
     write_figures(

@@ -17,7 +17,7 @@ from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
 from schemas.runtime import progress_messages
-from schemas.runtime.logs import event_logger, values
+from schemas.runtime.logs import event_logger, json_values
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
@@ -117,7 +117,7 @@ def make_warning_printer(config: AgentConfig) -> Callable[[str, GripWarning], No
         }
         events.info(
             f"{vehicle}: {warning.line()}",
-            extra=values(event="warning", vehicle=vehicle, at=warning.time, **parts),
+            extra=json_values(event="warning", vehicle=vehicle, at=warning.time, **parts),
         )
 
     return print_warning

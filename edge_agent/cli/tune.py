@@ -38,7 +38,7 @@ from edge_agent.lab.tuning.objectives import (
     OBJECTIVES,
     TuningScores,
     TuningSet,
-    choices,
+    candidate_values,
     detection_cost,
     objective_on,
     record_all,
@@ -278,14 +278,16 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         duration_s=QUICK_DURATION_S if args.quick else STUDY_DURATION_S,
         reporter=lambda way: progress_printer(way, iterations, time.monotonic, print_flushed),
     )
-    listed = study_report.figures(done)
+    listed = study_report.study_figures(done)
     title = "edge-agent tune --study" + " --quick" * args.quick
     figures.write_figures(args.study / "figures.json", title, list(seeds), listed)
-    text = study_report.markdown(listed)
+    text = study_report.results_table(listed)
     (args.study / "study.md").write_text(text, encoding="utf-8")
-    study_report.draw(listed, ants, args.study / "convergence.png")
+    study_report.draw_convergence(listed, ants, args.study / "convergence.png")
     names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
-    scores = {way: SplitScores(**study_report.scores(done, name)) for way, name in names.items()}
+    scores = {
+        way: SplitScores(**study_report.stored_scores(done, name)) for way, name in names.items()
+    }
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     )
@@ -307,7 +309,7 @@ def _run_searches(objective: Objective, ants: int, iterations: int, seed: int) -
     have the same start vector, candidate values and budget. Return the result of each search by its
     name, "random" or "colony".
     """
-    problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
+    problem = Problem(objective, candidate_values(POSITIONS), Memberships().to_vector())
     return {
         way: run_search(
             way,

@@ -51,7 +51,7 @@ def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
     ):
         question = QUESTIONS[name]
         answers[name] = question.ask(engine, Options(at=middle))
-        output.write(answers[name], question, folder / f"{name}.{ending}")
+        output.write_file(answers[name], question, folder / f"{name}.{ending}")
         print(
             f"\n{name}: {question.about}\n{output.format_text(answers[name].slice(0, 5), question)}"
         )

@@ -79,4 +79,4 @@ def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
     """Write an answer to a file; the ending selects the format: .parquet, .geo.parquet, .geojson,
     .csv, .png, .svg, .pdf, .html.
     """
-    output.write(table, question_of(question), Path(path))
+    output.write_file(table, question_of(question), Path(path))

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, Scale, Value, render
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, Scale, Value, render_page
 from fleet_service.analytics.questions import Question
 from fleet_service.archive.export import extract
 from fleet_service.archive.format import geo
@@ -105,7 +105,7 @@ def _cell_text(name: str, value: object) -> str:
     return str(value)
 
 
-def write(table: pa.Table, question: Question, path: Path) -> None:
+def write_file(table: pa.Table, question: Question, path: Path) -> None:
     """Write an answer to a file; the ending of its name selects the format.
 
     Raises:
@@ -118,16 +118,16 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
             with open_durably(path) as file:
                 pq.write_table(table, file, compression="zstd")
         elif path.suffix in PLOTS:
-            plot(table, question, path)
+            write_plot(table, question, path)
         elif path.suffix == ".html":
             with open_durably(path) as file:
                 file.write(make_page(table, question).encode())
         elif path.name.endswith(".geo.parquet"):
-            extract.write(add_geometry(table, question), path)
+            extract.write_extract(add_geometry(table, question), path)
         elif path.suffix == ".geojson":
-            extract.write(add_geometry(times_as_timestamps(table), question), path)
+            extract.write_extract(add_geometry(times_as_timestamps(table), question), path)
         else:
-            extract.write(times_as_timestamps(add_places(table)), path)
+            extract.write_extract(times_as_timestamps(add_places(table)), path)
 
 
 def times_as_timestamps(table: pa.Table) -> pa.Table:
@@ -179,19 +179,19 @@ def _row_cells(table: pa.Table) -> list[list[int]]:
     return found
 
 
-def plot(table: pa.Table, question: Question, path: Path) -> None:
+def write_plot(table: pa.Table, question: Question, path: Path) -> None:
     """Write the answer to a question as an image with a plot.
 
     Raises:
         InputError: matplotlib is not installed.
     """
     try:
-        from fleet_service.analytics.plots import draw
+        from fleet_service.analytics.plots import draw_answer
     except ImportError as error:
         raise InputError(
             "out", "matplotlib is not installed", install_command("analytics")
         ) from error
-    draw(table, question.name, question.about, path)
+    draw_answer(table, question.name, question.about, path)
 
 
 def make_page(table: pa.Table, question: Question) -> str:
@@ -233,7 +233,7 @@ def make_page(table: pa.Table, question: Question) -> str:
         boxes, sector, {"": values}, names, rows, part, known or [""], frame, lasting
     )
     about = f"{rest:,} more rows are not drawn: choose a smaller box or fewer days." if rest else ""
-    return render(question.about, drawn, _colour_scale(question, values), about=about)
+    return render_page(question.about, drawn, _colour_scale(question, values), about=about)
 
 
 def _colour_scale(question: Question, values: list[Value]) -> Scale:

@@ -73,7 +73,7 @@ class DrawnCells:
     lasting: Sequence[bool] | None = None
 
 
-def render(
+def render_page(
     title: str,
     cells: DrawnCells,
     scale: Scale,

@@ -35,7 +35,7 @@ _LIGHT = GRIP[8]
 _MARK = "#d0006f"
 
 
-def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
+def draw_answer(table: pa.Table, name: str, about: str, path: Path) -> None:
     """Draw the answer to a question as a plot, and write it in the format of the path's ending
     (png, svg, pdf). The plot's title consists of `name` and `about`, the question's name and
     description.
@@ -63,7 +63,7 @@ def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
     )
 
 
-def paint(
+def paint_cells(
     axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
 ) -> PolyCollection:
     """Draw shapes of map cells in colours that show their friction. Shapes without a value are
@@ -133,7 +133,7 @@ def _draw_worst(figure: Figure, table: pa.Table) -> None:
     for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
         cells = np.array(one["members"], np.int64)
         # Paint whole squares, because all cells of a stretch have the same heading.
-        patches = paint(axes, cell_shapes(cells), np.full(len(cells), one["mu"]))
+        patches = paint_cells(axes, cell_shapes(cells), np.full(len(cells), one["mu"]))
         axes.set_title(
             f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} "
             f"{ARROWS[one['sector']]}\n"
@@ -347,7 +347,9 @@ def _draw_replay(figure: Figure, table: pa.Table) -> None:
         frame = frame[near]
     shapes = cell_shapes(cell[near], table["sector"].to_numpy().astype(np.int64))
     for axes, time in zip(panels, times.tolist(), strict=False):
-        patches = paint(axes, shapes[frame == time], _float_column(table, "mu")[frame == time])
+        patches = paint_cells(
+            axes, shapes[frame == time], _float_column(table, "mu")[frame == time]
+        )
         axes.set_title(f"{np.datetime64(time, 'us').astype('datetime64[s]')} UTC", fontsize=9)
     figure.colorbar(patches, ax=panels, label=f"{MU}; hatched: {UNKNOWN}", shrink=0.8)
 

@@ -15,7 +15,7 @@ from fleet_service.app.historical_maps import HistoricalMaps, PastQuery
 from fleet_service.app.state import SharedState
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer_query, bound_answer_size
-from schemas.config import ServiceConfig, nanoseconds
+from schemas.config import ServiceConfig, to_nanoseconds
 from schemas.errors import InputError
 from schemas.query import MapQuery
 from schemas.tables import MAP_SCHEMA
@@ -94,7 +94,7 @@ class Queries:
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
             return answer_query(self._shared.tiles, query, is_requested, now, only)
-        at = nanoseconds(query.at)
+        at = to_nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time in the past")
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)

@@ -9,7 +9,7 @@ from typing import Final
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Inbox
-from schemas.runtime.logs import values
+from schemas.runtime.logs import json_values
 from schemas.wire import Kind
 
 STATUS_S: Final = 5.0
@@ -63,5 +63,5 @@ class StatusLine:
         )
         cells = self._engine.state.fusion.size
         self._events.info(
-            text, extra=values(cells=cells, queue=len(self._inbox), counts=counts.as_dict())
+            text, extra=json_values(cells=cells, queue=len(self._inbox), counts=counts.as_dict())
         )

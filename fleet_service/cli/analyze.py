@@ -183,7 +183,7 @@ def _output_answer(found: pa.Table, question: Question, arguments: argparse.Name
         else output.format_text(found, question, is_written=is_written)
     )
     if is_written:
-        output.write(found, question, arguments.out)
+        output.write_file(found, question, arguments.out)
         _print_progress(f"written: {arguments.out}")
 
 

@@ -122,7 +122,7 @@ def add_dry_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
-def confirm(arguments: argparse.Namespace, what: str) -> bool:
+def confirm_deletion(arguments: argparse.Namespace, what: str) -> bool:
     """Ask the user to confirm the deletion that `what` describes; return True if the user agrees,
     or if there is no terminal to ask on.
     """

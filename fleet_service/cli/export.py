@@ -132,13 +132,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _register_iceberg(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register
+    from fleet_service.archive.maintenance.iceberg import NAMESPACE, Place, register_files
 
     root = arguments.archive.resolve()
     # Readers of Iceberg do not decode percent signs, so that `root.as_uri()` would name no file.
     at = arguments.at or f"file://{root}"
     place = Place(arguments.catalog, arguments.namespace or NAMESPACE, at)
-    done = register(root, place)
+    done = register_files(root, place)
     line = (
         f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in "
         f"{place.catalog}"
@@ -220,7 +220,7 @@ def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
             as_of = _format_time(extract.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
         table = extract.with_vehicles(table, arguments.min_vehicles)
-    extract.write(table, arguments.out)
+    extract.write_extract(table, arguments.out)
     line = f"{table.num_rows} rows in {arguments.out}" + (
         f": the map as of {as_of}" if as_of else ""
     )

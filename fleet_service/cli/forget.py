@@ -12,7 +12,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirm, on_archive
+from fleet_service.cli.common import (
+    ArchiveReport,
+    add_archive,
+    add_dry_run,
+    confirm_deletion,
+    on_archive,
+)
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
@@ -65,7 +71,7 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     )
     if arguments.dry_run:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
-    if not confirm(arguments, what):
+    if not confirm_deletion(arguments, what):
         return ArchiveReport("nothing removed", {"rows": 0, "key": False})
     done = _erase_or_request(root, Erasure(month, vehicle), arguments.config)
     copy_notice = (

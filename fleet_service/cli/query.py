@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         from fleet_service.archive.export import extract
         from fleet_service.archive.format import geo
 
-        extract.write(geo.with_cells(answer.table), arguments.out)
+        extract.write_extract(geo.with_cells(answer.table), arguments.out)
     else:
         map_client.write_answer(answer, arguments.out)
     if answer.gap_description is not None:

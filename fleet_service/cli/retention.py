@@ -5,7 +5,13 @@ from __future__ import annotations
 import argparse
 from datetime import UTC, datetime
 
-from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirm, on_archive
+from fleet_service.cli.common import (
+    ArchiveReport,
+    add_archive,
+    add_dry_run,
+    confirm_deletion,
+    on_archive,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +40,9 @@ def _retire_rows(arguments: argparse.Namespace) -> ArchiveReport:
     what = f"raw rows of {len(folders)} days"
     if arguments.dry_run:
         return ArchiveReport(f"{what} would be removed", {"days": len(folders), "files": 0})
-    if folders and not confirm(arguments, f"{what} are removed, {folders[0].name} the first"):
+    if folders and not confirm_deletion(
+        arguments, f"{what} are removed, {folders[0].name} the first"
+    ):
         return ArchiveReport("nothing removed", {"days": 0, "files": 0})
     done = retire_rows(arguments.archive, arguments.raw_days, today)
     line = f"raw rows of {done.days} days removed, {done.files} files; their roll-ups stay"

@@ -33,7 +33,7 @@ from schemas.wire.batches import (
     Decoded,
     Heads,
     PresentColumns,
-    complete,
+    complete_batches,
     message_of,
 )
 
@@ -62,7 +62,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
         data, walked = _scan_messages(kind, [plain[index] for index in indices], strict=False)
         assert walked.understood.all(), "the protobuf library writes what we do not read"
     fields = _Fields(kind, data, walked)
-    return complete(
+    return complete_batches(
         Decoded(indices, fields.heads(), *fields.columns(), errors), fields.present_columns()
     )
 

@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.format.files import SEGMENT, write_table
 from fleet_service.archive.format.layout import DAY_NS, read_epoch, with_term
-from fleet_service.archive.format.load import Damaged, load, skip_damaged
+from fleet_service.archive.format.load import Damaged, load_rows, skip_damaged
 from fleet_service.archive.format.row_filter import ValueRange
 from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.counts import ServiceCounts
@@ -200,7 +200,7 @@ def _load_parts(
     for _ in range(_TURNS):
         with suppress(FileNotFoundError):
             parts = [
-                load(path, tables.WEATHER_ARCHIVE, where=where, whole=True, damaged=damaged)
+                load_rows(path, tables.WEATHER_ARCHIVE, where=where, whole=True, damaged=damaged)
                 for path in weather_files(root)
                 if path.name not in known
             ]
@@ -230,7 +230,8 @@ def join_daily_files(root: Path) -> int:
     saved = 0
     for paths in (paths for paths in days.values() if len(paths) > 1):
         found = [
-            (p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=skip_damaged)) for p in paths
+            (p, load_rows(p, tables.WEATHER_ARCHIVE, whole=True, damaged=skip_damaged))
+            for p in paths
         ]
         whole = [(path, table) for path, table in found if table is not None]
         if len(whole) > 1:
@@ -251,7 +252,7 @@ def retire_files(root: Path, until_day: int) -> int:
     """
     removed = 0
     for path in weather_files(root):
-        table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
+        table = load_rows(path, tables.WEATHER_ARCHIVE, ["acts_from"])
         if (
             table is not None
             and int(to_nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day

@@ -13,7 +13,7 @@ from fleet_service.page.features import FEW, MOST, Box, FeatureQuestion
 from fleet_service.page.records import CELL_LEVEL, LEAST_LEVEL
 from fleet_service.page.watchers import View
 from schemas import grid, query
-from schemas.config import nanoseconds
+from schemas.config import to_nanoseconds
 from schemas.errors import InputError
 
 MOST_TILES: Final = 256  # largest number of tiles in one request
@@ -134,7 +134,7 @@ def _parse_instant(text: str) -> int | None:
         raise InputError(
             "datetime", error.problem, "give 2026-01-31T07:00:00Z, or two with / between"
         ) from error
-    return None if found is None else nanoseconds(found)
+    return None if found is None else to_nanoseconds(found)
 
 
 def parse_place(request: Request) -> tuple[int, int]:

@@ -41,7 +41,7 @@ def log_warnings(form: Form, stream: TextIO, **identity: object) -> None:
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
 
 
-def values(**entries: object) -> dict[str, object]:
+def json_values(**entries: object) -> dict[str, object]:
     """Return the argument `extra` of a logger's method for a line with values by name, which the
     JSON form contains.
     """

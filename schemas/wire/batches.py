@@ -182,7 +182,7 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
         [message.estimator],
     )
     likelihood = sent.records(LIKELIHOOD) if kind is Kind.OBSERVATION else np.zeros(n, bool)
-    found = complete(Decoded([0], heads, sent.sizes, columns, likelihood, []), sent)
+    found = complete_batches(Decoded([0], heads, sent.sizes, columns, likelihood, []), sent)
     for _, error in found.errors:
         raise error
     if kind is Kind.OBSERVATION and not likelihood.all():
@@ -232,7 +232,7 @@ def _check_columns(message: Any, kind: Kind) -> None:  # noqa: ANN401
             )
 
 
-def complete(found: Decoded, sent: PresentColumns) -> Decoded:
+def complete_batches(found: Decoded, sent: PresentColumns) -> Decoded:
     """Fill missing columns of decoded batches: leaving time, cell and heading sector, and the
     region in the head of a batch. Return the batches.
 

@@ -197,7 +197,7 @@ def _geo_files(root: Path) -> Iterator[Path]:
         answer = QUESTIONS[name].ask(
             QueryEngine("duckdb", root, PART), Options(report=lambda _: None)
         )
-        output.write(answer, QUESTIONS[name], path)
+        output.write_file(answer, QUESTIONS[name], path)
         yield path
 
 

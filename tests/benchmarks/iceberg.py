@@ -67,7 +67,7 @@ def count_different_rows(folder: Path) -> float:
     for done, seed in enumerate(SEEDS, 1):
         fill(root, 5, 500, seed=seed)
         compact(root)
-        rows = iceberg.register(root, place).rows
+        rows = iceberg.register_files(root, place).rows
         if rows != done * 5000:
             raise RuntimeError(f"{rows} rows registered")
         different += rows_different(root, uri)

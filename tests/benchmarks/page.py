@@ -196,7 +196,7 @@ def serve_maplibre(on: Stage) -> Iterator[str | None]:
         town = pa.Table.from_batches([on.town.make_batch(tile) for tile in on.town.tiles]).select(
             ["cell", "mu"]
         )
-        extract.write(geo.with_cells(town), Path(folder) / "town.geojson")
+        extract.write_extract(geo.with_cells(town), Path(folder) / "town.geojson")
         x, y = on.town.corner
         longitude = 360.0 * x / 2**14 - 180.0
         latitude = math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y / 2**14))))

@@ -27,7 +27,7 @@ import numpy as np
 from fleet_service.app.engine import Engine
 from fleet_service.app.state import ServiceState, load_state
 from fleet_service.archive.format import layout, reading, snapshots
-from fleet_service.archive.format.load import load
+from fleet_service.archive.format.load import load_rows
 from fleet_service.archive.format.segments import to_nanoseconds
 from fleet_service.archive.identity.pseudonyms import Pseudonyms, pseudonym_number
 from fleet_service.archive.maintenance.compaction import compact
@@ -266,7 +266,8 @@ class ServiceHistory(Lives[Sent]):
         found = [f"{time} is there {count} times" for time, count in rows.items() if count > 1]
         found += self._find_lost(rows, last) + self._came_back(root, rows)
         reports = (
-            load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.weather_files(root)
+            load_rows(path, tables.WEATHER_ARCHIVE, ["time"])
+            for path in weather.weather_files(root)
         )
         stored = {
             time

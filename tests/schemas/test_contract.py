@@ -195,7 +195,7 @@ def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(
     assert config.parse_moment(text, "from") == expected
     at = query.parse({"at": text}).at
     assert at is not None
-    assert config.nanoseconds(at) == expected
+    assert config.to_nanoseconds(at) == expected
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "07:00", "1969-12-31", "2300-01-01", "1e9"])

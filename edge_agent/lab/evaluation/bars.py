@@ -12,8 +12,8 @@ import numpy as np
 
 from edge_agent.lab.evaluation import worth
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
-from edge_agent.lab.evaluation.measures import COMPONENTS, bounds
-from edge_agent.lab.evaluation.reliability import LEVELS, shares
+from edge_agent.lab.evaluation.measures import COMPONENTS, mean_bounds
+from edge_agent.lab.evaluation.reliability import LEVELS, rank_shares
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import SURFACES
@@ -247,7 +247,7 @@ def unit_of(measure: str) -> str:
     return next(whole, SHARE)
 
 
-def figures(results: Results, *, quick: bool) -> list[Figure]:
+def evaluation_figures(results: Results, *, quick: bool) -> list[Figure]:
     """Return all figures of the evaluation. Figures with a target come first. With `quick`, figures
     with a target are left out if they were not measured.
 
@@ -256,7 +256,7 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
     """
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
-    listed += worth.figures(results.worth)
+    listed += worth.comparison_figures(results.worth)
     for kind, table in (("ideal", results.ideal), ("real", results.real)):
         for (scenario, estimator), found in table.items():
             listed += _context_figures(f"{kind}.{scenario}.{estimator}", found)
@@ -285,10 +285,10 @@ def _consistency_figures(results: Results) -> list[Figure]:
     """
     listed = []
     for measure in COMPONENTS if results.seeds else ():
-        for end, value in zip(("lower", "upper"), bounds(measure, results.seeds), strict=True):
+        for end, value in zip(("lower", "upper"), mean_bounds(measure, results.seeds), strict=True):
             listed.append(Figure(f"bounds.{measure}.{end}", value, SHARE))
     for estimator, parts in results.ranks.items():
-        for level, share in zip(LEVELS, shares(np.concatenate(parts)), strict=True):
+        for level, share in zip(LEVELS, rank_shares(np.concatenate(parts)), strict=True):
             listed.append(
                 Figure(f"reliability.{estimator}.below_{100 * level:02.0f}", float(share), SHARE)
             )

@@ -74,7 +74,7 @@ class DriveSet:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(
+def simulate_realistic(
     scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL
 ) -> DriveSet:
     """Simulate one drive of the scenario per seed with the given sensors, by default ordinary ones.
@@ -83,7 +83,7 @@ def realistic(
     return join_drives([_simulate_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
-def ideal(scenario: DriveSpec) -> DriveSet:
+def simulate_ideal(scenario: DriveSpec) -> DriveSet:
     """Simulate one drive with error-free sensors and an exact vehicle file. The simulation runs at
     a higher rate than the scenario's sampling rate.
     """
@@ -147,7 +147,7 @@ def repeat_drive(batch: DriveSet, count: int) -> DriveSet:
     )
 
 
-def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
+def run_estimator(bank: EstimatorBank, batch: DriveSet) -> Estimates:
     """Return the estimates of motion and friction that an estimator bank computes from the signals
     of the drives.
     """

@@ -18,12 +18,30 @@ from edge_agent.estimators import (
     compensated_wckf,
 )
 from edge_agent.lab.evaluation import faults, oracle, real_world, worth
-from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeat_drive
-from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
-from edge_agent.lab.evaluation.paper_004 import experiments
+from edge_agent.lab.evaluation.batch import (
+    DriveSet,
+    repeat_drive,
+    run_estimator,
+    simulate_ideal,
+    simulate_realistic,
+)
+from edge_agent.lab.evaluation.measures import (
+    arrival_time,
+    common_measures,
+    consistency_shares,
+    false_changes,
+    side_measures,
+)
+from edge_agent.lab.evaluation.paper_004 import run_experiments
 from edge_agent.lab.evaluation.real_world import RealWorldResults
 from edge_agent.lab.evaluation.reliability import estimate_with_ranks
-from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
+from edge_agent.lab.evaluation.scenarios import (
+    FOREIGN,
+    OTHERS,
+    PAPERS,
+    VEHICLES,
+    with_foreign_tyres,
+)
 from schemas.numeric import FloatArray
 
 DEFAULT = "aco-fckf"
@@ -81,41 +99,40 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
     """
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
-    results.noise, plotted = experiments(seeds)
+    results.noise, plotted = run_experiments(seeds)
     for key, (batch, reported) in plotted.items():
         results.drives[key, "paper-aco-fckf"] = PlottedDrive(batch, reported)
     log_line("both noise experiments of paper 004")
     for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
         if quick and name not in QUICK_SCENARIOS:
             continue
-        batch = realistic(scenario, seeds)
-        exact = repeat_drive(ideal(scenario), 1) if name in PAPERS and not quick else None
+        batch = simulate_realistic(scenario, seeds)
+        exact = repeat_drive(simulate_ideal(scenario), 1) if name in PAPERS and not quick else None
         for estimator in names if name in PAPERS else (DEFAULT,):
             reported, ranks = estimate_with_ranks(bank_of(estimator, batch.vehicles), batch)
-            results.real[name, estimator] = _all_measures(name, batch, reported) | consistency(
-                batch, reported
-            )
+            shares = consistency_shares(batch, reported)
+            results.real[name, estimator] = _all_measures(name, batch, reported) | shares
             results.ranks.setdefault(estimator, []).append(ranks.ravel())
             results.drives[name, estimator] = PlottedDrive(batch, reported)
             if exact is not None:
                 results.ideal[name, estimator] = _all_measures(
-                    name, exact, estimates(_as_in_paper(estimator, exact), exact)
+                    name, exact, run_estimator(_as_in_paper(estimator, exact), exact)
                 )
         log_line(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
     manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
-    results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
+    results.faults = faults.run_fault_campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
     log_line(f"{len(faults.CASES) - 1} sensor faults")
-    results.rough = real_world.campaign(seeds, names, quick=quick)
+    results.rough = real_world.run_real_world_campaign(seeds, names, quick=quick)
     results.world = results.rough.found
     log_line(
         f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes"
     )
-    results.worth = worth.campaign(seeds, quick=quick)
+    results.worth = worth.compare_variants(seeds, quick=quick)
     log_line("gain from fuzzy inference and from the ant colony")
     if not quick:
         results.oracle = {
-            "002.sine.rmse_vx": oracle.speed(seeds),
-            "003.accel.mu_error": oracle.friction(seeds)[0],
+            "002.sine.rmse_vx": oracle.speed_rmse(seeds),
+            "003.accel.mu_error": oracle.friction_errors(seeds)[0],
         }
         log_line("an oracle on two manoeuvres of the papers")
         results.foreign = _foreign_tyres(seeds, log_line)
@@ -135,11 +152,11 @@ def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
 
 
 def _all_measures(name: str, batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
-    found = measures(batch, reported)
+    found = common_measures(batch, reported)
     if "split" in name:
-        found |= sides(batch, reported)
+        found |= side_measures(batch, reported)
     if "jump" in name:
-        found["arrival_s"] = arrival(batch, reported)
+        found["arrival_s"] = arrival_time(batch, reported)
     elif not any(word in name for word in HARD):
         found["false_changes"] = false_changes(batch, reported)
         found["hours"] = (batch.t[-1] - batch.t[0]) / 3600.0
@@ -157,8 +174,10 @@ def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dic
     kinds = list(FOREIGN)
     for scenario in (PAPERS | OTHERS).values():
         for place, kind in enumerate(kinds):
-            batch = realistic(foreign(scenario, kind), seeds[place :: len(kinds)] or seeds[:1])
-            reported = estimates(bank_of(DEFAULT, batch.vehicles), batch)
-            found[kind].extend(measures(batch, reported)["coverage90"])
+            batch = simulate_realistic(
+                with_foreign_tyres(scenario, kind), seeds[place :: len(kinds)] or seeds[:1]
+            )
+            reported = run_estimator(bank_of(DEFAULT, batch.vehicles), batch)
+            found[kind].extend(common_measures(batch, reported)["coverage90"])
     log_line("all scenarios on tyres that the filter does not model")
     return {kind: np.array(values) for kind, values in found.items()}

@@ -68,7 +68,7 @@ class DetectionTown(NamedTuple):
         return "long" if self.seconds >= LONGER_THAN_SHORT_S else "short"
 
 
-def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
+def simulate_towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
     """Return the simulated towns of the campaign, whose friction and hills are drawn by seed. Towns
     with an odd seed are winter towns.
 
@@ -125,14 +125,14 @@ def judge_towns(
     return results
 
 
-def campaign(
+def run_detection_campaign(
     seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
 ) -> DetectionResults:
     """Evaluate how well an estimator detects slippery road in all towns of the campaign. `seeds`
     are the seeds of the towns; `log_line` receives one line of progress per town.
     """
     return judge_towns(
-        towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
+        simulate_towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line
     )
 
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, realistic
-from edge_agent.lab.evaluation.measures import errors, is_covered
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, run_estimator, simulate_realistic
+from edge_agent.lab.evaluation.measures import is_covered, motion_errors
 from edge_agent.lab.evaluation.scenarios import SEDAN
 from edge_agent.lab.simulation import Fault
 from edge_agent.lab.simulation.faults import apply_faults
@@ -174,17 +174,19 @@ def case_measures(batch: DriveSet, reported: Estimates, case: Case) -> dict[str,
         "width": (reported.mu_upper - reported.mu_lower)[after].mean(axis=0),
     }
     for name in ("vx", "vy"):
-        found[f"rmse_{name}"] = np.sqrt((errors(batch, reported)[name][after] ** 2).mean(axis=0))
+        found[f"rmse_{name}"] = np.sqrt(
+            (motion_errors(batch, reported)[name][after] ** 2).mean(axis=0)
+        )
     return found
 
 
-def campaign(
+def run_fault_campaign(
     seeds: Sequence[int], estimators: Sequence[str], drives: Sequence[str] = tuple(DRIVES)
 ) -> dict[tuple[str, str], dict[str, FloatArray]]:
     """Run every sensor fault of the table with every estimator on all drives with all seeds. Return
     the measures by (fault case, estimator), one value per drive.
     """
-    batches = [realistic(DRIVES[name], seeds) for name in drives]
+    batches = [simulate_realistic(DRIVES[name], seeds) for name in drives]
     found = {}
     for name, case in CASES.items():
         for estimator in estimators:
@@ -193,7 +195,7 @@ def campaign(
                 broken = apply_fault(batch, case)
                 parts.append(
                     case_measures(
-                        broken, estimates(bank_of(estimator, broken.vehicles), broken), case
+                        broken, run_estimator(bank_of(estimator, broken.vehicles), broken), case
                     )
                 )
             found[name, estimator] = {

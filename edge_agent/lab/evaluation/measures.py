@@ -29,7 +29,7 @@ COMPONENTS = {
 }
 
 
-def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+def motion_errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Return the errors (T, N) of the estimated motion: vx, vy [m/s], yaw_rate [rad/s], beta
     (sideslip) [rad].
     """
@@ -50,13 +50,13 @@ def is_covered(batch: DriveSet, reported: Estimates) -> BoolArray:
     return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
 
-def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+def common_measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Return the measures that every kind of drive has, by name, (N,) each: errors, coverage and
     width of the friction interval, share of the time reported as slippery, NIS, NEES.
     """
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
-    for name, error in errors(batch, reported).items():
+    for name, error in motion_errors(batch, reported).items():
         found[f"mae_{name}"] = np.abs(error).mean(axis=0)
         found[f"rmse_{name}"] = np.sqrt((error**2).mean(axis=0))
     found["rmse_mu"] = np.sqrt(((reported.mu - batch.mu) ** 2).mean(axis=0))
@@ -75,13 +75,13 @@ def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Return the NEES (normalised estimation error squared): the squared error of (v_x, v_y) over
     its stated variance, as the mean over the two components, (T, N).
     """
-    off = errors(batch, reported)
+    off = motion_errors(batch, reported)
     return np.asarray(
         0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2)
     )
 
 
-def bounds(measure: str, drives: int) -> tuple[float, float]:
+def mean_bounds(measure: str, drives: int) -> tuple[float, float]:
     """Return the lower and upper 95 % bounds for the mean of `measure` ("nees" or "nis") over
     `drives` drives at one instant. They hold for a filter whose stated variances are right.
     """
@@ -91,19 +91,19 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
     return float(chi2.ppf(0.025, count)) / count, float(chi2.ppf(0.975, count)) / count
 
 
-def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+def consistency_shares(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Return the share of instants at which the mean NEES and the mean NIS (normalised squared
     errors and innovations) over all drives lie within their bounds, (1,) each.
     """
     found = {}
     for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):
-        low, high = bounds(name, value.shape[1])
+        low, high = mean_bounds(name, value.shape[1])
         mean = value.mean(axis=1)
         found[f"{name}_within"] = np.array([((low <= mean) & (mean <= high)).mean()])
     return found
 
 
-def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+def side_measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Return two measures for drives on a road with different friction left and right: the friction
     error on the slippery side, and the coverage of the friction interval on the other side. Both
     are computed over the last LAST_S [s] of each drive, one value per drive.
@@ -123,7 +123,7 @@ def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     }
 
 
-def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
+def arrival_time(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Return, per drive, the time [s] from the change of friction until the friction estimate is
     within NEAR of the new value. If this never happens, return the time from the change to the end
     of the drive.

@@ -9,7 +9,7 @@ estimate is least squares with a Gaussian prior.
 The body of a car rolls and pitches with a lag after the acceleration. Its tilt adds a share of
 gravity to the readings of the accelerometers.
 
-`speed`: v_x in sine steering with acceleration. Wheel speeds have no noise here: W = (1 + ρ) v.
+`speed_rmse`: v_x in sine steering with acceleration. Wheel speeds have no noise: W = (1 + ρ) v.
 
     a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y
     ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)      over stretches of STRETCH_S
@@ -26,9 +26,9 @@ gravity to the readings of the accelerometers.
                τ    error of the lag of roll [s]
                b    offsets of the accelerometers [m/s^2]
 
-`friction`: μ at the end of a drive with .6 g. The oracle gets the mean speed of the four wheels and
-the force of every tyre. It knows the vehicle's speed except for the errors that an offset of a_x
-and pitch cause.
+`friction_errors`: μ at the end of a drive with .6 g. The oracle gets the mean speed of the four
+wheels and the force of every tyre. It knows the vehicle's speed except for the errors that an
+offset of a_x and pitch cause.
 
     R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))
     R, ω       wheel radius of the vehicle file [m], mean wheel speed [rad/s]
@@ -52,7 +52,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.tyres import magic_formula
-from edge_agent.lab.evaluation.batch import USUAL, DriveSet, realistic
+from edge_agent.lab.evaluation.batch import USUAL, DriveSet, simulate_realistic
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.simulation.presets import KNOWN
 from edge_agent.lab.simulation.sensors import SENSORS, Sensors
@@ -91,14 +91,16 @@ class OracleSignals(NamedTuple):
     body_acceleration: FloatArray  # (T, 2), from accelerometers without other errors
 
 
-def speed(seeds: Sequence[int]) -> FloatArray:
+def speed_rmse(seeds: Sequence[int]) -> FloatArray:
     """Return the RMSE of v_x [m/s] as estimated by the oracle, one value per seed. The drive is
     that of paper 002: sine steering while the speed rises from 20 to 25 m/s.
     """
     scenario = PAPERS["002.sine"]
     car = scenario.vehicle
-    batch = realistic(scenario, seeds)
-    readings = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
+    batch = simulate_realistic(scenario, seeds)
+    readings = simulate_realistic(scenario, seeds[:1], Sensors(leak=True)).signals[
+        :, 0, S.AX : S.AY + 1
+    ]
     leaked = readings - np.stack(
         [batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1
     )
@@ -195,7 +197,7 @@ def _make_regression(signals: OracleSignals, n: int, wheels: FloatArray, dt: flo
     return _Regression(across, across_table, along, along_table)
 
 
-def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+def friction_errors(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """Return two arrays with one value per seed: the friction error of the oracle, and the error
     that the oracle itself expects.
 
@@ -205,17 +207,18 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     under the posterior.
     """
     scenario = PAPERS["003.accel"]
-    exact = realistic(scenario, seeds[:1], "ideal")
-    batch = realistic(scenario, seeds)
+    exact = simulate_realistic(scenario, seeds[:1], "ideal")
+    batch = simulate_realistic(scenario, seeds)
     car = scenario.vehicle
     v = exact.truth["true_vx"][:, 0]
     truth = float(exact.mu[0, 0])
     slip = car.vehicle.wheel_radius * exact.signals[:, 0, S.OMEGA : S.OMEGA + 4] / v[:, None] - 1.0
     used = np.stack([exact.truth[name][:, 0] for name in per_wheel("true_utilisation")], axis=-1)
-    here = np.maximum(_theta(used, car.shape, car.curvature) * truth, LEAST)
+    here = np.maximum(_normalised_slips(used, car.shape, car.curvature) * truth, LEAST)
     slips = {
         (mu, *shape): (
-            slip * np.where(here > LEAST, mu * _theta(used * truth / mu, *shape) / here, 1.0)
+            slip
+            * np.where(here > LEAST, mu * _normalised_slips(used * truth / mu, *shape) / here, 1.0)
         ).mean(axis=1)
         for mu in LIKELY
         for shape in SHAPES
@@ -226,7 +229,10 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         measured = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
         stiff = float(np.log(vehicle.longitudinal_stiffness / car.vehicle.longitudinal_stiffness))
         cost = np.array(
-            [_cost(measured, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()]
+            [
+                _negative_log_likelihood(measured, v, slip, vehicle.wheel_radius, stiff)
+                for slip in slips.values()
+            ]
         )
         weight = np.exp(cost.min() - cost).reshape(len(LIKELY), -1).sum(axis=1)
         median = float(np.interp(0.5, np.cumsum(weight) / weight.sum(), LIKELY))
@@ -235,7 +241,7 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     return np.array(errors), np.array(expected)
 
 
-def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
+def _normalised_slips(force: FloatArray, shape: float, curvature: float) -> FloatArray:
     """Return the normalised slips (n,) at which a tyre uses the shares `force` (n,) of its grip.
     The slips lie on the rising branch of the force curve with this `shape` and `curvature` (Magic
     Formula).
@@ -253,7 +259,7 @@ def _force_curve(shape: float, curvature: float) -> FloatArray:
     return curve[: int(np.argmax(curve)) + 1]
 
 
-def _cost(
+def _negative_log_likelihood(
     measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float
 ) -> float:
     """Return −ln of the likelihood of one pair of friction and tyre curve, given the mean wheel

@@ -20,8 +20,8 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import TUNED, Estimates
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, repeat_drive
-from edge_agent.lab.evaluation.measures import measures
+from edge_agent.lab.evaluation.batch import DriveSet, repeat_drive, run_estimator, simulate_ideal
+from edge_agent.lab.evaluation.measures import common_measures
 from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
 from edge_agent.lab.simulation import PRESETS
 from edge_agent.lab.simulation.white import add_white, scheduled_variance
@@ -39,7 +39,7 @@ EXPERIMENTS = {
 STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R unchanged
 
 
-def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
+def add_noise(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
     """Return one copy of the drive per seed, with white noise added to a_x, a_y and yaw rate r.
     `variance` (T,) is the variance of the noise over time [SI units squared].
     """
@@ -49,14 +49,14 @@ def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveS
     return copies
 
 
-def variances(t: FloatArray, experiment: str) -> FloatArray:
+def noise_variances(t: FloatArray, experiment: str) -> FloatArray:
     """Return the noise variance at the times t (T,) [s] in the experiment "constant" or "variable"
     of paper 004.
     """
     return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled_variance(t)
 
 
-def experiments(
+def run_experiments(
     seeds: Sequence[int],
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
     """Run the experiments of paper 004. Return the error measures of each drive by (experiment,
@@ -76,10 +76,10 @@ def experiments(
     found = {}
     drives = {}
     for name, vehicle in EXPERIMENTS.items():
-        exact = ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
-        batch = noisy(
+        exact = simulate_ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
+        batch = add_noise(
             exact,
-            variances(exact.t[:, 0], "variable" if name.endswith("variable") else "constant"),
+            noise_variances(exact.t[:, 0], "variable" if name.endswith("variable") else "constant"),
             seeds,
         )
         for estimator, sets in (
@@ -87,7 +87,7 @@ def experiments(
             ("paper-fckf", Memberships()),
             ("paper-aco-fckf", shipped_memberships(TUNED["paper-aco-fckf"])),
         ):
-            reported = estimates(make_bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
-            found[name, estimator] = measures(batch, reported)
+            reported = run_estimator(make_bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
+            found[name, estimator] = common_measures(batch, reported)
         drives[f"004.{name}"] = (batch, reported)
     return found, drives

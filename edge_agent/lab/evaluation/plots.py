@@ -18,7 +18,7 @@ from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
 from edge_agent.lab.evaluation.detection import KINDS, ROC_FLAG_MU, ROC_NATS
-from edge_agent.lab.evaluation.measures import bounds, nees
+from edge_agent.lab.evaluation.measures import mean_bounds, nees
 from edge_agent.lab.evaluation.real_world import RealWorldResults
 from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS, VEHICLES
 from schemas.runtime.figures import Figure
@@ -35,7 +35,7 @@ DPI: Final = 110  # resolution of PNG files: 1000 points wide; SVG and PDF are f
 NEARLY_ALIKE: Final = 0.02  # a smaller range of friction is shown as one value
 
 
-def draw(
+def draw_plots(
     results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png"
 ) -> list[Path]:
     """Draw all plots and write them into `folder`; return the paths of the files.
@@ -93,10 +93,10 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
         axes[5].semilogy(t, nees(drive.batch, reported).mean(axis=1), **style)
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
     axes[4].set(ylabel="factor on R")
-    ends = bounds("nees", first.batch.t.shape[1])
+    ends = mean_bounds("nees", first.batch.t.shape[1])
     axes[5].axhspan(*ends, color="k", alpha=0.15, lw=0, label="95 % of a consistent filter's mean")
     axes[5].set(ylabel="NEES, all drives", xlabel="t [s]", ylim=(1e-3, 1e3))
-    axes[0].set_title(title(scenario, first, seed))
+    axes[0].set_title(drive_title(scenario, first, seed))
     for axis in (axes[0], axes[3], axes[5]):
         axis.legend(fontsize="x-small", ncols=3)
     figure.savefig(path, dpi=DPI)
@@ -104,7 +104,7 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
     return path
 
 
-def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
+def drive_title(scenario: str, drive: PlottedDrive, seed: int) -> str:
     """Return the title of a drive's plot, which states scenario, manoeuvre, speed, friction,
     vehicle and seed.
     """

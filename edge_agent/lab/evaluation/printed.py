@@ -135,7 +135,7 @@ OWN: Final = {
 DEFAULT: Final = "aco-fckf"
 
 
-def names() -> list[str]:
+def compared_names() -> list[str]:
     """Return the names of the evaluation's results that are compared with printed numbers, and the
     names of their standard deviations.
     """

@@ -263,7 +263,7 @@ def root_mean_square(error: FloatArray, among: BoolArray) -> float:
     return float(np.sqrt(np.mean(np.square(error[some])))) if some.any() else math.nan
 
 
-def summarise(found: Sequence[LogFigures]) -> list[Figure]:
+def summary_figures(found: Sequence[LogFigures]) -> list[Figure]:
     """Return the figures (named numbers) of the evaluation over all logs. Most are means weighted
     by the duration of each log. For false ice, urgent observations and friction in use, the figure
     is the value of the worst log.
@@ -309,7 +309,7 @@ def table_row(log: LogFigures) -> str:
     )
 
 
-def table(found: Sequence[LogFigures]) -> str:
+def results_table(found: Sequence[LogFigures]) -> str:
     """Return the evaluation results for all logs as a Markdown table."""
     head = ["log", "seconds", "doctor passed", *(name.replace("_", " ") for name in HEAD)]
     rows = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(table_row(log) for log in found)]

@@ -40,8 +40,14 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import USUAL, DriveSet, DriveSpec, estimates, realistic
-from edge_agent.lab.evaluation.measures import errors, is_covered
+from edge_agent.lab.evaluation.batch import (
+    USUAL,
+    DriveSet,
+    DriveSpec,
+    run_estimator,
+    simulate_realistic,
+)
+from edge_agent.lab.evaluation.measures import is_covered, motion_errors
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
 from edge_agent.lab.simulation.scenarios import drawn_town, winter, with_cobbles
 from schemas.errors import InputError
@@ -213,7 +219,7 @@ def tally_town(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatAr
     tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)
     tally.add("width.all", width / (PRIOR[1] - PRIOR[0]))
     tally.add("score", interval_score(reported.mu_lower, reported.mu_upper, mu))
-    off = errors(batch, reported)
+    off = motion_errors(batch, reported)
     for name, std in (("vx", reported.vx_std), ("vy", reported.vy_std)):
         tally.add(f"rmse_{name}_squared", off[name] ** 2)
         tally.add(f"coverage90.{name}", np.abs(off[name]) <= Z_95 * std)
@@ -245,7 +251,9 @@ def simulate_standing(slope: float, seeds: Sequence[int], seconds: float) -> lis
             drive = DriveSpec(
                 "standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL
             )
-            batches.append(realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors))
+            batches.append(
+                simulate_realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors)
+            )
     return batches
 
 
@@ -253,7 +261,7 @@ def largest_speed(estimator: str, batches: Sequence[DriveSet]) -> float:
     """Return the largest speed [m/s], in any direction, that the estimator reports for cars that
     stand.
     """
-    reported = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
+    reported = [run_estimator(bank_of(estimator, batch.vehicles), batch) for batch in batches]
     return max(float(np.hypot(each.vx, each.vy).max()) for each in reported)
 
 
@@ -268,7 +276,9 @@ class RealWorldResults:
     reported: dict[str, Estimates]
 
 
-def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
+def run_real_world_campaign(
+    seeds: Sequence[int], estimators: Sequence[str], *, quick: bool
+) -> RealWorldResults:
     """Run towns whose cars have large sensor errors, and cars that stand on slopes, for every
     estimator. The first town is stored for plots.
     """
@@ -280,7 +290,7 @@ def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) ->
         tally_baseline(tallies["baseline"], batch)
         world = world or RealWorldResults({}, batch, {})
         for name in estimators:
-            reported = estimates(bank_of(name, batch.vehicles), batch)
+            reported = run_estimator(bank_of(name, batch.vehicles), batch)
             tally_town(tallies[name], batch, reported, used)
             world.reported.setdefault(name, reported)
     if world is None:

@@ -92,7 +92,7 @@ def between_quantiles(
     return np.where(upper - lower > PRIOR_WIDTH - 1e-6, uniform, norm.cdf((truth - mu) / std))
 
 
-def shares(ranks: FloatArray) -> FloatArray:
+def rank_shares(ranks: FloatArray) -> FloatArray:
     """Return, for each of LEVELS, the share of drives and times at which the rank of the true
     friction (posterior probability of a smaller friction) is at most this level, (L,).
     """

@@ -190,7 +190,7 @@ FOREIGN: Final = {
 }
 
 
-def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
+def with_foreign_tyres(scenario: DriveSpec, kind: str) -> DriveSpec:
     """Return the scenario with tyres of the given kind (a key of FOREIGN), which differ from the
     tyre model of the estimators.
     """

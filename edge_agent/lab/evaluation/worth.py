@@ -78,7 +78,7 @@ MANOEUVRES: Final = (
 Scores = dict[str, dict[str, FloatArray]]
 
 
-def campaign(
+def compare_variants(
     seeds: Sequence[int],
     *,
     quick: bool,
@@ -206,7 +206,7 @@ def score_ratio(scores: Scores, name: str) -> float:
     )
 
 
-def figures(scores: Scores) -> list[Figure]:
+def comparison_figures(scores: Scores) -> list[Figure]:
     """Return those figures (named numbers) of the comparison of filter variants that have no
     target: standard deviations of the ratios, paired differences of the scores, ratios per surface,
     and every interval score.
@@ -249,7 +249,7 @@ def barred_figures(scores: Scores) -> list[Figure]:
         for name in RATIOS
         if name not in BARS and not math.isnan(score_ratio(scores, name))
     ]
-    return barred + plain + figures(scores)
+    return barred + plain + comparison_figures(scores)
 
 
 def comparison_table(values: dict[str, float]) -> str:

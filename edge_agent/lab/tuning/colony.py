@@ -30,7 +30,7 @@ from functools import partial
 
 import numpy as np
 
-from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Result, nearest
+from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Result, nearest_path
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
@@ -103,7 +103,7 @@ def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
     return lowest
 
 
-def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
+def deposit_pheromone(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
     """Return the pheromone Δτ (V, K) that P paths (P, V) deposit on V vertices (variables) with K
     positions (values) each. At every vertex, path p adds the amount weights[p] at the position that
     it selects.
@@ -115,7 +115,7 @@ def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> Float
     return laid
 
 
-def renew(
+def renew_pheromone(
     pheromone: FloatArray,
     laid: FloatArray,
     reachable: BoolArray,
@@ -189,10 +189,10 @@ def optimise(
         )
         paths = [ledger.draw(partial(_walk_ant, odds, rng)) for _ in range(ants)]
         if iteration == 0 and problem.start is not None:
-            paths[0] = nearest(graph, problem.start)
+            paths[0] = nearest_path(graph, problem.start)
         values = [ledger.evaluate(path) for path in paths]
         ledger.record(values, progress)
-        pheromone = renew(
+        pheromone = renew_pheromone(
             pheromone,
             _laid_pheromone(paths, values, weights, ledger, habits),
             reachable,
@@ -215,4 +215,4 @@ def _laid_pheromone(
     best = ledger.best_path if ledger.best_path is not None else paths[0]
     depositing = np.array([paths[ant] for ant in order] + [best])
     amounts = np.append(weights, habits.memory * habits.evaporation)
-    return deposit(depositing, amounts, ledger.graph.reachable)
+    return deposit_pheromone(depositing, amounts, ledger.graph.reachable)

@@ -161,7 +161,7 @@ OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
 }
 
 
-def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
+def record_drives(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
     """Simulate the drives, each `duration_s` [s] long, and return them as one set for tuning."""
     signals = []
     truth = []
@@ -199,7 +199,7 @@ def record_all(name: str, duration_s: float) -> TuningSet:
     """Simulate all drives and towns of the set called `name`, "train" (for the search) or
     "held_out", each `duration_s` [s] long. Return them as one set for tuning.
     """
-    sets = [record(TRAIN if name == "train" else HELD_OUT, duration_s)]
+    sets = [record_drives(TRAIN if name == "train" else HELD_OUT, duration_s)]
     seeds, cars = TOWNS[name]
     sets += [record_town(seed, cars, duration_s) for seed in seeds]
     vehicles = tuple(vehicle for one in sets for vehicle in one.vehicles)
@@ -315,7 +315,7 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
     return objective
 
 
-def choices(positions: int) -> tuple[FloatArray, ...]:
+def candidate_values(positions: int) -> tuple[FloatArray, ...]:
     """Return an array of `positions` candidate values for every parameter of the memberships, such
     as a corner of a fuzzy set ("vertex") or a noise scale. The candidates are evenly spaced within
     the parameter's bounds; the one nearest to the default value is replaced by the default.

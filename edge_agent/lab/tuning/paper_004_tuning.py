@@ -25,7 +25,7 @@ from edge_agent.adaptation.lower_vertices import LowerVertices
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, Setting, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, repeat_drive
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, repeat_drive, simulate_ideal
 from edge_agent.lab.simulation.white import add_white
 from edge_agent.lab.tuning.colony import Habits, optimise
 from edge_agent.lab.tuning.search import Problem, Result
@@ -63,7 +63,7 @@ def record_levels(
     """Simulate a drive without errors. Return, for each noise level, a set of copies of the drive,
     one per seed, to which white noise of this level is added.
     """
-    exact = ideal(spec)
+    exact = simulate_ideal(spec)
     levels = []
     for level in LEVELS:
         batch = repeat_drive(exact, len(seeds))

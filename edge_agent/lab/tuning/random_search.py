@@ -4,7 +4,7 @@ with the same number of evaluations.
 
 import numpy as np
 
-from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Result, nearest
+from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Result, nearest_path
 from schemas.numeric import IntArray
 
 
@@ -30,6 +30,6 @@ def optimise(
     for iteration in range(iterations):
         paths = [ledger.draw(sample) for _ in range(ants)]
         if iteration == 0 and problem.start is not None:
-            paths[0] = nearest(graph, problem.start)
+            paths[0] = nearest_path(graph, problem.start)
         ledger.record([ledger.evaluate(path) for path in paths], progress)
     return ledger.result()

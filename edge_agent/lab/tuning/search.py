@@ -189,7 +189,7 @@ class Ledger:
         return Result(self.graph.vector(self.best_path), self.best_value, tuple(self.history))
 
 
-def nearest(graph: Graph, vector: FloatArray) -> IntArray:
+def nearest_path(graph: Graph, vector: FloatArray) -> IntArray:
     """Return the path (V,) nearest to a `vector` (V,): for each vertex (variable), the index of the
     position (possible value) that is nearest to the vector's value.
     """

@@ -31,7 +31,7 @@ from edge_agent.lab.tuning import (
     study,
 )
 from edge_agent.lab.tuning.continuous_colony import SearchTally
-from edge_agent.lab.tuning.objectives import choices
+from edge_agent.lab.tuning.objectives import candidate_values
 from edge_agent.lab.tuning.search import Problem, Progress, Result
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
@@ -94,12 +94,12 @@ def compare_searches(
     errors.
     """
     ants, iterations, duration = (3, 2, 1.0) if quick else (ANTS, ITERATIONS, study.DURATION_S)
-    train = study.record(study.TRAIN, duration)
+    train = study.record_noisy_drives(study.TRAIN, duration)
     searched: dict[str, list[float]] = {}
     judged: dict[str, list[float]] = {}
     for seed in seeds:
         drives = [drive._replace(seed=100 * seed + k) for k, drive in enumerate(study.HELD_OUT)]
-        held_out = study.record(drives, duration)
+        held_out = study.record_noisy_drives(drives, duration)
         for name, sets in GIVEN.items():
             searched.setdefault(name, []).append(study.mean_log_likelihood(sets, train))
             judged.setdefault(name, []).append(study.mean_log_likelihood(sets, held_out))
@@ -123,7 +123,7 @@ def compare_searches(
 
 def _problem(train: study.StudySet) -> Problem:
     start = Memberships().to_vector()[: study.VERTICES]
-    return Problem(study.objective_on(train), choices(POSITIONS)[: study.VERTICES], start)
+    return Problem(study.objective_on(train), candidate_values(POSITIONS)[: study.VERTICES], start)
 
 
 def _comparison_figures(

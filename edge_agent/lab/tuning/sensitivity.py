@@ -159,7 +159,7 @@ def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, Mixture
                 yield f"{field}[{place}]", factor, design_of(sets, adaptive=True)
 
 
-def campaign(
+def vary_constants(
     drives: Sequence[JudgedDrives],
     *,
     only: str = "",
@@ -240,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--only", default="", help="vary only numbers whose name contains this text"
     )
     options = parser.parse_args(arguments)
-    changes = campaign(
+    changes = vary_constants(
         simulate_drives(SEEDS), only=options.only, log_line=lambda line: print(line, flush=True)
     )
     options.out.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from edge_agent.lab.simulation.manoeuvres import kmh
 from edge_agent.lab.simulation.presets import matched_to_papers
 from edge_agent.lab.simulation.white import add_white, scheduled_variance
 from edge_agent.lab.tuning import colony, random_search
-from edge_agent.lab.tuning.objectives import choices, interval_score
+from edge_agent.lab.tuning.objectives import candidate_values, interval_score
 from edge_agent.lab.tuning.search import Objective, Problem, Progress, Result
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS as SIGNALS
@@ -116,7 +116,7 @@ class StudyScores(NamedTuple):
     rmse_yaw_rate: float  # [rad/s]
 
 
-def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
+def record_noisy_drives(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
     """Simulate the drives, each `duration_s` [s] long. Return their readings once for each entry of
     CONDITIONS, with the measurement noise that the entry states.
     """
@@ -233,7 +233,9 @@ def problem_on(drives: StudySet, positions: int) -> Problem:
     values) per vertex. Every search starts at the untuned vertices (corners of the fuzzy sets).
     """
     return Problem(
-        objective_on(drives), choices(positions)[:VERTICES], Memberships().to_vector()[:VERTICES]
+        objective_on(drives),
+        candidate_values(positions)[:VERTICES],
+        Memberships().to_vector()[:VERTICES],
     )
 
 

@@ -95,7 +95,10 @@ def run(
     receives the name of a search and returns the function to which this search reports its
     progress.
     """
-    done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
+    done = Study(
+        study.record_noisy_drives(study.TRAIN, duration_s),
+        study.record_noisy_drives(study.HELD_OUT, duration_s),
+    )
     problem = study.problem_on(done.train, positions)
     for seed in seeds:
         for way in WAYS:
@@ -111,7 +114,7 @@ def run(
     return done
 
 
-def figures(done: Study) -> list[Figure]:
+def study_figures(done: Study) -> list[Figure]:
     """Return the figures of the study for each kind of search. These are the scores on held-out
     drives under each condition of the study (right or wrong measurement noise R), the objective on
     search and held-out drives, and the progress of the searches.
@@ -160,7 +163,7 @@ def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
     )
 
 
-def markdown(listed: Sequence[Figure]) -> str:
+def results_table(listed: Sequence[Figure]) -> str:
     """Return a Markdown table of the study's results `listed`, with a row per condition and measure
     and a column per kind of search.
     """
@@ -186,7 +189,7 @@ def markdown(listed: Sequence[Figure]) -> str:
     return "\n".join(rows) + f"\n\n{summary}\n"
 
 
-def scores(done: Study, way: str) -> dict[str, Score]:
+def stored_scores(done: Study, way: str) -> dict[str, Score]:
     """Return the scores that are stored in the file of tuned memberships: one `Score` for the
     drives of the search ("train"), and one for the held-out drives ("held_out").
 
@@ -207,7 +210,7 @@ def scores(done: Study, way: str) -> dict[str, Score]:
     return found
 
 
-def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
+def draw_convergence(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
     """Plot, for each kind of search, the best objective found so far as a function of the number of
     evaluations: mean and one standard deviation over the searches. The plot is written to `path`.
     """

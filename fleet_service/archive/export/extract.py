@@ -18,7 +18,7 @@ import pyarrow.csv as pacsv
 
 from fleet_service.archive.format import geo, layout, reading, snapshots
 from fleet_service.archive.format.files import MAP, write_table
-from fleet_service.archive.format.load import load
+from fleet_service.archive.format.load import load_rows
 from fleet_service.archive.format.row_filter import ValueRange
 from fleet_service.archive.maintenance import rollup
 from schemas import grid, tables
@@ -91,7 +91,7 @@ def map_then(root: Path, part: Extract) -> pa.Table:
     selected box, as a table with cell polygons.
     """
     path = _find_snapshot(root, part)
-    table = load(path, tables.MAP_ARCHIVE)
+    table = load_rows(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
     # Files before format 1.2 have a number in `mu` even if only a lower bound is known.
@@ -120,7 +120,7 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
         root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS
     )
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
-    loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
+    loaded = (load_rows(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
     found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
     measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before format 1.2
@@ -151,7 +151,7 @@ def _cells_in_box(table: pa.Table, bbox: Box | None) -> pa.Table:
     return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))
 
 
-def write(table: pa.Table, path: Path) -> None:
+def write_extract(table: pa.Table, path: Path) -> None:
     """Write a GeoParquet table in the format that the ending of the file name selects. CSV omits
     binary and nested columns.
 

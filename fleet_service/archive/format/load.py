@@ -91,7 +91,7 @@ class Content(NamedTuple):
     entries: dict[str, str]
 
 
-def load(
+def load_rows(
     path: Path,
     schema: pa.Schema,
     columns: Sequence[str] | None = None,

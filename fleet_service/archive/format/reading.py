@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.format import layout, segments
 from fleet_service.archive.format.layout import Partition
-from fleet_service.archive.format.load import Damaged, load, load_groups, skip_damaged
+from fleet_service.archive.format.load import Damaged, load_groups, load_rows, skip_damaged
 from fleet_service.archive.format.row_filter import Where
 from fleet_service.archive.format.version import DamagedError, check_version, entries_of
 from schemas import grid
@@ -161,7 +161,7 @@ class Listing:
         """
         both = [*(self._selection.where or ()), *(where or ())]
         try:
-            return load(path, self._schema, self._names, both or None, damaged=self._damaged)
+            return load_rows(path, self._schema, self._names, both or None, damaged=self._damaged)
         except FileNotFoundError:
             return None
 
@@ -189,7 +189,7 @@ def _read_inbox(
             loaded = [
                 (
                     path,
-                    load(
+                    load_rows(
                         path,
                         schema,
                         selection.columns,

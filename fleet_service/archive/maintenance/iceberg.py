@@ -2,8 +2,8 @@
 copying; new rows in the inbox are never registered.
 
 Only one process may register files of a table. Before retention or erasure removes or rewrites
-files, these files are removed from the tables (`unregister`), because a table that refers to a
-missing file cannot be read.
+files, these files are removed from the tables (`unregister_files`), because a table that refers to
+a missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class RegistrationResult(NamedTuple):
     rows: int
 
 
-def register(root: Path, place: Place) -> RegistrationResult:
+def register_files(root: Path, place: Place) -> RegistrationResult:
     """Register the compacted (sorted) files of an archive in the Iceberg tables; a repeated call
     changes nothing.
 
@@ -86,7 +86,7 @@ def register(root: Path, place: Place) -> RegistrationResult:
     return total
 
 
-def unregister(root: Path, paths: Sequence[Path]) -> None:
+def unregister_files(root: Path, paths: Sequence[Path]) -> None:
     """Remove files from the Iceberg tables, before they are removed or rewritten on disk.
 
     Raises:
@@ -130,7 +130,7 @@ def place_of(root: Path) -> Place | None:
 def _record_registration(root: Path, place: Place) -> None:
     """Record in the archive the Iceberg tables in which its files will be registered. The record
     must precede the registration. Otherwise a crash between the two could leave registered files
-    that `unregister` does not find, and the tables would refer to missing files.
+    that `unregister_files` does not find, and the tables would refer to missing files.
     """
     path = root / RECORD
     try:

@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 from fleet_service.archive.format import layout, reading, snapshots
 from fleet_service.archive.format.files import COMPACTED, MAP, lock_archive, put_in_place
 from fleet_service.archive.format.layout import TABLES
-from fleet_service.archive.format.load import BAD, load, read_content
+from fleet_service.archive.format.load import BAD, load_rows, read_content
 from fleet_service.archive.format.row_filter import ValueRange, Where
 from fleet_service.archive.format.segments import SCHEMAS, to_nanoseconds
 from fleet_service.archive.format.version import KEY
@@ -60,7 +60,7 @@ def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
     with hold_compaction_lock(root):
         rollup.complete_parts(root, until_day=_last_to_go(raw_days, today))
         folders = due_folders(root, raw_days, today)
-        iceberg.unregister(root, [path for folder in folders for path in folder.glob("*/*")])
+        iceberg.unregister_files(root, [path for folder in folders for path in folder.glob("*/*")])
         for folder in folders:
             for path in sorted(folder.glob("*/*"), reverse=True):
                 path.unlink()
@@ -205,7 +205,7 @@ def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]
                 for path in layout.compacted_files(root, kind, begin, end)
                 if _may_hold_vehicle(kind, path, pseudonym)
             ]
-            iceberg.unregister(root, theirs)
+            iceberg.unregister_files(root, theirs)
             for path in theirs:
                 removed = _remove_vehicle(root, kind, path, pseudonym)
                 if not removed:
@@ -296,7 +296,7 @@ def _may_hold_vehicle(kind: Kind, path: Path, pseudonym: str) -> bool:
     """Return True if a file contains rows of the vehicle with this pseudonym; raise an error if the
     file is damaged.
     """
-    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
+    found = load_rows(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 

@@ -27,7 +27,7 @@ import pyarrow as pa
 
 from fleet_service.archive.format import layout, segments
 from fleet_service.archive.format.files import ROLLUP, put_in_place
-from fleet_service.archive.format.load import Damaged, load, set_aside
+from fleet_service.archive.format.load import Damaged, load_rows, set_aside
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
 from schemas.wire import Kind
@@ -92,7 +92,7 @@ def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
     Raises:
         OSError: the file cannot be read.
     """
-    table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
+    table = load_rows(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
     return None if table is None else roll_up(table)
 
 

@@ -16,7 +16,7 @@ from edge_agent.estimators.literal import federated_friction, wheel_friction_ukf
 from edge_agent.estimators.literal.given_motion import GivenMotion
 from edge_agent.estimators.literal.wheel_forces import WheelForces
 from edge_agent.estimators.literal.wheel_friction_ukf import AS_PRINTED, UKF, UKF_SINGLE
-from edge_agent.lab.evaluation.batch import ideal
+from edge_agent.lab.evaluation.batch import simulate_ideal
 from edge_agent.lab.evaluation.papers.conditions import MATCHED, given_motion
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
@@ -31,7 +31,7 @@ def turn() -> tuple[GivenMotion, FloatArray]:
     4).
     """
     spec = replace(MATCHED["003.turn"], duration_s=SHORT_S)
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     return given_motion(batch, spec.vehicle), batch.mu_wheel[:, 0]
 
 
@@ -110,7 +110,7 @@ def test_alpha_of_the_sigma_points_does_not_change_the_result(
 def test_printed_tuning_finds_friction_only_of_the_printed_tyre(proportional: bool) -> None:
     spec = MATCHED["000.jump" if proportional else "000.jump.similarity"]
     spec = replace(spec, duration_s=5.0)
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     setting = federated_friction.AS_PRINTED._replace(proportional=proportional)
     found = federated_friction.estimate(given_motion(batch, spec.vehicle), setting).mu.mean(axis=1)
     near = np.abs(found - batch.mu[:, 0]) < 0.1

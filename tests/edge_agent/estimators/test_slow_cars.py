@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators.estimates import Estimates
-from edge_agent.lab.evaluation.batch import DriveSet, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, simulate_realistic
 from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import DriveSetup, simulate_manoeuvre
@@ -38,7 +38,7 @@ def start(mu: float, vehicle: str, seed: int) -> tuple[Estimates, FloatArray]:
 @pytest.fixture(scope="module")
 def lane_changes() -> DriveSet:
     """Lane changes of a car that accelerates from 4 to 40 km/h on a dry road."""
-    return realistic((PAPERS | OTHERS)["001.gaining.dlc"], [FIGURES + 6])
+    return simulate_realistic((PAPERS | OTHERS)["001.gaining.dlc"], [FIGURES + 6])
 
 
 @pytest.mark.parametrize("vehicle", ["van", "sedan"])

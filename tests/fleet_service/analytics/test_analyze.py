@@ -268,6 +268,6 @@ def test_a_file_that_could_not_be_finished_is_none(tmp_path: Path) -> None:
         table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01"])
     )
     with pytest.raises((ValueError, struct.error)):
-        extract.write(broken, path)
+        extract.write_extract(broken, path)
     assert path.read_text() == "as it was"
     assert [one.name for one in tmp_path.iterdir()] == ["a.geojson"]

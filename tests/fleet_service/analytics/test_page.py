@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.analytics import output
-from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render_page
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.cli import main
 from schemas import grid
@@ -69,7 +69,7 @@ def cells(values: list[float | None], lasting: list[bool] | None = None) -> Draw
 
 def test_unmeasured_cells_have_no_colour_of_the_scale(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
-    path.write_text(render("two", cells([0.9, None]), GRIP_SCALE))
+    path.write_text(render_page("two", cells([0.9, None]), GRIP_SCALE))
     dry = ",".join(str(int(shade(0.9, *GRIP_RANGE)[k : k + 2], 16)) for k in (1, 3, 5))
     with open_page(path) as found:
         colours = found.count_colours()
@@ -90,7 +90,7 @@ def test_cells_of_two_continents_open_as_one_area_and_a_list(tmp_path: Path) -> 
     rows = [["0.3"]] * len(number)
     path = tmp_path / "page.html"
     drawn = DrawnCells(boxes, [0] * len(number), {"map": [0.3] * len(number)}, ["mu"], rows)
-    path.write_text(render("two", drawn, GRIP_SCALE))
+    path.write_text(render_page("two", drawn, GRIP_SCALE))
     with open_page(path) as found:
         assert found.drawn_count == 40
         assert (
@@ -104,7 +104,7 @@ def test_cells_of_two_continents_open_as_one_area_and_a_list(tmp_path: Path) -> 
 
 def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
-    path.write_text(render("one", cells([0.2]), GRIP_SCALE))
+    path.write_text(render_page("one", cells([0.2]), GRIP_SCALE))
     with open_page(path) as found:
         canvas = found.page.locator("canvas.map")
         box = canvas.bounding_box()
@@ -129,7 +129,7 @@ def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
 
 def test_a_finger_moves_the_map(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
-    path.write_text(render("one", cells([0.2]), GRIP_SCALE))
+    path.write_text(render_page("one", cells([0.2]), GRIP_SCALE))
     with open_page(path, phone=True) as found:
         before = found.count_colours()
         found.page.evaluate("""() => {

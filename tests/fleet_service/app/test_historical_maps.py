@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fleet_service.app import historical_maps
 from fleet_service.app.engine import Engine
 from fleet_service.archive.format import files, layout, segments
-from fleet_service.archive.format.load import load, load_groups
+from fleet_service.archive.format.load import load_groups, load_rows
 from fleet_service.archive.format.row_filter import ValueRange
 from fleet_service.archive.maintenance.compaction import compact
 from fleet_service.ingest.inbox import Message
@@ -111,7 +111,7 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     ]
     for where, right in wanted:
         for columns in (["vehicle", "seq", "row", "leave_time", "latitude"], None):
-            found = load(path, schema, columns, [where])
+            found = load_rows(path, schema, columns, [where])
             assert found is not None
             names = columns or schema.names
             assert repr(found.to_pylist()) == repr(

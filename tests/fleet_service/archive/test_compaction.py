@@ -204,17 +204,17 @@ def test_a_reader_that_is_overtaken_begins_again(
 ) -> None:
     fill(tmp_path, 3, ROWS)
     whole = identities(tmp_path, Kind.OBSERVATION)
-    load = loading.load
+    load = loading.load_rows
     loaded = []
 
     def overtaken(path: Path, *args: object, **named: object) -> pa.Table | None:
         loaded.append(path)
         if len(loaded) == 2:
-            monkeypatch.setattr(reading, "load", load)
+            monkeypatch.setattr(reading, "load_rows", load)
             compact(tmp_path)
         return load(path, *args, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(reading, "load", overtaken)
+    monkeypatch.setattr(reading, "load_rows", overtaken)
     assert identities(tmp_path, Kind.OBSERVATION) == whole
 
 

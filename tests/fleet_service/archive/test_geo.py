@@ -77,7 +77,7 @@ def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: P
 
 def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> None:
     table = geo.with_cells(pa.table({"cell": [CELL] * 4, "sector": pa.array(range(4), pa.int8())}))
-    extract.write(table, tmp_path / "a.geojson")
+    extract.write_extract(table, tmp_path / "a.geojson")
     quarters = geopandas.read_file(tmp_path / "a.geojson").geometry.set_crs(
         None, allow_override=True
     )
@@ -123,7 +123,7 @@ def test_the_validator_refuses_a_file_whose_geometry_is_broken(tmp_path: Path) -
 def test_geojson_and_csv_equal_the_map(tmp_path: Path) -> None:
     table = geo.with_cells(a_map(3))
     for ending in (".geojson", ".csv"):
-        extract.write(table, tmp_path / f"map{ending}")
+        extract.write_extract(table, tmp_path / f"map{ending}")
     frame = geopandas.read_file(tmp_path / "map.geojson")
     assert frame["cell"].tolist() == table["cell"].to_pylist()
     np.testing.assert_allclose(frame["mu"], table["mu"].to_numpy(), atol=1e-6)

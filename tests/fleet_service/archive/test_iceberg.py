@@ -162,7 +162,7 @@ def test_iceberg_tables_can_refer_to_the_files_of_a_mirror(
     assert paths
     assert all(path.startswith(target.as_uri()) for path in paths)
     with pytest.raises(InputError, match="^catalog: this archive is registered at "):
-        iceberg.register(root, iceberg.Place(uri(root), "other", root.as_uri()))
+        iceberg.register_files(root, iceberg.Place(uri(root), "other", root.as_uri()))
 
 
 def test_the_namespace_is_the_one_that_is_given(

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from schemas.runtime.logs import event_logger, log_warnings, values
+from schemas.runtime.logs import event_logger, json_values, log_warnings
 
 
 def test_lines_are_text_for_people_and_json_for_programs() -> None:
     line = "status: 3 rows"
-    parts = values(rows=3, counts={"late": 1})
+    parts = json_values(rows=3, counts={"late": 1})
     plain = io.StringIO()
     structured = io.StringIO()
     event_logger("test", "text", plain).info(line, extra=parts)
     events = event_logger("test", "json", structured, service="shard-0")
     events.info(line, extra=parts)
     events.info("compacted: 7 rows\nof <many>, 5 %")
-    events.info("driving", extra=values(event="ready"))
+    events.info("driving", extra=json_values(event="ready"))
     assert plain.getvalue() == "status: 3 rows\n"
     first, second, third = (json.loads(text) for text in structured.getvalue().splitlines())
     assert (first["event"], first["rows"], first["counts"], first["service"]) == (

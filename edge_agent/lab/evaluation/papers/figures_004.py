@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FILTERS: Final = {"FCKF": "comparator", "ACOFCKF": "improved"}
 
 
-def plots(
+def make_plots(
     constant: NoisyRun, variable: NoisyRun, tuned: Memberships, tuning: PaperTuning
 ) -> list[PaperPlot]:
     """Return all plots for paper 004 from its two experiments (`constant` and `variable` noise) and

@@ -33,12 +33,12 @@ LEGEND: Final = (
 )
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Return a number as text for the report, with three digits; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.3g}"
 
 
-def cells(row: PaperRow) -> list[str]:
+def format_cells(row: PaperRow) -> list[str]:
     """Return the cells of a table row of the report as text: the number that the paper prints, and
     four results of this project for comparison.
 
@@ -49,8 +49,11 @@ def cells(row: PaperRow) -> list[str]:
     - the paper's estimator with ordinary sensors and vehicle parameters known to a few per cent
     - the project's default estimator on the same drives as the third result
     """
-    shown = row.shown or number(row.printed)
-    return [shown, *(number(value) for value in (row.matched, row.own, row.realistic, row.default))]
+    shown = row.shown or format_number(row.printed)
+    return [
+        shown,
+        *(format_number(value) for value in (row.matched, row.own, row.realistic, row.default)),
+    ]
 
 
 def limit_text(row: PaperRow) -> str:
@@ -62,7 +65,7 @@ def limit_text(row: PaperRow) -> str:
     return f"{'≤' if row.better == 'less' else '≥'} {row.limit:g}"
 
 
-def summary(done: Reproduction) -> str:
+def summary_sentence(done: Reproduction) -> str:
     """Return one sentence for the report: how many of the results under the paper's conditions meet
     their targets.
     """
@@ -80,7 +83,7 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
         for row in table.rows:
             verdict = "" if row.limit is None else "holds" if row.holds else "MISSED"
             lines.append(
-                "| " + " | ".join((row.what, *cells(row), limit_text(row), verdict)) + " |"
+                "| " + " | ".join((row.what, *format_cells(row), limit_text(row), verdict)) + " |"
             )
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
@@ -103,7 +106,7 @@ def report_markdown(done: Reproduction) -> str:
     notes = "\n".join(f"- {note}" for note in done.notes)
     parts = (
         f"# Paper {done.paper}: {done.title}",
-        summary(done),
+        summary_sentence(done),
         markdown_tables(done.tables),
         f"## Notes\n\n{notes}",
         f"## Elements of the paper\n\n{markdown_elements(done.elements)}",
@@ -126,7 +129,7 @@ def report_html(done: Reproduction, seconds: float) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
         f"<h1>{escape(title)}</h1>",
-        f'<p class="sum">{escape(summary(done))}</p>',
+        f'<p class="sum">{escape(summary_sentence(done))}</p>',
         f"<p>{escape(LEGEND)} Made in {seconds:.0f} s.</p>",
         "<h2>Tables</h2>",
         *(_table(table) for table in done.tables),
@@ -150,7 +153,7 @@ def _table(table: PaperTable) -> str:
         f"<h3>{escape(table.title)}</h3><table><tr><th></th>{head}<th>bar of matched</th></tr>"
     ]
     for row in table.rows:
-        found = cells(row)
+        found = format_cells(row)
         verdict = "" if row.limit is None else " held" if row.holds else " missed"
         body = [
             f'<td class="number">{found[0]}</td>',

@@ -12,8 +12,8 @@ import numpy as np
 from edge_agent.estimators import Estimates, federated_ckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
 from edge_agent.estimators.literal.federated_friction import AS_PRINTED, FederatedSetting, estimate
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
-from edge_agent.lab.evaluation.papers.columns import means, with_sensors, without_noise
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, simulate_ideal
+from edge_agent.lab.evaluation.papers.columns import mean_measures, with_sensors, without_noise
 from edge_agent.lab.evaluation.papers.conditions import MATCHED, given_motion
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
@@ -58,7 +58,7 @@ def _run_friction(spec: DriveSpec, setting: FederatedSetting) -> tuple[DriveSet,
     """Simulate a drive, and run the printed friction filter on it with the true motion as input.
     Return the drive and the estimated friction of the wheels (T, 4).
     """
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     return batch, estimate(given_motion(batch, spec.vehicle), setting).mu
 
 
@@ -75,7 +75,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
     )
     done.tables = [
         _printed_filter_table(batch, mu),
-        _joint_filter_table(means(joint_batch, joint), seeds),
+        _joint_filter_table(mean_measures(joint_batch, joint), seeds),
     ]
     done.plots = [_state_plot(batch, mu, joint), _signal_plot(batch), _path_plot(batch)]
     done.notes = list(NOTES)
@@ -134,7 +134,7 @@ def _joint_filter_table(matched: Values, seeds: Sequence[int]) -> PaperTable:
     """Return the table about the project's joint filter. `matched` has its mean errors under
     matched conditions; `seeds` are the seeds of the drives with ordinary sensors.
     """
-    own = means(*without_noise(PAPERS[SCENARIO], federated_ckf.make_bank))
+    own = mean_measures(*without_noise(PAPERS[SCENARIO], federated_ckf.make_bank))
     real, default = with_sensors(SCENARIO, ESTIMATOR, seeds)
     return PaperTable(
         "Joint filter of the project with the printed tyre",

@@ -14,8 +14,8 @@ from edge_agent.adaptation.rules import ALPHA, RATE
 from edge_agent.estimators import Estimates, adaptive_federated_ckf
 from edge_agent.estimators.adaptive_federated_ckf import AS_PRINTED, FKF, AdaptiveSetting
 from edge_agent.estimators.common.tyre_option import TyreOption
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal
-from edge_agent.lab.evaluation.papers.columns import means, with_sensors
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, run_estimator, simulate_ideal
+from edge_agent.lab.evaluation.papers.columns import mean_measures, with_sensors
 from edge_agent.lab.evaluation.papers.conditions import MATCHED
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
@@ -58,17 +58,19 @@ class MotionRun:
 
     def values(self, name: str) -> Values:
         """Return the measures (such as errors) of the estimates by the filter called `name`."""
-        return means(self.batch, self.reported[name])
+        return mean_measures(self.batch, self.reported[name])
 
 
 def run_drive(spec: DriveSpec, settings: dict[str, AdaptiveSetting]) -> MotionRun:
     """Simulate a drive with error-free sensors, and run the filters, one per entry of `settings`,
     on it. Each starts with the true friction.
     """
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     friction = float(batch.mu[0, 0])
     reported = {
-        name: estimates(adaptive_federated_ckf.make_bank(batch.vehicles, friction, setting), batch)
+        name: run_estimator(
+            adaptive_federated_ckf.make_bank(batch.vehicles, friction, setting), batch
+        )
         for name, setting in settings.items()
     }
     return MotionRun(batch, reported)

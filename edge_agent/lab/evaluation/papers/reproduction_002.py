@@ -14,7 +14,7 @@ from edge_agent.estimators import compensated_wckf
 from edge_agent.estimators.common.tyre_option import TyreOption
 from edge_agent.estimators.compensated_wckf import DriveWheelState
 from edge_agent.estimators.estimates import Column
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, simulate_ideal
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import IN_WHEEL_TYRE, MATCHED, given_motion
 from edge_agent.lab.evaluation.papers.outcome import (
@@ -121,7 +121,7 @@ def run_drive(spec: DriveSpec, tyre: TyreOption | None) -> ForceRun:
     sample, store the states of the wheel filter WCKF-A and the compensated tyre forces (weighted
     means of tyre model and wheel filter).
     """
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     bank = compensated_wckf.make_bank(batch.vehicles, float(batch.mu[0, 0]), tyre)
     fused = []
     first = []

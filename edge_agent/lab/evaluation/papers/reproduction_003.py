@@ -19,7 +19,7 @@ from edge_agent.estimators.literal.wheel_friction_ukf import (
     UnscentedSetting,
     estimate,
 )
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, simulate_ideal
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import LOW, MATCHED, given_motion
 from edge_agent.lab.evaluation.papers.outcome import (
@@ -112,7 +112,7 @@ def run_case(spec: DriveSpec, filters: dict[str, UnscentedSetting]) -> CaseRuns:
     """Simulate an experiment with error-free sensors, and run the friction filters, which get the
     true motion.
     """
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     motion = given_motion(batch, spec.vehicle)
     return CaseRuns(batch, {name: estimate(motion, setting) for name, setting in filters.items()})
 
@@ -292,7 +292,7 @@ def _ablation_rows() -> tuple[PaperRow, ...]:
 
 def _sensor_errors() -> tuple[PaperRow, ...]:
     spec = MATCHED["003.split"]
-    batch = ideal(spec)
+    batch = simulate_ideal(spec)
     motion = given_motion(batch, spec.vehicle)
     rows = []
     for name, what, omega in (

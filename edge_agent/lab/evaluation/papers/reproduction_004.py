@@ -16,10 +16,16 @@ from edge_agent.app.tuned_memberships import shipped_memberships
 from edge_agent.estimators import Estimates, paper_aco_fckf
 from edge_agent.estimators.common.tyre_option import PROPORTIONAL
 from edge_agent.estimators.paper_aco_fckf import AS_PRINTED, AT_THE_TRUTH, Setting, make_bank
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, ideal, repeat_drive
+from edge_agent.lab.evaluation.batch import (
+    DriveSet,
+    DriveSpec,
+    repeat_drive,
+    run_estimator,
+    simulate_ideal,
+)
 from edge_agent.lab.evaluation.papers.columns import with_sensors
 from edge_agent.lab.evaluation.papers.conditions import MATCHED
-from edge_agent.lab.evaluation.papers.figures_004 import plots
+from edge_agent.lab.evaluation.papers.figures_004 import make_plots
 from edge_agent.lab.evaluation.papers.outcome import (
     NONE,
     PaperRow,
@@ -96,12 +102,12 @@ def run_noise(
     seeds: Sequence[int],
 ) -> NoisyRun:
     """Simulate a drive without errors, add noise with each seed, and run the filters."""
-    batch = repeat_drive(ideal(spec), len(seeds))
+    batch = repeat_drive(simulate_ideal(spec), len(seeds))
     variance = noise_of(batch.t[:, 0], noise)
     for n, seed in enumerate(seeds):
         add_white(batch.signals[:, n], variance, np.random.default_rng([seed, 4]))
     reported = {
-        name: estimates(make_bank(batch.vehicles, sets, setting), batch)
+        name: run_estimator(make_bank(batch.vehicles, sets, setting), batch)
         for name, (sets, setting) in filters.items()
     }
     return NoisyRun(batch, reported)
@@ -140,7 +146,7 @@ def reproduce(seeds: Sequence[int]) -> Reproduction:
             "Sixteen lower vertices tuned under the printed conditions, judged on other noise", rows
         )
     )
-    done.plots = plots(both["constant"], both["variable"], tuned, tuning)
+    done.plots = make_plots(both["constant"], both["variable"], tuned, tuning)
     done.notes = list(NOTES)
     return done
 

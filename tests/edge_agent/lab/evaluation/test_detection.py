@@ -22,8 +22,8 @@ from edge_agent.lab.evaluation.detection_bars import DETECTION, detection_figure
 from edge_agent.lab.evaluation.detection_campaign import (
     DetectionTown,
     judge_towns,
+    simulate_towns,
     town_named,
-    towns,
 )
 from edge_agent.lab.evaluation.detection_drives import (
     DetectionDrive,
@@ -211,7 +211,7 @@ def test_names_of_detection_figures_are_unique_and_towns_are_named() -> None:
     with pytest.raises(InputError, match="town"):
         town_named("50001:wet")
     assert town_named("50003:rough:120:winter").winter
-    campaign = towns(range(20), quick=False)
+    campaign = simulate_towns(range(20), quick=False)
     assert {town.length for town in campaign} == {"short", "long"}
     assert sum(town.winter for town in campaign) == len(campaign) / 2
     assert not detection_figures(DetectionResults())

@@ -15,14 +15,27 @@ from edge_agent.cli import main
 from edge_agent.estimators import ESTIMATORS, Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import measures
-from edge_agent.lab.evaluation.bars import BARS, figures
-from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, realistic, repeat_drive
+from edge_agent.lab.evaluation.bars import BARS, evaluation_figures
+from edge_agent.lab.evaluation.batch import (
+    DriveSet,
+    DriveSpec,
+    repeat_drive,
+    simulate_ideal,
+    simulate_realistic,
+)
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.faults import CASES
-from edge_agent.lab.evaluation.paper_004 import noisy, variances
+from edge_agent.lab.evaluation.paper_004 import add_noise, noise_variances
 from edge_agent.lab.evaluation.printed import OWN, PRINTED
 from edge_agent.lab.evaluation.report import evaluation_report
-from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, SEDAN, VEHICLES, foreign
+from edge_agent.lab.evaluation.scenarios import (
+    FOREIGN,
+    OTHERS,
+    PAPERS,
+    SEDAN,
+    VEHICLES,
+    with_foreign_tyres,
+)
 from edge_agent.lab.seeds import FIGURES
 from schemas.runtime.figures import Figure
 from schemas.signals import S
@@ -102,7 +115,7 @@ def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
 @pytest.fixture(scope="module")
 def jumping() -> DriveSet:
     """Return two simulated drives in which the road's friction falls from 0.85 to 0.5."""
-    return realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
+    return simulate_realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
 
 
 def test_the_bars_are_those_that_were_asked_for() -> None:
@@ -110,9 +123,9 @@ def test_the_bars_are_those_that_were_asked_for() -> None:
 
 
 def test_missing_measurements_are_reported_except_in_a_quick_run() -> None:
-    assert {figure.name for figure in figures(Results(), quick=False)} == set(ASKED)
-    assert not any(figure.holds for figure in figures(Results(), quick=False))
-    assert figures(Results(), quick=True) == []
+    assert {figure.name for figure in evaluation_figures(Results(), quick=False)} == set(ASKED)
+    assert not any(figure.holds for figure in evaluation_figures(Results(), quick=False))
+    assert evaluation_figures(Results(), quick=True) == []
 
 
 def test_every_printed_figure_names_a_scenario_and_an_estimator_that_exist() -> None:
@@ -127,7 +140,7 @@ def test_every_printed_figure_names_a_scenario_and_an_estimator_that_exist() -> 
 def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(
     jumping: DriveSet,
 ) -> None:
-    found = measures.measures(jumping, fake(0.6, 0.45, 0.7, jumping))
+    found = measures.common_measures(jumping, fake(0.6, 0.45, 0.7, jumping))
     assert found["rmse_vx"] == pytest.approx([0.0, 0.0])
     assert found["nees"] == pytest.approx([0.0, 0.0])
     assert found["mu_error"] == pytest.approx([0.1, 0.1])
@@ -140,12 +153,16 @@ def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(
 def test_arrival_time_counts_from_the_change_or_to_the_end(
     jumping: DriveSet,
 ) -> None:
-    assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
+    assert measures.arrival_time(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx(
+        [0.0, 0.0]
+    )
     late = fake(0.85, 0.7, 0.9, jumping)
     late.mu[-50:] = 0.5
     changed = np.argmax(jumping.mu == 0.5, axis=0)
-    assert measures.arrival(jumping, late) == pytest.approx((len(late.mu) - 50 - changed) / 100.0)
-    assert (measures.arrival(jumping, fake(0.85, 0.7, 0.9, jumping)) > 1.0).all()
+    assert measures.arrival_time(jumping, late) == pytest.approx(
+        (len(late.mu) - 50 - changed) / 100.0
+    )
+    assert (measures.arrival_time(jumping, fake(0.85, 0.7, 0.9, jumping)) > 1.0).all()
 
 
 def test_false_change_is_an_interval_that_stays_away_from_the_truth(jumping: DriveSet) -> None:
@@ -158,17 +175,17 @@ def test_false_change_is_an_interval_that_stays_away_from_the_truth(jumping: Dri
 
 
 def test_sides_are_distinguished() -> None:
-    batch = realistic(replace(PAPERS["003.split"], duration_s=2.0), range(2))
-    found = measures.sides(batch, fake(0.3, 0.2, 0.4, batch))
+    batch = simulate_realistic(replace(PAPERS["003.split"], duration_s=2.0), range(2))
+    found = measures.side_measures(batch, fake(0.3, 0.2, 0.4, batch))
     assert found["low_error"] == pytest.approx([0.0, 0.0])
     assert found["high_coverage90"] == pytest.approx([0.0, 0.0])
 
 
 def test_noise_of_paper_004_affects_three_signals_by_its_schedule() -> None:
-    exact = repeat_drive(ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
-    variance = variances(exact.t[:, 0], "variable")
+    exact = repeat_drive(simulate_ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
+    variance = noise_variances(exact.t[:, 0], "variable")
     assert [variance[k] for k in (0, 150, 250, 350, 450)] == [0.04, 0.01, 0.05, 0.04, 0.01]
-    batch = noisy(exact, variance, [0, 1])
+    batch = add_noise(exact, variance, [0, 1])
     error = batch.signals - np.repeat(exact.signals, 2, axis=1)
     assert np.nanmax(np.abs(np.delete(error, [S.AX, S.AY, S.YAW_RATE], axis=2))) == 0.0
     assert error[:100, :, S.AX].var() == pytest.approx(0.04, rel=0.4)
@@ -179,8 +196,8 @@ def test_noise_of_paper_004_affects_three_signals_by_its_schedule() -> None:
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_foreign_tyres_make_another_drive(kind: str) -> None:
     usual = DriveSpec("j-turn", SEDAN, 0.4, duration_s=2.0)
-    own = ideal(usual)
-    other = ideal(foreign(usual, kind))
+    own = simulate_ideal(usual)
+    other = simulate_ideal(with_foreign_tyres(usual, kind))
     assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
 
 

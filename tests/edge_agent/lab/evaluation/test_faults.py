@@ -10,7 +10,7 @@ import pytest
 
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.lab.evaluation import faults
-from edge_agent.lab.evaluation.batch import DriveSet, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, simulate_realistic
 from edge_agent.lab.evaluation.campaign import DEFAULT
 from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, apply_fault
 from schemas.signals import Health, S
@@ -33,7 +33,7 @@ HONEST = 0.75  # share of the samples of six drives; a drive that is wrong until
 
 @pytest.fixture(scope="module")
 def slalom() -> DriveSet:
-    return realistic(DRIVES["slalom"], range(1))
+    return simulate_realistic(DRIVES["slalom"], range(1))
 
 
 def test_every_fault_that_was_asked_for_has_a_row_with_an_expectation() -> None:
@@ -45,14 +45,14 @@ def test_every_fault_that_was_asked_for_has_a_row_with_an_expectation() -> None:
 def test_no_fault_loses_an_estimate_and_health_reports_detectable_ones(
     estimator: str,
 ) -> None:
-    found = faults.campaign(range(1), [estimator], ("slalom", "braking"))
+    found = faults.run_fault_campaign(range(1), [estimator], ("slalom", "braking"))
     for (case, _), measured in found.items():
         assert (measured["finite"] == 1.0).all(), case
         assert (measured["told"] == float(CASES[case].flag != Health.OK)).all(), case
 
 
 def test_under_a_fault_the_interval_of_the_default_stays_honest() -> None:
-    found = faults.campaign(range(2), [DEFAULT])
+    found = faults.run_fault_campaign(range(2), [DEFAULT])
     for (case, _), measured in found.items():
         assert measured["coverage90"].mean() >= HONEST, case
 

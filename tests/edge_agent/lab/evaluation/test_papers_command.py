@@ -28,7 +28,12 @@ from edge_agent.lab.evaluation.papers.outcome import (
     PlotPanel,
     Reproduction,
 )
-from edge_agent.lab.evaluation.papers.page import limit_text, markdown_tables, report_html, summary
+from edge_agent.lab.evaluation.papers.page import (
+    limit_text,
+    markdown_tables,
+    report_html,
+    summary_sentence,
+)
 from edge_agent.lab.evaluation.papers.reproduction_001 import BOTH, run_drive
 from edge_agent.lab.evaluation.papers.reproduction_004 import run_noise
 from edge_agent.lab.simulation.presets import PRESETS
@@ -69,8 +74,8 @@ def replace_bar(row: PaperRow, bar: float) -> PaperRow:
 
 
 def test_summary_names_the_rows_that_miss() -> None:
-    assert summary(made_up(HELD, SHOWN)) == "1 of 1 matched numbers meet their bar."
-    assert "Missed: mae_vy" in summary(made_up(HELD, MISSED))
+    assert summary_sentence(made_up(HELD, SHOWN)) == "1 of 1 matched numbers meet their bar."
+    assert "Missed: mae_vy" in summary_sentence(made_up(HELD, MISSED))
 
 
 def test_tables_show_dashes_where_nothing_is_known() -> None:

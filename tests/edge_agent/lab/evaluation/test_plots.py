@@ -8,7 +8,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.lab.evaluation import plots
-from edge_agent.lab.evaluation.batch import estimates, realistic
+from edge_agent.lab.evaluation.batch import run_estimator, simulate_realistic
 from edge_agent.lab.evaluation.campaign import PlottedDrive
 from edge_agent.lab.evaluation.detection import ROC_FLAG_MU, ROC_NATS
 from edge_agent.lab.seeds import FIGURES
@@ -21,9 +21,9 @@ def drives() -> dict[str, PlottedDrive]:
     """Return a drive, a double lane change, with the estimates of each of two estimators, by
     estimator name.
     """
-    batch = realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
+    batch = simulate_realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
     return {
-        name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch))
+        name: PlottedDrive(batch, run_estimator(bank_of(name, batch.vehicles), batch))
         for name in ("ckf", "sr-ukf")
     }
 
@@ -31,9 +31,9 @@ def drives() -> dict[str, PlottedDrive]:
 def test_title_states_manoeuvre_speed_friction_vehicle_and_seed(
     drives: dict[str, PlottedDrive],
 ) -> None:
-    title = plots.title("004.dlc", drives["ckf"], 7)
+    title = plots.drive_title("004.dlc", drives["ckf"], 7)
     assert title == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
-    assert plots.title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
+    assert plots.drive_title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
 
 
 def test_the_roc_plot_shows_belief_slip_flag_and_oracle(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import oracle, real_world
-from edge_agent.lab.evaluation.batch import DriveSet, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, simulate_realistic
 from edge_agent.lab.evaluation.real_world import PRIOR, Tally
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.seeds import FIGURES
@@ -167,9 +167,9 @@ def test_oracle_error_comes_only_from_unknown_parameters() -> None:
     Its friction error must be below 0.1.
     """
     seeds = range(FIGURES, FIGURES + 4)
-    speeds = oracle.speed(seeds)
-    (frictions, expected) = oracle.friction(seeds)
-    batch = realistic(PAPERS["002.sine"], seeds)
+    speeds = oracle.speed_rmse(seeds)
+    (frictions, expected) = oracle.friction_errors(seeds)
+    batch = simulate_realistic(PAPERS["002.sine"], seeds)
     true = PAPERS["002.sine"].vehicle.vehicle.wheel_radius
     by_wheels = [
         abs(vehicle.wheel_radius / true - 1.0) * batch.truth["true_vx"].mean()

@@ -16,14 +16,14 @@ from edge_agent.estimators.friction_mixture.report.reported_interval import (
     NEARER,
     UPPER_END,
 )
-from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
-from edge_agent.lab.evaluation.measures import bounds, consistency
+from edge_agent.lab.evaluation.batch import DriveSet, run_estimator, simulate_realistic
+from edge_agent.lab.evaluation.measures import consistency_shares, mean_bounds
 from edge_agent.lab.evaluation.reliability import (
     LEVELS,
     between_quantiles,
     estimate_with_ranks,
     on_the_grid,
-    shares,
+    rank_shares,
 )
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from schemas.mugrid import BINS, CENTRES
@@ -32,7 +32,7 @@ from tests.edge_agent.lab.evaluation.test_evaluation import fake
 
 @pytest.fixture(scope="module")
 def turning() -> DriveSet:
-    return realistic(replace(PAPERS["003.turn"], duration_s=4.0), range(3))
+    return simulate_realistic(replace(PAPERS["003.turn"], duration_s=4.0), range(3))
 
 
 def test_truths_from_the_stated_distribution_match_each_quantile() -> None:
@@ -40,14 +40,14 @@ def test_truths_from_the_stated_distribution_match_each_quantile() -> None:
     mean = rng.uniform(0.5, 0.7, 20_000)
     truth = mean + 0.05 * rng.normal(size=mean.shape)
     ranks = between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05)
-    assert shares(ranks) == pytest.approx(np.array(LEVELS), abs=0.012)
+    assert rank_shares(ranks) == pytest.approx(np.array(LEVELS), abs=0.012)
 
 
 def test_an_overconfident_answer_is_seen_at_both_ends() -> None:
     rng = np.random.default_rng(1)
     mean = np.full(20_000, 0.6)
     truth = mean + 0.1 * rng.normal(size=mean.shape)
-    output = shares(between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05))
+    output = rank_shares(between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05))
     assert output[0] > 0.15
     assert output[-1] < 0.85
 
@@ -71,7 +71,7 @@ def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
 
 @pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
 def test_computing_ranks_does_not_change_the_estimates(estimator: str, turning: DriveSet) -> None:
-    plain = estimates(bank_of(estimator, turning.vehicles), turning)
+    plain = run_estimator(bank_of(estimator, turning.vehicles), turning)
     reported, ranks = estimate_with_ranks(bank_of(estimator, turning.vehicles), turning)
     assert np.array_equal(plain.values, reported.values)
     assert ranks.shape == (3, 3)
@@ -111,15 +111,15 @@ def test_consistency_is_one_for_the_right_spread_and_zero_for_a_tenth(
         one.vx[:] += rng.normal(size=reported.vx.shape)
         one.vy[:] += rng.normal(size=reported.vy.shape)
         one.innovation_nis[:] = rng.chisquare(3, reported.vx.shape) / 3.0
-    found = consistency(turning, right)
+    found = consistency_shares(turning, right)
     assert found["nees_within"][0] == pytest.approx(0.95, abs=0.03)
     assert found["nis_within"][0] == pytest.approx(0.95, abs=0.03)
     wrong.vx_std[:] = 0.1 * reported.vx_std
     wrong.vy_std[:] = 0.1 * reported.vy_std
-    assert consistency(turning, wrong)["nees_within"][0] < 0.05
+    assert consistency_shares(turning, wrong)["nees_within"][0] < 0.05
 
 
 def test_bounds_close_in_on_one_with_more_drives() -> None:
-    few = bounds("nees", 5)
-    many = bounds("nees", 500)
+    few = mean_bounds("nees", 5)
+    many = mean_bounds("nees", 500)
     assert few[0] < many[0] < 1.0 < many[1] < few[1]

@@ -27,7 +27,7 @@ def test_worth_is_the_ratio_of_means_with_its_spread_per_surface() -> None:
             "random": [0.5, 0.5],
         }.items()
     }
-    found = {figure.name: figure for figure in worth.figures(scores)}
+    found = {figure.name: figure for figure in worth.comparison_figures(scores)}
     assert worth.score_ratio(scores, "fuzzy.worth") == pytest.approx(0.6)
     assert worth.score_ratio(scores, "ants.worth") == pytest.approx(0.625)
     assert worth.score_ratio(scores, "ants.worth.random") == pytest.approx(1.0)
@@ -57,7 +57,7 @@ def test_figures_with_targets_are_first_and_missing_ones_fail() -> None:
 
 def test_with_and_without_rules_are_three_filters() -> None:
     lines: list[str] = []
-    scores = worth.campaign([FIGURES], quick=True, log_line=lines.append)
+    scores = worth.compare_variants([FIGURES], quick=True, log_line=lines.append)
     every = {float(scores[way]["all"][0]) for way in ("fuzzy", "sets_off", "none")}
     assert len(every) == 3
     assert {"default", "random", "colony"} <= set(scores)

@@ -10,9 +10,9 @@ import pytest
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.colony import (
     Habits,
-    deposit,
+    deposit_pheromone,
     lowest_pheromone,
-    renew,
+    renew_pheromone,
     transition_probabilities,
 )
 from edge_agent.lab.tuning.search import Graph, Iteration, Objective, Problem, Result
@@ -105,13 +105,13 @@ def test_transition_probabilities_sum_to_one_over_valid_positions() -> None:
 
 def test_every_vertex_receives_the_whole_deposit() -> None:
     reachable = np.ones((2, 4), dtype=np.bool_)
-    laid = deposit(np.array([[0, 3], [0, 1]]), np.array([0.5, 0.25]), reachable)
+    laid = deposit_pheromone(np.array([[0, 3], [0, 1]]), np.array([0.5, 0.25]), reachable)
     np.testing.assert_array_equal(laid, [[0.75, 0, 0, 0], [0, 0.25, 0, 0.5]])
 
 
 def test_evaporation_takes_its_share_and_the_deposit_is_added() -> None:
     reachable = np.ones((1, 2), dtype=np.bool_)
-    renewed = renew(
+    renewed = renew_pheromone(
         np.array([[0.8, 0.8]]), np.array([[0.1, 0.0]]), reachable, evaporation=0.25, retrace=0.9
     )
     np.testing.assert_allclose(renewed, [[0.7, 0.6]])
@@ -122,8 +122,8 @@ def test_pheromone_stays_in_bounds_when_one_path_always_wins() -> None:
     lowest = lowest_pheromone(reachable, 0.3)
     pheromone = np.ones(reachable.shape)
     for _ in range(200):
-        laid = deposit(np.zeros((1, 3), dtype=np.int64), np.array([0.6]), reachable)
-        pheromone = renew(pheromone, laid, reachable, evaporation=0.6, retrace=0.3)
+        laid = deposit_pheromone(np.zeros((1, 3), dtype=np.int64), np.array([0.6]), reachable)
+        pheromone = renew_pheromone(pheromone, laid, reachable, evaporation=0.6, retrace=0.3)
     np.testing.assert_allclose(pheromone[:, 0], 1.0)
     np.testing.assert_allclose(pheromone[:, 1:], np.broadcast_to(lowest, (3, 3)))
     odds = transition_probabilities(pheromone, np.ones((3, 4)), reachable, alpha=1.0, theta=1.0)

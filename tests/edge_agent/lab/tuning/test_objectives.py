@@ -21,13 +21,13 @@ from edge_agent.lab.tuning.objectives import (
     TRAIN,
     TuningScores,
     TuningSet,
-    choices,
+    candidate_values,
     detection_cost,
     detection_scores,
     interval_score,
     objective_on,
-    record,
     record_all,
+    record_drives,
     scores_of,
 )
 from edge_agent.lab.tuning.search import Iteration
@@ -40,7 +40,7 @@ ESTIMATOR = tune.ESTIMATOR
 @pytest.fixture(scope="module")
 def drives() -> TuningSet:
     """Return three short simulated drives of the training set."""
-    return record(TRAIN[:3], 4.0)
+    return record_drives(TRAIN[:3], 4.0)
 
 
 def test_recorded_drives_stand_side_by_side(drives: TuningSet) -> None:
@@ -153,7 +153,7 @@ def test_an_unknown_objective_is_refused(drives: TuningSet) -> None:
 def test_default_is_among_the_choices_and_all_lie_within_the_bounds() -> None:
     lower, upper = Memberships.bounds()
     for value, positions, least, largest in zip(
-        Memberships().to_vector(), choices(7), lower, upper, strict=True
+        Memberships().to_vector(), candidate_values(7), lower, upper, strict=True
     ):
         assert value in positions
         assert np.all((least <= positions) & (positions <= largest))
@@ -263,7 +263,7 @@ def test_table_has_a_row_per_way_and_set_of_drives() -> None:
 
 
 def test_other_drive_gives_another_score(drives: TuningSet) -> None:
-    other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
+    other = record_drives((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
     assert scores_of(Memberships(), other, ESTIMATOR) != scores_of(Memberships(), drives, ESTIMATOR)
 
 

@@ -26,7 +26,7 @@ def drives() -> list[sensitivity.JudgedDrives]:
 
 
 def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.JudgedDrives]) -> None:
-    changes = sensitivity.campaign(drives, only="curve_c")
+    changes = sensitivity.vary_constants(drives, only="curve_c")
     assert [change.name for change in changes] == ["curve_c"] * 2
     assert {change.factor for change in changes} == set(sensitivity.FACTORS)
     assert changes[0].effect >= changes[1].effect

@@ -23,7 +23,7 @@ from edge_agent.lab.tuning.study import (
     VARIANCE,
     StudySet,
     mean_log_likelihood,
-    record,
+    record_noisy_drives,
     run_search,
     scores_of,
 )
@@ -36,7 +36,7 @@ STILL = study_report.GIVEN["fixed"]
 @pytest.fixture(scope="module")
 def drives() -> StudySet:
     """Return the first two drives of the study's search set, six seconds of each."""
-    return record(TRAIN[:2])
+    return record_noisy_drives(TRAIN[:2])
 
 
 def test_judging_drives_share_no_seed_or_manoeuvre_with_search_drives() -> None:
@@ -109,7 +109,7 @@ def test_the_quick_study_writes_figures_table_plot_and_a_tuned_file(
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
     assert header["seeds"] == [0, 1]
     listed = [Figure(row["name"], row["value"], row["unit"]) for row in rows]
-    assert (tmp_path / "study.md").read_text() == study_report.markdown(listed)
+    assert (tmp_path / "study.md").read_text() == study_report.results_table(listed)
     names = {figure.name for figure in listed}
     for name in CONDITIONS:
         assert {f"tuning.{name}.{way}.log_likelihood" for way in study_report.SHOWN} <= names
