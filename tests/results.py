@@ -384,7 +384,9 @@ def _campaign_section(name: str) -> Iterator[str]:
     if rows:
         yield "\n|figure| |value|target|unit|commit|\n|---|---|---|---|---|---|"
     for row in rows:
-        mark = "" if row["bar"] is None else HOLDS if row["holds"] else MISSED
+        mark = ""
+        if row["bar"] is not None:
+            mark = HOLDS if row["holds"] else MISSED
         yield (
             f"|`{row['name']}`|{mark}|{format_number(row['value'])}|{format_bar(row)}"
             f"|{escape_unit(row['unit'])}|{row['commit']}|"

@@ -161,11 +161,9 @@ def format_value(values: dict[str, float], name: str, *, spread: bool = True) ->
     """
     value = values.get(name, math.nan)
     sd = values.get(f"{name}.sd")
-    return (
-        "–"
-        if math.isnan(value)
-        else f"{value:.3g}" + (f" ± {sd:.2g}" if spread and sd is not None else "")
-    )
+    if math.isnan(value):
+        return "–"
+    return f"{value:.3g}" + (f" ± {sd:.2g}" if spread and sd is not None else "")
 
 
 def own_plants_table(barred: Sequence[Figure], values: dict[str, float]) -> str:
@@ -303,7 +301,9 @@ def format_verdict(shares: Sequence[float]) -> str:
     estimator, the share of drives that passed the check. The cell is "yes" if all shares are 1,
     otherwise "NO" with the smallest share; a dash if there are no shares.
     """
-    return "–" if not shares else "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
+    if not shares:
+        return "–"
+    return "yes" if min(shares) == 1.0 else f"NO ({min(shares):.2g})"
 
 
 def consistency_table(values: dict[str, float]) -> str:
@@ -377,20 +377,30 @@ def detection_table(figures: Sequence[Figure]) -> str:
         held = []
         for kind in ("rough", "plain"):
             figure = by_name.get(f"{name}.{kind}")
-            error = by_name.get(f"{name}.{kind}.se")
-            winter = by_name.get(f"{name}.{kind}.winter")
             shown = figure is not None and not math.isnan(figure.value)
-            cells.append(
-                f"{figure.value:.3g}"
-                + (f" ± {error.value:.1g}" if error else "")
-                + (f" ({winter.value:.3g})" if winter and math.isfinite(winter.value) else "")
-                if figure and shown
-                else "–"
-            )
+            cells.append(_detection_cell(by_name, f"{name}.{kind}") if shown else "–")
             if figure is not None and figure.bar is not None:
                 limits.append(f"{figure.bar:g}")
                 held += [figure.holds] if shown else []
-        sign = "" if not limits else "≤ " if by_name[f"{name}.rough"].better == "less" else "≥ "
-        verdict = "" if not held else "holds" if all(held) else "✗"
+        sign = ""
+        if limits:
+            sign = "≤ " if by_name[f"{name}.rough"].better == "less" else "≥ "
+        verdict = ""
+        if held:
+            verdict = "holds" if all(held) else "✗"
         rows.append([f"`{name}`", *cells, sign + "; ".join(dict.fromkeys(limits)), verdict])
     return markdown_table(("figure", "rough", "plain", "bar", ""), rows)
+
+
+def _detection_cell(figures: dict[str, Figure], name: str) -> str:
+    """Return the value of the figure `name` as text, with its standard error and, in parentheses,
+    its value in winter, if they are known.
+    """
+    error = figures.get(f"{name}.se")
+    winter = figures.get(f"{name}.winter")
+    text = f"{figures[name].value:.3g}"
+    if error:
+        text += f" ± {error.value:.1g}"
+    if winter and math.isfinite(winter.value):
+        text += f" ({winter.value:.3g})"
+    return text

@@ -94,7 +94,11 @@ def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]
         split = 0.5 if vehicle.drive_split_front is None else vehicle.drive_split_front
         base = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
         rear = vehicle.cg_to_front_axle / base
-        driven = rear if split < 0.25 else 1.0 - rear if split > 0.75 else 1.0
+        driven = 1.0
+        if split < 0.25:
+            driven = rear
+        elif split > 0.75:
+            driven = 1.0 - rear
         car = CarGeometry(vehicle.wheel_radius, base, 0.5 * vehicle.track_front, driven)
         period = float(t[1, n] - t[0, n]) if len(t) > 1 else 0.01
         out[:, n] = _flag_friction(np.ascontiguousarray(signals[:, n]), car, period)
@@ -176,7 +180,11 @@ def _follow_rims(
     middle = np.nanmedian(rim)
     most = np.nanmax(rim)
     least = np.nanmin(rim)
-    target = most if ax < -BRAKING else least if ax > BRAKING else middle
+    target = middle
+    if ax < -BRAKING:
+        target = most
+    elif ax > BRAKING:
+        target = least
     if np.isnan(speed):
         speed = middle
     speed = min(max(target, speed + (ax - FREE) * period), speed + (ax + FREE) * period)

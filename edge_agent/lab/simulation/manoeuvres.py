@@ -163,9 +163,16 @@ def braking(now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) for braking with anti-lock control after
     one second, down to walking pace.
     """
-    return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
-        now, now.speed if now.t < 1.0 else 1.5
-    )
+    return 0.0, _brake_after_a_second(now, -12.0)
+
+
+def _brake_after_a_second(now: Moment, braking: float) -> float:
+    """Return the acceleration [m/s^2] for a second at constant speed, then `braking` down to
+    walking pace.
+    """
+    if now.t >= 1.0 and now.vx > 2.0:
+        return braking
+    return hold(now, now.speed if now.t < 1.0 else 1.5)
 
 
 def split_braking(now: Moment) -> tuple[float, float]:
@@ -179,9 +186,7 @@ def gentle_braking(now: Moment) -> tuple[float, float]:
     """Return the controls (road-wheel angle, acceleration) for braking with 2 m/s^2 after one
     second, down to walking pace.
     """
-    return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(
-        now, now.speed if now.t < 1.0 else 1.5
-    )
+    return 0.0, _brake_after_a_second(now, -2.0)
 
 
 def constant_radius(now: Moment) -> tuple[float, float]:

@@ -202,7 +202,9 @@ def drives(
     If `winter` is True, the drives are in a random winter town that `seed` determines, and the cars
     have winter equipment.
     """
-    scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
+    scenario = "hills" if rough else "demo"
+    if winter:
+        scenario = f"winter-{seed}"
     fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
     parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
     t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))

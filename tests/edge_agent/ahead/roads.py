@@ -48,8 +48,9 @@ def cells(
     friction `mu`, an interval of ± `width`, and the kind of evidence `basis`, such as MEASURED.
     """
     median = np.full(len(key), mu)
-    slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
-    belief = local_map.belief_of(median - width, median, median + width, slippery)
+    is_below = [mu - width <= 0.4, mu + width < 0.4]
+    p_slippery = np.full(len(key), np.mean(is_below))
+    belief = local_map.belief_of(median - width, median, median + width, p_slippery)
     return ReceivedCells(
         key,
         belief,

@@ -81,7 +81,9 @@ def markdown_tables(tables: Sequence[PaperTable]) -> str:
         head = ("", *COLUMNS, "bar of matched", "")
         lines = [f"## {table.title}", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         for row in table.rows:
-            verdict = "" if row.limit is None else "holds" if row.holds else "MISSED"
+            verdict = ""
+            if row.limit is not None:
+                verdict = "holds" if row.holds else "MISSED"
             lines.append(
                 "| " + " | ".join((row.what, *format_cells(row), limit_text(row), verdict)) + " |"
             )
@@ -154,7 +156,9 @@ def _table(table: PaperTable) -> str:
     ]
     for row in table.rows:
         found = format_cells(row)
-        verdict = "" if row.limit is None else " held" if row.holds else " missed"
+        verdict = ""
+        if row.limit is not None:
+            verdict = " held" if row.holds else " missed"
         body = [
             f'<td class="number">{found[0]}</td>',
             f'<td class="number{verdict}">{found[1]}</td>',
