@@ -144,9 +144,9 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     bend = np.abs(np.nan_to_num(curvature))
     expected = np.where(measured, mu_lower, UNKNOWN_LOWER)
     grip = GRAVITY * expected
-    held = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
+    cornering = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
     squares = np.where(
-        measured, np.minimum(held, stopping_speed(expected, SIGHT_M) ** 2), np.inf
+        measured, np.minimum(cornering, stopping_speed(expected, SIGHT_M) ** 2), np.inf
     ).tolist()
     brakes = np.minimum(grip, COMFORT).tolist()
     bends = bend.tolist()

@@ -76,36 +76,36 @@ def update_warnings(
     issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
     stretches = [stretch for horizon in horizons for stretch in _slippery_stretches(horizon, speed)]
-    kept: dict[str, Active] = {one.warning.id: one for one in active}
+    current: dict[str, Active] = {one.warning.id: one for one in active}
     here: set[str] = set()  # names of the warnings whose stretches lie ahead now
     for places, ways in _by_place(stretches):
         nearest = min(ways, key=lambda stretch: stretch.start)
-        before = next((one for one in kept.values() if one.places & places), None)
+        before = next((one for one in current.values() if one.places & places), None)
         sure = len({id(way.horizon) for way in ways}) == len(horizons)
         if before is None:
             if nearest.braking_energy > 0.5 * speed**2:
                 continue
             warning = _make_warning(_new_name(nearest, pose), "raised", nearest, pose, sure=sure)
             issued.append(warning)
-            kept[warning.id] = Active(warning, places, pose.time, nearest.start)
+            current[warning.id] = Active(warning, places, pose.time, nearest.start)
         else:
             warning = _make_warning(before.warning.id, "updated", nearest, pose, sure=sure)
             has_grown = len(places - before.places) >= CHANGED_PLACES
             if has_grown or abs(warning.mu - before.warning.mu) >= CHANGED_MU:
                 issued.append(warning)
                 places |= before.places
-                kept[warning.id] = Active(warning, places, pose.time, nearest.start)
+                current[warning.id] = Active(warning, places, pose.time, nearest.start)
             else:
-                kept[warning.id] = replace(before, seen=pose.time, distance_m=nearest.start)
+                current[warning.id] = replace(before, seen=pose.time, distance_m=nearest.start)
         here.add(warning.id)
-    for name, last in list(kept.items()):
+    for name, last in list(current.items()):
         if name in here:
             continue
         stands = justifies_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:
             issued.append(_end_warning(last, pose, stands=bool(stands)))
-            del kept[name]
-    return tuple(kept.values()), issued
+            del current[name]
+    return tuple(current.values()), issued
 
 
 def _slippery_stretches(horizon: Horizon, speed: float) -> list[_Stretch]:

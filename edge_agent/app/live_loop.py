@@ -152,7 +152,7 @@ def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
     delay of the loop [s].
     """
     counts = publisher.counts
-    seen = Kind.OBSERVATION
+    kind = Kind.OBSERVATION
     return {
         "published": sum(counts.published.values()),
         "acknowledged": sum(counts.acknowledged.values()),
@@ -165,8 +165,8 @@ def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
         "lag_s": round(progress.lag_s, 3),
         "signals_s": round(progress.signals_s, 3),
         "resent_batches": counts.resent_batches,
-        "observations_published": counts.published[seen],
-        "observations_acknowledged": counts.acknowledged[seen],
-        "observations_unsettled": publisher.count_unsettled(seen),
-        "observations_rejected": counts.rejected[seen],
+        "observations_published": counts.published[kind],
+        "observations_acknowledged": counts.acknowledged[kind],
+        "observations_unsettled": publisher.count_unsettled(kind),
+        "observations_rejected": counts.rejected[kind],
     }

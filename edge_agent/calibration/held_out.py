@@ -74,21 +74,21 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
     folds = split_folds(drives)
     candidates = []
     judged = []
-    for taught, held in folds:
+    for taught, held_out in folds:
         try:
             candidates.append(learn_calibration(taught, vehicle))
         except InputError:
             continue
-        judged.append(held)
+        judged.append(held_out)
     if not judged:
         raise InputError(
             "log",
             "the logs are too short to hold out a part for validation",
             "give two drives or a longer one",
         )
-    before = [judge(vehicle, held) for held in judged]
+    before = [judge(vehicle, held_out) for held_out in judged]
     best = before
-    kept = list[str]()
+    accepted = list[str]()
     refused = list[str]()
     for group, names in GROUPS.items():
         if not any(getattr(whole, name) is not None for name in names):
@@ -96,19 +96,19 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
         tried = [
             judge(
                 vehicle.model_copy(
-                    update={"calibration": restrict_groups(candidate, [*kept, group])}
+                    update={"calibration": restrict_groups(candidate, [*accepted, group])}
                 ),
-                held,
+                held_out,
             )
-            for candidate, held in zip(candidates, judged, strict=True)
+            for candidate, held_out in zip(candidates, judged, strict=True)
         ]
         if is_worse(tried, best):
             refused.append(group)
         else:
             best = tried
-            kept.append(group)
+            accepted.append(group)
     return HeldOut(
-        restrict_groups(whole, kept),
+        restrict_groups(whole, accepted),
         refused,
         _mean_prediction(before),
         _mean_prediction(best),
@@ -132,8 +132,8 @@ def split_folds(drives: Sequence[Drive]) -> list[tuple[list[Drive], Drive]]:
         np.linspace(0, len(drives) - 1, min(MOST_FOLDS, len(drives))).round().astype(int)
     )
     return [
-        ([drive for k, drive in enumerate(drives) if k != held], drives[held])
-        for held in chosen.tolist()
+        ([drive for k, drive in enumerate(drives) if k != held_out], drives[held_out])
+        for held_out in chosen.tolist()
     ]
 
 

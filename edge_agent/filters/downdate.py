@@ -80,7 +80,7 @@ def update_by_downdate(
         work[a, points : points + used] = 0.0
         work[a, points + a] = measurement.noise_std[present[a]]
     triangularize(work, used, points + used)
-    kept = sqrt_cov.copy()
+    saved = sqrt_cov.copy()
     start = mean.copy()
     spare = np.empty_like(mean)
     gain = _cross_covariance(deviations, state_deviations)
@@ -97,7 +97,7 @@ def update_by_downdate(
         square += white[a] ** 2
         mean += gain[a] * white[a]
         if not downdate(sqrt_cov, gain[a], spare):
-            sqrt_cov[:, :] = kept
+            sqrt_cov[:, :] = saved
             mean[:] = start
             used, log_likelihood, square = update(
                 mean, sqrt_cov, state_deviations, measurement, work

@@ -48,7 +48,7 @@ def limit_memory(most: int) -> None:
     lower limit, that limit remains.
     """
     with suppress(FileNotFoundError):
-        held = int(_PAGES.read_text().split()[0]) * resource.getpagesize()
-        limits = [held + most, *resource.getrlimit(resource.RLIMIT_AS)]
+        used = int(_PAGES.read_text().split()[0]) * resource.getpagesize()
+        limits = [used + most, *resource.getrlimit(resource.RLIMIT_AS)]
         limit = min(one for one in limits if one != resource.RLIM_INFINITY)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limits[2]))

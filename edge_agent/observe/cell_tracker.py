@@ -227,12 +227,12 @@ def _advance_tracks(
             now = t[k, n]
             _store_readings(track, fix, now)
             heading = track.yaw if now - track.yaw_time <= FIX_HELD_S else track.course
-            held = now - track.fix_time <= FIX_HELD_S
-            if held:
+            is_held = now - track.fix_time <= FIX_HELD_S
+            if is_held:
                 located.latitude[k, n] = track.latitude
                 located.longitude[k, n] = track.longitude
                 located.yaw[k, n] = heading
-            if not held and track.cell != NOWHERE:
+            if not is_held and track.cell != NOWHERE:
                 track.cell = NOWHERE
                 track.sector = NOWHERE
                 located.closes[k, n] = True

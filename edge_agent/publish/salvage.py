@@ -35,9 +35,9 @@ def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]
         (int.from_bytes(log[at : at + 4], "big"), log[at + _FRAME : at + _FRAME + PAGE])
         for at in range(_WAL_HEADER, len(log) - _FRAME, _FRAME + PAGE)
     ]
-    held = pages | dict(newer)
+    current = pages | dict(newer)
     for number, page in [*reversed(newer), *pages.items()]:
-        yield from _leaf_cells(number, page, held)
+        yield from _leaf_cells(number, page, current)
 
 
 def _leaf_cells(

@@ -234,9 +234,9 @@ class SequenceTrackers:
                 *(column[first].tolist() for column in (vehicle, boot, region)), strict=True
             )
         ]
-        held = largest_of(first_held, group, len(first)).tolist()
+        lowest = largest_of(first_held, group, len(first)).tolist()
         newest = largest_of(time, group, len(first)).tolist()
-        for stream, least, last in zip(streams, held, newest, strict=True):
+        for stream, least, last in zip(streams, lowest, newest, strict=True):
             stream.raise_to(least)
             stream.newest = max(stream.newest, last)
         # Only few rows are above the watermark, because senders store little.

@@ -102,21 +102,21 @@ def _find_implausible(
     """
     for n in range(len(row)):
         path = paths[row[n]]
-        held = path.count
-        if held == 0:
+        count = path.count
+        if count == 0:
             path.leap = LEAP_M
-        after = held  # number of anchors that are not later
+        after = count  # number of anchors that are not later
         while after > 0 and path.time[after - 1] > time[n]:
             after -= 1
         excess = _excess_at(paths, row[n], after, time[n], place[n])
-        if after == held and held > 0:
-            refilled = LEAP_M_PER_S * (time[n] - path.time[held - 1]) / NS
+        if after == count and count > 0:
+            refilled = LEAP_M_PER_S * (time[n] - path.time[count - 1]) / NS
             path.leap = min(LEAP_M, path.leap + refilled)
         if excess > path.leap:
             out[n] = True
             continue
         path.leap -= excess
-        if held == ANCHORS:
+        if count == ANCHORS:
             dropped = _least_needed(path.time)
             _drop_anchor(paths, row[n], dropped)
             after -= after > dropped

@@ -107,10 +107,10 @@ class Moments:
         """
         tile = int(grid.tile_of(cell))
         place = (cell & 0x3FFF) * grid.SECTORS + sector
-        held = (self._recent.at(moment) or {}).get(tile)
-        if held is None:
+        rows = (self._recent.at(moment) or {}).get(tile)
+        if rows is None:
             return []
-        return [records.as_values(row) | {"moment": moment} for row in held[held["place"] == place]]
+        return [records.as_values(row) | {"moment": moment} for row in rows[rows["place"] == place]]
 
     def _files(self) -> dict[int, Path]:
         if self._root is None:

@@ -234,9 +234,9 @@ class Lease:
         Raises:
             CopyError: another service has taken over, or the bucket does not answer.
         """
-        mine = self._mine
-        if mine is None or self._bucket.get(mine._replace(number=mine.number + 1).name) is not None:
-            self.lost = mine is not None
+        own = self._mine
+        if own is None or self._bucket.get(own._replace(number=own.number + 1).name) is not None:
+            self.lost = own is not None
             raise CopyError("another service has the lease")
 
     def wait(
@@ -309,12 +309,12 @@ class Lease:
         self._stop.set()
         if self._thread is not None:
             self._thread.join(self._lease_s)
-        mine = self._mine
+        own = self._mine
         self._mine = None
-        if mine is not None and not self.lost:
+        if own is not None and not self.lost:
             try:
                 self._bucket.put(
-                    mine.name, mine._replace(released=True, turn=mine.turn + 1, to=to).content
+                    own.name, own._replace(released=True, turn=own.turn + 1, to=to).content
                 )
             except CopyError as error:
                 log.warning("the lease was not released and expires by itself: %s", error)
@@ -380,7 +380,7 @@ class Lease:
         takes over the archive. Return False if another service was faster, or if `stop` is set.
         """
         succeeds = found is not None and found.holder != self._holder
-        mine = LeaseRecord(
+        own = LeaseRecord(
             number=1 if found is None else found.number + 1,
             holder=secrets.token_hex(8) if succeeds else self._holder,
             service=self.service,
@@ -391,14 +391,14 @@ class Lease:
             lease_s=self._lease_s,
         )
         began = elapsed_seconds()
-        if not self._bucket.create(mine.name, mine.content):
+        if not self._bucket.create(own.name, own.content):
             return False
         is_renewed = found is not None and self._bucket.get(found.name) != found.content
         # A holder that renewed its lease meanwhile may acknowledge for half of `lease_s`.
         if is_renewed and stop.wait(self._lease_s):
             return False
         # Only now may `release` let another service take over at once.
-        self._mine = mine
+        self._mine = own
         self._renewed = began
         self.succeeds = succeeds
         return True

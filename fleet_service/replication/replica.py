@@ -254,11 +254,11 @@ class BucketReplica:
             self._following.release()
 
     def _claim_bucket(self, service: str) -> None:
-        mine = json.dumps({"service": service}).encode()
+        own = json.dumps({"service": service}).encode()
         owner = self._slow.get(OWNER)
         if owner is None:
-            self._slow.put_new(OWNER, mine)
-        elif owner != mine:
+            self._slow.put_new(OWNER, own)
+        elif owner != own:
             with suppress(ValueError, KeyError, TypeError):
                 owner = str(json.loads(owner)["service"]).encode()
             problem = (

@@ -119,8 +119,8 @@ class PublicCells:
         bits = bit_of(observations.vehicle)
         for sector in (observations.sector, observations.second):
             slots = self._fusion.slots_of(observations.cell, np.maximum(sector, 0))
-            mine = (sector >= 0) & (slots >= 0)
-            np.bitwise_or.at(self._pending, slots[mine], bits[mine])
+            is_known = (sector >= 0) & (slots >= 0)
+            np.bitwise_or.at(self._pending, slots[is_known], bits[is_known])
         tiles = grid.tile_of(observations.cell)
         for tile in np.unique(tiles).tolist():
             present = int(np.bitwise_or.reduce(bits[tiles == tile]))

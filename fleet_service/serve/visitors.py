@@ -49,8 +49,8 @@ class Visitors:
         for sector in (observations.sector, observations.second):
             slot = self._fusion.slots_of(observations.cell, np.maximum(sector, 0))
             for back in range(PARTS):
-                mine = (part == self._part - back) & (slot >= 0) & (sector >= 0)
-                np.bitwise_or.at(self._bits[:, back], slot[mine], bit[mine])
+                is_current = (part == self._part - back) & (slot >= 0) & (sector >= 0)
+                np.bitwise_or.at(self._bits[:, back], slot[is_current], bit[is_current])
 
     @property
     def newest(self) -> int:

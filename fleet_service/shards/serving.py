@@ -47,18 +47,18 @@ def claim_regions(
     Raises:
         InputError: another service has one of the regions.
     """
-    mine = frozenset(ServiceToken(region, name, secrets.token_hex(4)) for region in regions)
-    with _hold_tokens(_claim_regions(session, mine, stop, former)):
-        yield mine
+    own = frozenset(ServiceToken(region, name, secrets.token_hex(4)) for region in regions)
+    with _hold_tokens(_claim_regions(session, own, stop, former)):
+        yield own
 
 
 @contextmanager
-def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
+def announce_regions(session: zenoh.Session, own: frozenset[ServiceToken]) -> Iterator[None]:
     """Announce to all clients that regions are served while the `with` block runs. The service must
     be able to answer queries before the block begins and until after it ends: an empty answer from
     an announced region means that no data exist there.
     """
-    with _hold_tokens(_declare_tokens(session, mine, SERVES)):
+    with _hold_tokens(_declare_tokens(session, own, SERVES)):
         yield
 
 
@@ -73,36 +73,39 @@ def _hold_tokens(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 
 @contextmanager
 def watch_successors(
-    session: zenoh.Session, mine: frozenset[ServiceToken]
+    session: zenoh.Session, own: frozenset[ServiceToken]
 ) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True if another service has taken over the regions of the
-    tokens `mine` since the `with` block began. In this way a service that cannot reach its bucket
+    tokens `own` since the `with` block began. In this way a service that cannot reach its bucket
     learns that it was replaced, and stops serving outdated data.
     """
     with presence.track_tokens(session) as services:
         before = services.active
-        yield lambda: bool(rival_tokens(mine, services.active - before))
+        yield lambda: bool(rival_tokens(own, services.active - before))
 
 
 def rival_tokens(
-    mine: frozenset[ServiceToken], present: set[ServiceToken], former: Collection[str] = ()
+    own: frozenset[ServiceToken], present: set[ServiceToken], former: Collection[str] = ()
 ) -> list[ServiceToken]:
     """Return, sorted, the liveliness tokens by which other services announce regions that overlap
-    the regions of `mine`. Tokens of the `former` services are excluded.
+    the regions of `own`. Tokens of the `former` services are excluded.
     """
-    candidates = (one for one in present - mine if one.service not in former)
-    return sorted(one for one in candidates if any(overlap(one.region, own.region) for own in mine))
+    regions = {token.region for token in own}
+    candidates = (token for token in present - own if token.service not in former)
+    return sorted(
+        token for token in candidates if any(overlap(token.region, region) for region in regions)
+    )
 
 
 def _claim_regions(
     session: zenoh.Session,
-    mine: frozenset[ServiceToken],
+    own: frozenset[ServiceToken],
     stop: threading.Event,
     former: Collection[str],
 ) -> list[zenoh.LivelinessToken]:
     def find_rivals() -> list[ServiceToken]:
         return rival_tokens(
-            mine, presence.active_tokens(session) | presence.active_tokens(session, CLAIMS), former
+            own, presence.active_tokens(session) | presence.active_tokens(session, CLAIMS), former
         )
 
     for _ in range(_TRIES):
@@ -114,7 +117,7 @@ def _claim_regions(
         if rivals:
             problem = f"{rivals[0].region} is already served by {rivals[0].service}"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
-        claims = _declare_tokens(session, mine, CLAIMS)
+        claims = _declare_tokens(session, own, CLAIMS)
         if not find_rivals():
             return claims
         for token in claims:  # another service began at the same time; the first to retry succeeds
@@ -128,9 +131,9 @@ def _claim_regions(
 
 
 def _declare_tokens(
-    session: zenoh.Session, mine: frozenset[ServiceToken], root: str
+    session: zenoh.Session, own: frozenset[ServiceToken], root: str
 ) -> list[zenoh.LivelinessToken]:
-    return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(mine)]
+    return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(own)]
 
 
 @contextmanager

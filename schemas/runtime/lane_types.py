@@ -222,8 +222,8 @@ def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
     the position: an index, or a tuple with one index for each axis except the last (the lanes).
     """
     kind = sig.args[0]
-    held = target.make_array(kind)(target, builder, values[0])
-    shape = cgutils.unpack_tuple(builder, held.shape, kind.ndim)
+    data = target.make_array(kind)(target, builder, values[0])
+    shape = cgutils.unpack_tuple(builder, data.shape, kind.ndim)
     place = sig.args[1]
     kinds = getattr(place, "types", (place,))
     parts = cgutils.unpack_tuple(builder, values[1]) if len(kinds) > 1 else [values[1]]
@@ -231,7 +231,7 @@ def find_vector(target: Any, builder: Any, sig: Any, values: Any) -> Any:
     for axis, (part, given) in enumerate(zip(parts, kinds, strict=True)):
         index = target.cast(builder, part, given, types.intp)
         row = builder.add(builder.mul(row, shape[axis]), index)
-    pointer = builder.bitcast(held.data, VECTOR.as_pointer())
+    pointer = builder.bitcast(data.data, VECTOR.as_pointer())
     return builder.gep(pointer, [row], inbounds=True)
 
 

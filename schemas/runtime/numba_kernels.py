@@ -97,9 +97,10 @@ class _Cache(FunctionCache):
         cells = self._py_func.__closure__
         if cells is None:
             return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
-        held = (cell.cell_contents for cell in cells)
+        enclosed = (cell.cell_contents for cell in cells)
         names = tuple(
-            f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held
+            f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}"
+            for one in enclosed
         )
         return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 

@@ -90,10 +90,10 @@ def record_type(kind: type) -> np.dtype[np.void]:
     offsets = []
     end = 0
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        held, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        number, *sizes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         shape = tuple(int(size) for size in sizes)
-        form = np.dtype((_number_type(held), (*shape, LANES) if held is LaneArray else shape))
-        offsets.append(_round_up(end, _alignment(held)))
+        form = np.dtype((_number_type(number), (*shape, LANES) if number is LaneArray else shape))
+        offsets.append(_round_up(end, _alignment(number)))
         names.append(name)
         formats.append(form)
         end = offsets[-1] + form.itemsize
@@ -108,22 +108,22 @@ def record_type(kind: type) -> np.dtype[np.void]:
     )
 
 
-def _number_type(held: Any) -> Any:  # noqa: ANN401 a field's annotation
-    if held is LaneArray:
+def _number_type(annotation: Any) -> Any:  # noqa: ANN401 a field's annotation
+    if annotation is LaneArray:
         return np.dtype("f8")
-    return np.dtype(KINDS[held]) if held in KINDS else record_type(held)
+    return np.dtype(KINDS[annotation]) if annotation in KINDS else record_type(annotation)
 
 
 @cache
-def _alignment(held: Any) -> int:  # noqa: ANN401 a field's annotation
-    """Return the alignment [bytes] of a record's field with the type `held`. The field's offset in
-    the record must be a multiple of this number.
+def _alignment(annotation: Any) -> int:  # noqa: ANN401 a field's annotation
+    """Return the alignment [bytes] of a record's field with the type `annotation`. The field's
+    offset in the record must be a multiple of this number.
     """
-    if held is LaneArray:
+    if annotation is LaneArray:
         return LINE
-    if held in KINDS:
-        return int(np.dtype(KINDS[held]).alignment)
-    hints = get_type_hints(held, include_extras=True).values()
+    if annotation in KINDS:
+        return int(np.dtype(KINDS[annotation]).alignment)
+    hints = get_type_hints(annotation, include_extras=True).values()
     parts = (get_args(hint)[0] if get_origin(hint) is Annotated else hint for hint in hints)
     return max((_alignment(part) for part in parts), default=1)
 

@@ -116,7 +116,7 @@ class Ros2Feed(Feed):
         if session is None:
             return
         with session:
-            held = [
+            subscribers = [
                 session.declare_subscriber(
                     f"{self._domain}/{topic.strip('/')}/*/*", self._make_listener(topic)
                 )
@@ -124,7 +124,7 @@ class Ros2Feed(Feed):
             ]
             self.openings += 1
             self.stopping.wait()
-            for subscriber in held:
+            for subscriber in subscribers:
                 subscriber.undeclare()
 
     def series(self, received: list[Received]) -> dict[str, Series]:

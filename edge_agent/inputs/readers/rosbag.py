@@ -65,8 +65,8 @@ def _close_files(part: Any) -> None:  # noqa: ANN401
     """Close the files that the reader of a ROS bag has opened. This is necessary because the
     library rosbags leaves a file open if it cannot read it as a bag.
     """
-    for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
-        if (file := getattr(held, "bio", None)) is not None:
+    for storage in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
+        if (file := getattr(storage, "bio", None)) is not None:
             file.close()
 
 

@@ -39,8 +39,8 @@ def expression(t: Table, least_vehicles: int) -> Table:
         )
     )
     t = t.filter(t.slippery == 1)
-    mine = ibis.window(group_by=[*place, "run"], order_by=order, preceding=None, following=None)
-    t = t.mutate(first=t.vehicle.first().over(mine))
+    spell = ibis.window(group_by=[*place, "run"], order_by=order, preceding=None, following=None)
+    t = t.mutate(first=t.vehicle.first().over(spell))
     spells = t.group_by([*place, "run"]).aggregate(
         onset=t.time.min(),
         last=t.time.max(),

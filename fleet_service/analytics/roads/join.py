@@ -184,15 +184,15 @@ def _join_cells(network: RoadNetwork, marks: _Marks, scale: FloatArray, side: fl
                 np.cumsum(np.append(0, row[1:] != row[:-1]))[: len(row)]
             ]
             goes_on = (end[link] == start[link[best]]) | (end[link[best]] == start[link])
-            mine = link == link[best]
+            is_best = link == link[best]
             more = cost - cost[best]
             # Also keep a link that continues the best one, if it begins within the cell.
-            kept = mine | (goes_on & (more <= side / 2.0))
+            is_kept = is_best | (goes_on & (more <= side / 2.0))
             other = np.full(len(piece), np.inf)
-            np.minimum.at(other, row, np.where(kept, np.inf, more))
+            np.minimum.at(other, row, np.where(is_kept, np.inf, more))
             other[np.isinf(other)] = np.nan
-            columns = (piece[row], np.full(len(row), axis), mark, metre, other[row], ~mine)
-            parts.append([column[kept] for column in columns])
+            columns = (piece[row], np.full(len(row), axis), mark, metre, other[row], ~is_best)
+            parts.append([column[is_kept] for column in columns])
     return _Joined(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

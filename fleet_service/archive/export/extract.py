@@ -106,10 +106,12 @@ def mask_unmeasured(table: pa.Table, names: Sequence[str], known: BoolArray) -> 
     """
     for name in names:
         column = table[name]
-        held: pa.ChunkedArray[Any] = pc.if_else(
+        masked: pa.ChunkedArray[Any] = pc.if_else(
             pa.array(known), column, pa.scalar(None, column.type)
         )
-        table = table.set_column(table.schema.get_field_index(name), table.schema.field(name), held)
+        table = table.set_column(
+            table.schema.get_field_index(name), table.schema.field(name), masked
+        )
     return table
 
 

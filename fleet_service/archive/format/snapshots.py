@@ -34,8 +34,8 @@ def write_snapshot(root: Path, table: pa.Table, now: int) -> Path:
     table = table.append_column("snapshot_time", time).sort_by(
         [("cell", "ascending"), ("sector", "ascending")]
     )
-    kept = table.cast(tables.MAP_ARCHIVE, safe=False)
-    put_in_place(root, geo.with_cells(kept), path, MAP)
+    archived = table.cast(tables.MAP_ARCHIVE, safe=False)
+    put_in_place(root, geo.with_cells(archived), path, MAP)
     return path
 
 

@@ -200,7 +200,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
     archived_files = {
         _file_url(root, place, path): path for path in layout.compacted_files(root, kind)
     }
-    mine = {
+    own = {
         name: file
         for name, file in _files_by_name(table).items()
         if name.startswith(_folder_url(place))
@@ -208,11 +208,11 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registrat
     # A file that was rewritten under the same name is recognised by its size.
     stale = [
         n
-        for n, file in mine.items()
+        for n, file in own.items()
         if n not in archived_files or archived_files[n].stat().st_size != file.file_size_in_bytes
     ]
-    missing = sorted((archived_files.keys() - mine.keys()) | (archived_files.keys() & set(stale)))
-    _commit_files(table, [mine[name] for name in stale], missing)
+    missing = sorted((archived_files.keys() - own.keys()) | (archived_files.keys() & set(stale)))
+    _commit_files(table, [own[name] for name in stale], missing)
     now = _files_by_name(table.refresh())
     return RegistrationResult(
         len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in archived_files)
