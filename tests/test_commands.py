@@ -26,7 +26,7 @@ import fleet_service.cli
 from deploy.demo.processes import DemoError, ManagedProcess
 from schemas.errors import InputError
 from schemas.runtime import commandline
-from tests.fleet_service.archive.kept import DATA
+from tests.fleet_service.archive.reference_archive import DATA
 from tests.structure import ROOT
 
 LINES: Final[dict[str, Any]] = {"edge-agent": edge_agent.cli, "fleet-service": fleet_service.cli}

@@ -269,7 +269,7 @@ def test_unusable_tyre_curve_is_reported(
 
 @pytest.mark.campaign
 def test_question_and_source_of_another_distribution_are_found(plugin_site: PluginSite) -> None:
-    from tests.fleet_service.archive.kept import DATA
+    from tests.fleet_service.archive.reference_archive import DATA
 
     archive = str(DATA / "v1.0" / "archive")
     options = ["--archive", archive, "--as-it-lies", "--json"]

@@ -28,7 +28,13 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.fleet_service.archive.kept import ROUNDS, make, map_of, messages, now_of
+from tests.fleet_service.archive.reference_archive import (
+    ROUNDS,
+    make_messages,
+    now_of,
+    read_map,
+    write_reference_archive,
+)
 from tests.outboxes import read_batches
 
 KINDS: Final = {
@@ -55,7 +61,7 @@ def run(site: Site) -> list[Figure]:
     random_ = random.Random(site.seed)
     each = site.choose_amount(40, 1)
     whole = site.folder / "whole"
-    make(whole)
+    write_reference_archive(whole)
     right = _reload_service(whole, whole)
     unnoticed = []
     loops = []
@@ -109,14 +115,14 @@ def _reload_service(root: Path, whole: Path) -> dict[str, Any]:
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
             if root != whole:
-                engine.intake.ingest(list(messages(turn)), now_of(ROUNDS))
+                engine.intake.ingest(list(make_messages(turn)), now_of(ROUNDS))
         engine.settlement.flush()
         counts = engine.counts
         damaged: list[Path] = []
         rows = {kind: _read_rows(root, kind, damaged) for kind in Kind}
         counted = counts.files_set_aside + counts.checkpoints_refused + counts.key_failures
         counted += counts.witnesses_damaged + len(damaged)
-        return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
+        return {"map": read_map(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
 
 
 def _read_rows(root: Path, kind: Kind, damaged: list[Path]) -> list[tuple[str, int, int]]:

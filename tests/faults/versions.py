@@ -26,7 +26,7 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import make_figure
 from tests.faults.frame import Site
-from tests.fleet_service.archive.kept import DATA, make, map_of
+from tests.fleet_service.archive.reference_archive import DATA, read_map, write_reference_archive
 from tests.fleet_service.archive.test_version import rewrite_file, with_columns
 
 
@@ -38,7 +38,7 @@ def run(site: Site) -> list[Figure]:
     new = site.folder / "new"
     shutil.copytree(DATA / "v1.0" / "archive", old)
     made_old = json.loads((DATA / "v1.0" / "map.json").read_text())
-    made_new = make(new)
+    made_new = write_reference_archive(new)
     changed = 0
     for pattern in (
         "inbox/*.parquet",
@@ -74,7 +74,7 @@ def run(site: Site) -> list[Figure]:
 
 def _find_difference(root: Path, made: dict[str, Any]) -> float:
     with closing(Engine(ServiceConfig(), root)) as engine:
-        found = np.asarray(map_of(engine, made["at"])["beliefs"])
+        found = np.asarray(read_map(engine, made["at"])["beliefs"])
     beliefs = np.asarray(made["beliefs"])
     return float(np.abs(found - beliefs).max()) if found.shape == beliefs.shape else float("inf")
 

@@ -34,7 +34,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.commandline import Command
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
-from tests.fleet_service.archive.kept import DATA, PLACES
+from tests.fleet_service.archive.reference_archive import DATA, PLACES
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, batch
 from tests.secured import make_enrolment
@@ -216,7 +216,7 @@ GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
     "analyze": ("analytics/roads/test_contract", "test_refused_files"),
     "router": ("test_refused_files",),
     "query": (),
-    "watch": ("test_alerts",),
+    "watch": ("client/test_stretches",),
     "page": ("page/test_server",),
     "cits": ("client/cits/test_command",),
     "hand-over": ("shards/test_handover",),

@@ -28,7 +28,7 @@ from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.changed_tiles import changed_tiles
 from tests.event_lines import logger_into
-from tests.fleet_service.archive.kept import DATA
+from tests.fleet_service.archive.reference_archive import DATA
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.secured import make_enrolment
 

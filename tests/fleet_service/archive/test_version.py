@@ -38,7 +38,15 @@ from schemas import query, tables
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.wire import Kind
-from tests.fleet_service.archive.kept import COLUMNS, DATA, ROUNDS, make, map_of, messages, now_of
+from tests.fleet_service.archive.reference_archive import (
+    COLUMNS,
+    DATA,
+    ROUNDS,
+    make_messages,
+    now_of,
+    read_map,
+    write_reference_archive,
+)
 from tests.fleet_service.archive.rows import fill, rows_of
 
 OLD = DATA / "v1.0"
@@ -96,9 +104,11 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
         assert engine.counts.checkpoints_refused == (begin == "checkpoint"), (
             "it has no digests: the log is replayed"
         )
-        same(map_of(engine, MADE["at"]), MADE)
+        same(read_map(engine, MADE["at"]), MADE)
         assert engine.alerts.count == MADE["alerts"] > 0
-        engine.intake.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
+        engine.intake.ingest(
+            [m for turn in range(ROUNDS) for m in make_messages(turn)], now_of(ROUNDS)
+        )
         assert engine.counts.duplicates == 8 * 2 * ROUNDS, "it knows every batch again"
     assert not list(old.rglob("*.bad"))
 
@@ -106,11 +116,11 @@ def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, 
 def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         for turn in (ROUNDS, ROUNDS + 1):
-            engine.intake.ingest(list(messages(turn)), now_of(turn))
+            engine.intake.ingest(list(make_messages(turn)), now_of(turn))
             engine.settlement.flush()
     drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
-        before = map_of(engine, now_of(ROUNDS + 2))
+        before = read_map(engine, now_of(ROUNDS + 2))
     rows = {str(kind): _identities(old, kind) for kind in Kind}
     assert {kind: len(found) for kind, found in rows.items()} == {"obs": 224, "state": 112}
     compact(old)
@@ -123,7 +133,7 @@ def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     assert versions.keys() == {"1.0", str(version.VERSION)}
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:
-        assert map_of(engine, now_of(ROUNDS + 2)) == before, "bit for bit"
+        assert read_map(engine, now_of(ROUNDS + 2)) == before, "bit for bit"
     assert extract.cell_hours(old, EVERYTHING)["observations"].to_numpy().sum() == 224
     assert not list(old.rglob("*.bad"))
 
@@ -370,7 +380,7 @@ def test_reader_skips_damaged_files_and_renames_none(
 
 
 def test_every_written_file_states_version_and_digest(tmp_path: Path) -> None:
-    make(tmp_path)
+    write_reference_archive(tmp_path)
     for path in files(tmp_path):
         found = read_content(path)
         assert found is not None

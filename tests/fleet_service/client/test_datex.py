@@ -29,9 +29,9 @@ from schemas.errors import InputError
 from schemas.thresholds import NS
 from schemas.wire import Alert
 from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.client.test_stretches import alert
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import SECOND, batch
-from tests.fleet_service.test_alerts import alert
 from tests.structure import ROOT
 from tests.waiting import PATIENCE_S
 

@@ -15,7 +15,7 @@ import zenoh
 from fleet_service.client import watching
 from schemas import grid, keys, wire
 from schemas.config import ZenohSettings
-from tests.fleet_service.test_alerts import alert
+from tests.fleet_service.client.test_stretches import alert
 from tests.waiting import until
 
 

@@ -1,10 +1,10 @@
 """Reference archive: a small archive with every kind of file that a service writes, and the map
 that it gave when it was written.
 
-    python -m tests.fleet_service.archive.kept FOLDER        write a new archive and its map with
-                                                             the present code
-    python -m tests.fleet_service.archive.kept --map FOLDER  read an existing archive, and write
-                                                             only its map, after the fusion changed
+    python -m tests.fleet_service.archive.reference_archive [--map] FOLDER
+
+Without --map, write a new archive and its map with the present code. With --map, read an existing
+archive, and write only its map, after the fusion has changed.
 
 Commit 1f90692 wrote `data/v1.0`, before files had a version. A stored archive is never written
 again, because later code must still be able to read it.
@@ -113,7 +113,7 @@ def make_state(turn: int, vehicle: int) -> Batch:
     return Batch(Kind.STATE, f"sim-{vehicle:03}", 7, region, turn + 1, 1, columns, "ckf")
 
 
-def messages(turn: int) -> Iterator[Message]:
+def make_messages(turn: int) -> Iterator[Message]:
     """Yield all messages that the vehicles send in round `turn` (step of the simulated drive)."""
     for vehicle in range(VEHICLES):
         for one, key in (
@@ -125,7 +125,7 @@ def messages(turn: int) -> Iterator[Message]:
             )
 
 
-def map_of(engine: Engine, at: int) -> dict[str, Any]:
+def read_map(engine: Engine, at: int) -> dict[str, Any]:
     """Return the map at the time `at`: for every cell its columns and its belief (probabilities of
     friction), sorted by cell and heading sector.
     """
@@ -139,7 +139,7 @@ def map_of(engine: Engine, at: int) -> dict[str, Any]:
     }
 
 
-def make(root: Path) -> dict[str, Any]:
+def write_reference_archive(root: Path) -> dict[str, Any]:
     """Write the reference archive, and return its final map, alerts and rows."""
     with closing(Engine(ServiceConfig(), root)) as engine:
         for turn in range(ROUNDS):
@@ -152,7 +152,7 @@ def make(root: Path) -> dict[str, Any]:
                     WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING)
                 )
                 engine.intake.update_weather(now_of(2))
-            engine.intake.ingest(list(messages(turn)), now_of(turn))
+            engine.intake.ingest(list(make_messages(turn)), now_of(turn))
             if turn % 2:
                 engine.settlement.flush()
             if turn == ROUNDS // 2 - 1:
@@ -161,7 +161,7 @@ def make(root: Path) -> dict[str, Any]:
                 snapshots.write_snapshot(root, engine.queries.whole_map(now_of(turn)), now_of(turn))
                 save_checkpoint(engine)
         rows = {str(kind): engine.counts.rows[kind] for kind in Kind}
-        return map_of(engine, now_of(ROUNDS)) | {
+        return read_map(engine, now_of(ROUNDS)) | {
             "alerts": engine.alerts.count,
             "late": engine.counts.late,
             "rows": rows,
@@ -176,7 +176,7 @@ def read_again(root: Path, found: dict[str, Any]) -> dict[str, Any]:
         archive = Path(shutil.copytree(root, Path(copy) / "archive"))
         drop_checkpoints(archive)
         with closing(Engine(ServiceConfig(), archive)) as engine:
-            return found | map_of(engine, found["at"]) | {"alerts": engine.alerts.count}
+            return found | read_map(engine, found["at"]) | {"alerts": engine.alerts.count}
 
 
 def main() -> None:
@@ -186,7 +186,7 @@ def main() -> None:
     if "--map" in sys.argv:
         maps.write_text(json.dumps(read_again(folder / "archive", json.loads(maps.read_text()))))
         return
-    found = make(folder / "archive")
+    found = write_reference_archive(folder / "archive")
     (folder / "lock").unlink(missing_ok=True)
     maps.write_text(json.dumps(found))
 
