@@ -55,17 +55,12 @@ def measure(seeds: range) -> dict[str, float]:
     """Return the lower end of the map's friction interval, averaged over the seeds, by weather and
     minutes since the last pass.
     """
-    return {
-        f"{PREFIX}.{name}.min{minutes}": float(lower)
-        for name, known in WEATHER.items()
-        for minutes, lower in zip(
-            AFTER_MIN,
-            np.mean(
-                [lower_ends(np.random.default_rng([seed, 23]), known) for seed in seeds], axis=0
-            ),
-            strict=True,
-        )
-    }
+    figures = {}
+    for name, known in WEATHER.items():
+        ends = [lower_ends(np.random.default_rng([seed, 23]), known) for seed in seeds]
+        for minutes, lower in zip(AFTER_MIN, np.mean(ends, axis=0), strict=True):
+            figures[f"{PREFIX}.{name}.min{minutes}"] = float(lower)
+    return figures
 
 
 def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:

@@ -59,9 +59,12 @@ live holder writes the object again with its next turn.
 
 A machine that was suspended finds that its lease has expired (`elapsed_seconds`).
 
-**Not covered:** a machine whose elapsed-time clock runs at less than 5/6 of another machine's speed
-(1/2 of it if the holder's token stays active, so that HINT does not apply), a clock that stops
-while the machine is migrated between hosts, and a bucket without read-after-write consistency.
+Not covered
+    - a machine whose elapsed-time clock runs at less than 5/6 of another machine's speed (1/2 of
+      it if the holder's token stays active, so that HINT does not apply)
+    - a clock that stops while the machine is migrated between hosts
+    - a bucket without read-after-write consistency
+
 `tests/faults/protocol_model.py` checks all states of a model. `tests/faults/lease_histories.py`
 checks histories of this module in virtual time.
 """

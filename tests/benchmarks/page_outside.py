@@ -20,6 +20,7 @@ from typing import Final
 
 import numpy as np
 import pyarrow as pa
+import zenoh
 
 from deploy.router import open_router
 from fleet_service.client import map_client
@@ -193,18 +194,23 @@ def measure_publication() -> dict[str, float]:
                 leaked = len(cells_of(fetch_publication(address)) - measured_cells(table))
                 failed = sum(not can_open(reader, address) for reader in READERS)
                 failed += shutil.which("ogrinfo") is not None and not ogrinfo_opens(address)
-                for _ in range(12):
-                    if not standing_alerts(session):
-                        break
-                    time.sleep(1.0)
-                    seq = street.put(session, ("melted",), time.time_ns(), seq)
-                until(lambda: not standing_alerts(session), PATIENCE_S)
+                _melt_ice(session, seq)
                 time.sleep(1.0)  # time for the feed's next update
                 unended = sum(not is_over(one) for one in list_records(fetch_publication(address)))
         finally:
             stop.set()
             page.join(10.0)
     return {"leaked": float(leaked), "unended": float(unended), "readers_failed": float(failed)}
+
+
+def _melt_ice(session: zenoh.Session, seq: int) -> None:
+    """Publish that the ice has melted until no alert stands; `seq` is the last number used."""
+    for _ in range(12):
+        if not standing_alerts(session):
+            break
+        time.sleep(1.0)
+        seq = street.put(session, ("melted",), time.time_ns(), seq)
+    until(lambda: not standing_alerts(session), PATIENCE_S)
 
 
 def fetch_publication(address: str) -> bytes:

@@ -117,18 +117,18 @@ def relay_packets(ends: tuple[int, int], terms: LinkTerms) -> None:
     with selectors.DefaultSelector() as waiting:
         for end in (*ends, sys.stdin.fileno()):
             waiting.register(end, selectors.EVENT_READ)
-        while True:
+        is_open = True
+        while is_open:
             first = min((way.flying[0][0] for way in ways.values() if way.flying), default=None)
             patience = None if first is None else max(first - time.monotonic(), 0.0)
             for key, _ in waiting.select(patience):
-                if key.fd == sys.stdin.fileno():
-                    line = sys.stdin.readline()
-                    if not line:
-                        return
+                if key.fd in ways:
+                    for packet in _read_packets(key.fd):
+                        ways[key.fd].accept_packet(packet, time.monotonic(), terms, draw)
+                elif line := sys.stdin.readline():
                     terms = replace(terms, **json.loads(line))
-                    continue
-                for packet in _read_packets(key.fd):
-                    ways[key.fd].accept_packet(packet, time.monotonic(), terms, draw)
+                else:
+                    is_open = False
             now = time.monotonic()
             for way in ways.values():
                 way.deliver_packets(now)

@@ -111,14 +111,9 @@ def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
                 continue
             if command.startswith(LASTING):
                 if "certs/" in command:  # the second router needs the port of the first
-                    for words, process in staying:
-                        _end_process(words, process, failed)
+                    _end_processes(staying, failed)
                     staying.clear()
-                with log.open("wb") as out:
-                    typed = command.split()
-                    process = subprocess.Popen(
-                        [str(bin_folder / typed[0]), *typed[1:]], cwd=folder, stdout=out, stderr=out
-                    )
+                process = _start_process(command, folder, log)
                 staying.append((command, process))
                 _await_ready(command, process, log)
                 if process.poll() is not None:
@@ -132,9 +127,15 @@ def run_all(folder: Path) -> tuple[list[str], dict[str, str]]:
             if code:
                 failed.append(f"{command}: {code}: {_last_line(log)}")
     finally:
-        for words, process in staying:
-            _end_process(words, process, failed)
+        _end_processes(staying, failed)
     return failed, maps
+
+
+def _start_process(command: str, folder: Path, log: Path) -> subprocess.Popen[bytes]:
+    program, *arguments = command.split()
+    path = Path(sys.executable).parent / program
+    with log.open("wb") as out:
+        return subprocess.Popen([str(path), *arguments], cwd=folder, stdout=out, stderr=out)
 
 
 def _list_steps() -> Iterator[tuple[str | None, dict[str, str]]]:
@@ -234,6 +235,11 @@ def _await_ready(command: str, process: subprocess.Popen[bytes], log: Path) -> N
         ):
             return
         time.sleep(0.1)
+
+
+def _end_processes(staying: list[tuple[str, subprocess.Popen[bytes]]], failed: list[str]) -> None:
+    for command, process in staying:
+        _end_process(command, process, failed)
 
 
 def _end_process(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> None:

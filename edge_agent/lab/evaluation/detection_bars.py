@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -71,6 +72,90 @@ def rate_of(numerator: str, denominator: str) -> Callable[[DetectionTally], floa
 
 PER_1000_KM = "per 1000 km"
 PER_1000_S = "per 1000 s"
+SHARES: Final = (
+    *(
+        f"{road}.{what}{among}"
+        for road, what, among in product(
+            ("ice", "snow"), ("yield", "favoured"), ("", ".slide", ".calm")
+        )
+    ),
+    "warned",
+    "passes.ice",
+    "passes.snow",
+    "passes.ice.stood",
+    "coverage90.ice.stood",
+    "ice.yield.stood",
+    "flag.passes.ice",
+    "flag.passes.snow",
+    "either.passes.ice",
+    "controller.passes.ice",
+    "contradiction_share.ice.excited",
+    "contradiction_share",
+    "coverage90.snow",
+    "coverage90.wet",
+    "coverage90.dry",
+    *(f"passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
+)
+WITH_TARGET: Final = {
+    "short": {"ice.favoured.slide", *(f"coverage90.{surface}" for surface in SURFACES)},
+    "long": {"ice.yield", "ice.yield.slide", "passes.ice"},
+}
+QUANTILES: Final = (("median", 0.5), ("p90", 0.9))
+
+
+def _list_shares(length: str) -> list[DetectionBar]:
+    """Return the figures of one class of drives that are shares without a target."""
+    return [
+        DetectionBar(f"{name}.{length}", length, mean_of(name), SHARE)
+        for name in SHARES
+        if name not in WITH_TARGET[length]
+    ]
+
+
+def _list_comparisons() -> list[DetectionBar]:
+    """Return the shares found by the oracle and by the slip flag, for comparison."""
+    names = [
+        f"oracle.ice.{what}{among}"
+        for what, among in product(("yield", "favoured"), ("", ".slide", ".calm"))
+    ]
+    names += [f"flag.passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)]
+    return [DetectionBar(f"{name}.short", "short", mean_of(name), SHARE) for name in names]
+
+
+def _list_times() -> list[DetectionBar]:
+    """Return the quantiles of the detection times of the estimator and of the slip flag."""
+    listed = [
+        DetectionBar(
+            f"ice.seconds.{activity}.{end}",
+            "short",
+            seconds_of(f"seconds.ice.{activity}", share),
+            "s",
+        )
+        for activity, (end, share) in product(ACTIVITIES, QUANTILES)
+    ]
+    for end, share in QUANTILES:
+        read = seconds_of("flag.seconds.ice.braking", share)
+        listed.append(DetectionBar(f"flag.seconds.{end}", "short", read, "s"))
+    return listed
+
+
+def _list_operating_points() -> list[DetectionBar]:
+    """Return the passes found and the false events at each threshold of the estimator (`roc`) and
+    of the slip flag (`flag`).
+    """
+    listed = []
+    for way, limits in (("roc", ROC_NATS), ("flag", ROC_FLAG_MU)):
+        for limit in limits:
+            name = f"{way}.{limit:g}"
+            false_events = rate_of(f"{name}.false_events", "km")
+            listed += [
+                DetectionBar(f"{name}.ice", "", mean_of(f"{name}.ice"), SHARE),
+                DetectionBar(f"{name}.snow", "", mean_of(f"{name}.snow"), SHARE),
+                DetectionBar(f"{name}.false_events", "", false_events, PER_1000_KM),
+            ]
+    return listed
+
+
 DETECTION: Final = (
     DetectionBar("ice.yield.long", "long", mean_of("ice.yield"), SHARE, (0.60, 0.58)),
     DetectionBar("ice.yield.slide.long", "long", mean_of("ice.yield.slide"), SHARE, (0.80, 0.90)),
@@ -159,80 +244,12 @@ DETECTION: Final = (
     DetectionBar("score.ice.long", "long", mean_of("score.ice"), SHARE, (0.62, 0.62), "less"),
     DetectionBar("score.ice.short", "short", mean_of("score.ice"), SHARE),
     DetectionBar("false_visits", "", mean_of("false_visits"), SHARE),
-    *(
-        DetectionBar(f"{name}.{length}", length, mean_of(name), SHARE)
-        for length in LENGTHS
-        for name in (
-            *(
-                f"{road}.{what}{among}"
-                for road in ("ice", "snow")
-                for what in ("yield", "favoured")
-                for among in ("", ".slide", ".calm")
-            ),
-            "warned",
-            "passes.ice",
-            "passes.snow",
-            "passes.ice.stood",
-            "coverage90.ice.stood",
-            "ice.yield.stood",
-            "flag.passes.ice",
-            "flag.passes.snow",
-            "either.passes.ice",
-            "controller.passes.ice",
-            "contradiction_share.ice.excited",
-            "contradiction_share",
-            "coverage90.snow",
-            "coverage90.wet",
-            "coverage90.dry",
-            *(f"passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
-        )
-        if (name, length)
-        not in {
-            ("ice.yield", "long"),
-            ("ice.yield.slide", "long"),
-            ("ice.favoured.slide", "short"),
-            ("passes.ice", "long"),
-            *((f"coverage90.{surface}", "short") for surface in SURFACES),
-        }
-    ),
-    *(
-        DetectionBar(f"{name}.short", "short", mean_of(name), SHARE)
-        for name in (
-            *(
-                f"oracle.ice.{what}{among}"
-                for what in ("yield", "favoured")
-                for among in ("", ".slide", ".calm")
-            ),
-            *(f"flag.passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
-        )
-    ),
-    *(
-        DetectionBar(
-            f"ice.seconds.{activity}.{end}",
-            "short",
-            seconds_of(f"seconds.ice.{activity}", share),
-            "s",
-        )
-        for activity in ACTIVITIES
-        for end, share in (("median", 0.5), ("p90", 0.9))
-    ),
-    *(
-        DetectionBar(
-            f"flag.seconds.{end}", "short", seconds_of("flag.seconds.ice.braking", share), "s"
-        )
-        for end, share in (("median", 0.5), ("p90", 0.9))
-    ),
+    *_list_shares("short"),
+    *_list_shares("long"),
+    *_list_comparisons(),
+    *_list_times(),
     DetectionBar("flag.false_events", "", rate_of("flag.false_events", "km"), PER_1000_KM),
-    *(
-        DetectionBar(f"{way}.{limit:g}.{what}", "", read, unit)
-        for way, limits in (("roc", ROC_NATS), ("flag", ROC_FLAG_MU))
-        for limit in limits
-        for what, read, unit in (
-            ("ice", mean_of(f"{way}.{limit:g}.ice"), SHARE),
-            ("snow", mean_of(f"{way}.{limit:g}.snow"), SHARE),
-            ("false_events", rate_of(f"{way}.{limit:g}.false_events", "km"), PER_1000_KM),
-        )
-    ),
+    *_list_operating_points(),
 )
 
 

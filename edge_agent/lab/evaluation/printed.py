@@ -139,14 +139,16 @@ def compared_names() -> list[str]:
     """Return the names of the evaluation's results that are compared with printed numbers, and the
     names of their standard deviations.
     """
-    found = [
-        name.replace("ESTIMATOR", estimator)
-        for row in PRINTED
-        for name in (row.same, row.real)
-        if name
-        for estimator in ((OWN[row.paper], DEFAULT) if "ESTIMATOR" in name else ("",))
-    ]
-    return [f"{name}{end}" for name in found for end in ("", ".sd")]
+    listed = []
+    for row in PRINTED:
+        for template in (row.same, row.real):
+            if "ESTIMATOR" in template:
+                names = [template.replace("ESTIMATOR", own) for own in (OWN[row.paper], DEFAULT)]
+            else:
+                names = [template] if template else []
+            for name in names:
+                listed += [name, f"{name}.sd"]
+    return listed
 
 
 WHY_NOT: Final = """\

@@ -13,10 +13,15 @@ Legend
     Δω       step width of wheel speed readings; a wheel that stands reads exactly zero
     τ        delay of a device: it reports the state at a time τ earlier
 
-The sizes of the errors are those found in eleven public logs of real cars: offsets of a_x .22 to
-.96 and of a_y .07 to .54 m/s^2, steering offsets of 1 to 17 mrad, steering gain errors of 3 % at
-speed and 5 to 15 % at .3 to .5 rad, radii that differ by .15 to 1.6 %, wheel speeds in steps of up
-to 1 km/h, clock differences of .02 to .4 s, and torque in hardly any log.
+Eleven public logs of real cars contain errors of these sizes
+    offsets of a_x          .22 to .96 m/s^2
+    offsets of a_y          .07 to .54 m/s^2
+    steering offset         1 to 17 mrad
+    steering gain error     3 % at speed, 5 to 15 % at .3 to .5 rad
+    differences of radii    .15 to 1.6 %
+    wheel speed steps       up to 1 km/h
+    clock differences       .02 to .4 s
+Hardly any of these logs contains torque.
 """
 
 from __future__ import annotations

@@ -145,22 +145,18 @@ def study_figures(done: Study) -> list[Figure]:
 
 
 def _spread(prefix: str, per_condition: Sequence[StudyScores]) -> list[Figure]:
-    return [
-        figure
-        for name, unit in UNITS.items()
-        for figure in _mean_sd(
-            f"{prefix}.{name}", [getattr(one, name) for one in per_condition], unit
-        )
-    ]
+    listed = []
+    for name, unit in UNITS.items():
+        values = [getattr(scores, name) for scores in per_condition]
+        listed += _mean_sd(f"{prefix}.{name}", values, unit)
+    return listed
 
 
 def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
     listed = [Figure(name, float(np.mean(values)), unit)]
-    return (
-        [*listed, Figure(f"{name}.sd", float(np.std(values, ddof=1)), unit)]
-        if len(values) > 1
-        else listed
-    )
+    if len(values) > 1:
+        listed.append(Figure(f"{name}.sd", float(np.std(values, ddof=1)), unit))
+    return listed
 
 
 def results_table(listed: Sequence[Figure]) -> str:

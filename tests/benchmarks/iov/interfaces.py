@@ -97,18 +97,13 @@ def _alerted(
         try:
             for turn in range(10):
                 now = START + 30 * turn * NS
-                for k, (latitude, longitude) in enumerate(places):
-                    seq = 1 + k + len(places) * turn
+                for k, place in enumerate(places):
                     batches = [
-                        _own_report(f"car-{k}-{n}", 1 + turn, now, (latitude, longitude), friction)
+                        _own_report(f"car-{k}-{n}", 1 + turn, now, place, friction)
                         for n, friction in enumerate(own)
                     ]
                     if foreign:
-                        denm = Denm(99, k, 99, START, now, None, (latitude, longitude), 2.0, 3600)
-                        decoded = decode_denm(
-                            encode_denm(replace(denm, sub_cause=ICE, heading=0.0))
-                        )
-                        batches += encode_reports(decoded, "cits-se", 5, seq, now)
+                        batches += _foreign_reports(k, 1 + k + len(places) * turn, now, place)
                     engine.intake.ingest(
                         [Message(Kind.OBSERVATION, key, body, JSON) for key, body in batches], now
                     )
@@ -118,6 +113,15 @@ def _alerted(
             engine.close()
     assert len(set(cells)) > 0.9 * len(cells)
     return sum(cell in under_alert for cell in cells), taken
+
+
+def _foreign_reports(
+    number: int, seq: int, now: int, place: tuple[float, float]
+) -> list[tuple[str, bytes]]:
+    """Return a foreign publisher's warning of ice at a place as batches, by key."""
+    denm = Denm(99, number, 99, START, now, None, place, 2.0, 3600)
+    decoded = decode_denm(encode_denm(replace(denm, sub_cause=ICE, heading=0.0)))
+    return encode_reports(decoded, "cits-se", 5, seq, now)
 
 
 def _own_report(

@@ -143,7 +143,6 @@ def accept(
 
 def test_silent_connections_are_closed_and_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "MOST", 3)
-    monkeypatch.setattr(connections, "FlowControl", object, raising=False)
     open_ones: set[Any] = set()
     timers: list[Any] = []
     first = accept(open_ones, timers)

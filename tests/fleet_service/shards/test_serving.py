@@ -259,7 +259,7 @@ def test_service_found_after_an_empty_answer_is_queried_again(
     The service has no liveliness token (sign of a connected service), so that the client cannot
     find it by its token.
     """
-    monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
+    monkeypatch.setattr("fleet_service.app.service.announce_regions", lambda *_: nullcontext())
     with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
         drive_one(session, service)
         asked = map_client.query_replies
