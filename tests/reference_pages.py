@@ -172,7 +172,7 @@ def all_metrics(root: Path) -> Shown:
         link_watches=[],
     )
     publisher: Any = SimpleNamespace(status=status, counts=counts, count_unsettled=lambda: 0)
-    progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
+    progress: Any = SimpleNamespace(late_blocks=0, lag_s=0.0, longest_lag_s=0.0)
     return {"service": of_service, "agent": agent_metrics.agent_metrics(publisher, progress)}
 
 

@@ -149,6 +149,11 @@ def _render_study(values: dict[str, float]) -> str:
     ).rstrip()
 
 
+def _list_compared() -> list[str]:
+    names = (name for row in printed.PRINTED for name in printed.compared_names(row))
+    return [name for name in names if name]
+
+
 def _render_searches(values: dict[str, float]) -> str:
     listed = [Figure(name, value, "") for name, value in values.items()]
     return search_comparison.comparison_tables(listed)
@@ -178,7 +183,7 @@ TABLES: Final = (
         "edge",
         "The papers' figures: printed, of our implementation, with realistic sensors, and of the "
         "default estimator with realistic sensors",
-        re.compile(f"({'|'.join(map(re.escape, printed.compared_names()))})$"),
+        re.compile(rf"({'|'.join(map(re.escape, _list_compared()))})(\.sd)?$"),
         report.paper_table,
     ),
     Table(

@@ -46,7 +46,7 @@ class Active:
 
     warning: GripWarning
     places: frozenset[int]
-    seen: int
+    last_seen: int
     distance_m: float
 
 
@@ -96,13 +96,13 @@ def update_warnings(
                 places |= before.places
                 current[warning.id] = Active(warning, places, pose.time, nearest.start)
             else:
-                current[warning.id] = replace(before, seen=pose.time, distance_m=nearest.start)
+                current[warning.id] = replace(before, last_seen=pose.time, distance_m=nearest.start)
         here.add(warning.id)
     for name, last in list(current.items()):
         if name in here:
             continue
         stands = justifies_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
-        if not stands or pose.time - last.seen > ABSENT_S * NS:
+        if not stands or pose.time - last.last_seen > ABSENT_S * NS:
             issued.append(_end_warning(last, pose, stands=bool(stands)))
             del current[name]
     return tuple(current.values()), issued

@@ -206,7 +206,7 @@ class Agent:
                 duration_s=options.duration_s,
                 clock=source.clock,
                 is_admitted=source.is_admitted,
-                after=after_block,
+                after_block=after_block,
             ),
             self._progress,
         )

@@ -33,19 +33,23 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Progress:
-    """Progress of the live loop (estimation in real time): duration of the signals [s], number of
-    blocks of samples, number of late blocks (delayed by more than their own duration), the longest
-    and the last delay [s].
+    """Progress of the live loop (estimation in real time).
 
-    `held` counts records that were not published, because their signals were not verified.
+    Attributes:
+        signals_s: duration of the processed signals [s].
+        blocks: number of processed blocks of samples.
+        late_blocks: number of blocks that were delayed by more than their own duration.
+        lag_s, longest_lag_s: delay after the last block, and the longest delay [s].
+        unverified_records: number of records that were not published, because their signals were
+            not verified.
     """
 
     signals_s: float = 0.0
     blocks: int = 0
-    behind: int = 0
+    late_blocks: int = 0
     lag_s: float = 0.0
-    now_s: float = 0.0
-    held: int = 0
+    longest_lag_s: float = 0.0
+    unverified_records: int = 0
 
     def record_block(self, length_s: float, elapsed_s: float) -> float:
         """Count a processed block whose signals last `length_s` seconds, `elapsed_s` seconds after
@@ -56,9 +60,9 @@ class Progress:
         self.blocks += 1
         lag = elapsed_s - self.signals_s
         if lag > length_s:
-            self.behind += 1
-        self.lag_s = max(self.lag_s, lag)
-        self.now_s = max(lag, 0.0)
+            self.late_blocks += 1
+        self.longest_lag_s = max(self.longest_lag_s, lag)
+        self.lag_s = max(lag, 0.0)
         return lag
 
 
@@ -71,14 +75,14 @@ class LoopOptions(NamedTuple):
         clock: returns the time of a monotonic clock [s].
         is_admitted: function that returns True if the records of a block may be published; records
             that may not be published are only counted.
-        after: function that the loop calls after each block of samples.
+        after_block: function that the loop calls after each block of samples.
     """
 
     on_status: Callable[[Progress], None] = lambda _: None
     duration_s: float = float("inf")
     clock: Callable[[], float] = time.monotonic
     is_admitted: Callable[[], bool] = lambda: True
-    after: Callable[[], None] = lambda: None
+    after_block: Callable[[], None] = lambda: None
 
 
 def run_live_loop(
@@ -102,7 +106,7 @@ def run_live_loop(
     for block in blocks:
         _, observations, states = pipeline.step(block)
         _offer_if_admitted(publisher, progress, options.is_admitted(), observations, states)
-        options.after()
+        options.after_block()
         _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
             # Start the clock after the first block, which may have loaded compiled kernels.
@@ -143,7 +147,7 @@ def _offer_if_admitted(
     if admitted:
         publisher.offer(*records)
     else:
-        progress.held += sum(len(block.vehicle) for block in records)
+        progress.unverified_records += sum(len(block.vehicle) for block in records)
 
 
 def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
@@ -159,10 +163,10 @@ def final_counts(progress: Progress, publisher: Publisher) -> dict[str, float]:
         "unsettled": publisher.count_unsettled(),
         "rejected": sum(counts.rejected.values()),
         "dropped": publisher.status.dropped_records,
-        "held": progress.held,
-        "behind": progress.behind,
+        "held": progress.unverified_records,
+        "behind": progress.late_blocks,
         "blocks": progress.blocks,
-        "lag_s": round(progress.lag_s, 3),
+        "lag_s": round(progress.longest_lag_s, 3),
         "signals_s": round(progress.signals_s, 3),
         "resent_batches": counts.resent_batches,
         "observations_published": counts.published[kind],

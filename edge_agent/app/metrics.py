@@ -27,9 +27,9 @@ def agent_metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         *_outbox_metrics(publisher),
         gauge("sessions", "open sessions", publisher.status.links),
         *link_metrics(publisher.status.link_watches),
-        gauge("blocks_behind", "blocks that were processed too late", progress.behind),
-        gauge("lag_seconds", "lag behind real time at the last block", progress.now_s),
-        gauge("longest_lag_seconds", "largest lag behind real time", progress.lag_s),
+        gauge("blocks_behind", "blocks that were processed too late", progress.late_blocks),
+        gauge("lag_seconds", "lag behind real time at the last block", progress.lag_s),
+        gauge("longest_lag_seconds", "largest lag behind real time", progress.longest_lag_s),
     ]
 
 
@@ -121,8 +121,8 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
         )
     if publisher.is_broken:
         found.append("the sending thread has died; restart the agent")
-    if progress.now_s > BEHIND_S:
-        found.append(f"{progress.now_s:.1f} s behind real time")
+    if progress.lag_s > BEHIND_S:
+        found.append(f"{progress.lag_s:.1f} s behind real time")
     return found
 
 

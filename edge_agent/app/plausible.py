@@ -49,8 +49,8 @@ class Plausibility:
     """
 
     radius: float
-    first: float = np.inf
-    last: float = -np.inf
+    first_s: float = np.inf
+    last_s: float = -np.inf
     samples: int = 0
     sliding: int = 0
     resets: int = 0
@@ -77,13 +77,13 @@ class Plausibility:
         self.violations += int(np.sum(upper < grip_in_use(t[:, 0], signals[:, 0]) - SLACK))
         self.excited += int(np.sum(used > EXCITED_SHARE * mu))
         self.samples += len(health)
-        self.first = min(self.first, float(t[0, 0]))
-        self.last = float(t[-1, 0])
+        self.first_s = min(self.first_s, float(t[0, 0]))
+        self.last_s = float(t[-1, 0])
 
     @property
     def seconds(self) -> float:
         """Return the duration of the replayed drive [s]."""
-        return max(self.last - self.first, 0.0)
+        return max(self.last_s - self.first_s, 0.0)
 
     @property
     def median_speed_error(self) -> float:

@@ -140,7 +140,9 @@ def print_status(progress: Progress, publisher: Publisher, events: logging.Logge
     from edge_agent.app.live_loop import final_counts
 
     counts = publisher.counts
-    late = f", at most {progress.lag_s:.1f} s behind real time" if progress.behind else ""
+    late = (
+        f", at most {progress.longest_lag_s:.1f} s behind real time" if progress.late_blocks else ""
+    )
     text = (
         f"{progress.signals_s:7.1f} s  {publisher.status.links} sessions, "
         f"{sum(counts.published.values())} records published, {sum(counts.acknowledged.values())} "

@@ -46,25 +46,25 @@ class Prediction(NamedTuple):
 
 class HeldOut(NamedTuple):
     """Result of a validated calibration: the calibration to write, the groups of quantities left
-    out of it, and the mean prediction scores on held-out drives without the calibration (`before`)
-    and with it (`after`).
+    out of it, and the mean prediction scores on held-out drives. `score_without` is the score
+    without the calibration, `score_with` the score with it.
     """
 
     calibration: Calibration
     refused: list[str]
-    before: Prediction
-    after: Prediction
+    score_without: Prediction
+    score_with: Prediction
     folds: int
 
 
-Judge: TypeAlias = Callable[[Vehicle, Drive], Prediction]
+DriveScorer: TypeAlias = Callable[[Vehicle, Drive], Prediction]
 """Function that replays a drive with a vehicle and returns the predictive score."""
 
 
-def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> HeldOut:
+def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, score_drive: DriveScorer) -> HeldOut:
     """Learn a calibration from all drives. Keep only those groups of quantities with which an
-    estimator predicts held-out drives at least as well as without them. `judge` replays a drive
-    with a vehicle and returns the prediction score.
+    estimator predicts held-out drives at least as well as without them. `score_drive` replays a
+    drive with a vehicle and returns the prediction score.
 
     Raises:
         InputError: no drive has enough excitation, or there is only one drive and it is too short
@@ -73,20 +73,20 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
     whole = learn_calibration(drives, vehicle)
     folds = split_folds(drives)
     candidates = []
-    judged = []
+    held_out_drives = []
     for taught, held_out in folds:
         try:
             candidates.append(learn_calibration(taught, vehicle))
         except InputError:
             continue
-        judged.append(held_out)
-    if not judged:
+        held_out_drives.append(held_out)
+    if not held_out_drives:
         raise InputError(
             "log",
             "the logs are too short to hold out a part for validation",
             "give two drives or a longer one",
         )
-    before = [judge(vehicle, held_out) for held_out in judged]
+    before = [score_drive(vehicle, held_out) for held_out in held_out_drives]
     best = before
     accepted = list[str]()
     refused = list[str]()
@@ -94,13 +94,13 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
         if not any(getattr(whole, name) is not None for name in names):
             continue
         tried = [
-            judge(
+            score_drive(
                 vehicle.model_copy(
                     update={"calibration": restrict_groups(candidate, [*accepted, group])}
                 ),
                 held_out,
             )
-            for candidate, held_out in zip(candidates, judged, strict=True)
+            for candidate, held_out in zip(candidates, held_out_drives, strict=True)
         ]
         if is_worse(tried, best):
             refused.append(group)
@@ -112,7 +112,7 @@ def learn_validated(drives: Sequence[Drive], vehicle: Vehicle, judge: Judge) -> 
         refused,
         _mean_prediction(before),
         _mean_prediction(best),
-        len(judged),
+        len(held_out_drives),
     )
 
 

@@ -118,8 +118,8 @@ def report_lines(found: HeldOut) -> list[str]:
     lines += [
         f"not written: {group}: it does not improve a held-out drive" for group in found.refused
     ]
-    before = found.before
-    after = found.after
+    before = found.score_without
+    after = found.score_with
     lines.append(
         f"held-out drives ({found.folds}): predictive log-likelihood {before.log_likelihood:.2f} "
         f"-> {after.log_likelihood:.2f} nat/s, contradicted {before.contradicted:.3f} -> "

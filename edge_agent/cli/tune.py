@@ -291,7 +291,7 @@ def _run_study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     )
-    budget = Budget(ants=ants, iterations=iterations, evaluations=_count_evaluations(done.found))
+    budget = Budget(ants=ants, iterations=iterations, evaluations=_count_evaluations(done.results))
     document = Document(
         estimator="paper-aco-fckf",
         memberships=done.best("colony").to_json(),

@@ -56,7 +56,7 @@ class _Sequence:
     stream: Stream
     next: int = 1
     first: int = 1
-    held: dict[int, int] = field(default_factory=dict)
+    batch_keys: dict[int, int] = field(default_factory=dict)
 
     def first_held(self) -> int:
         """Return the lowest sequence number of a batch of this stream that is still in the outbox.
@@ -65,7 +65,7 @@ class _Sequence:
         Each call continues the search where the last call ended, so that each number is skipped
         only once.
         """
-        while self.first < self.next and self.first not in self.held:
+        while self.first < self.next and self.first not in self.batch_keys:
             self.first += 1
         return self.first
 
@@ -111,7 +111,7 @@ class HeldBatches:
             sequence = _Sequence(batch.stream)
             self._streams[batch.stream] = sequence
         batch.stream = sequence.stream
-        sequence.held[batch.seq] = key
+        sequence.batch_keys[batch.seq] = key
         sequence.next = max(sequence.next, batch.seq + 1)
         self.bytes += batch.size
 
@@ -119,8 +119,8 @@ class HeldBatches:
         """Remove the batch with the row number `key` from the index, and return the batch."""
         batch = self._entries.pop(key)
         sequence = self._streams[batch.stream]
-        del sequence.held[batch.seq]
-        if not sequence.held and batch.stream.boot != self._boot:
+        del sequence.batch_keys[batch.seq]
+        if not sequence.batch_keys and batch.stream.boot != self._boot:
             del self._streams[batch.stream]
         self.bytes -= batch.size
         return batch
@@ -135,7 +135,7 @@ class HeldBatches:
             if stream.boot == self._boot
         }
         for sequence in own.values():
-            sequence.held.clear()
+            sequence.batch_keys.clear()
         self._entries = {}
         self._oldest = {kind: deque() for kind in Kind}
         self._streams = own
@@ -161,7 +161,7 @@ class HeldBatches:
         sequence = self._streams.get(stream)
         if sequence is None:
             return set()
-        held = sequence.held
+        held = sequence.batch_keys
         return {key for first, last in ranges for key in _keys_within(held, first, last)}
 
     def pop_oldest(self, kind: Kind) -> int | None:
@@ -182,7 +182,7 @@ class HeldBatches:
         settled (acknowledged or refused by the service).
         """
         sequence = self._streams[batch.stream]
-        later = sequence.next - batch.seq - len(sequence.held)
+        later = sequence.next - batch.seq - len(sequence.batch_keys)
         return later >= PASSED_OVER and sequence.first_held() == batch.seq
 
     def count_records(

@@ -44,7 +44,7 @@ class QueryEngine:
     Args:
         name: one of ENGINES.
         root: folder of the archive; only compacted (sorted) files are read.
-        part: selected times and box.
+        extract: selected times and box.
         progress: True to let the engine draw its own progress bar.
 
     Raises:
@@ -53,7 +53,7 @@ class QueryEngine:
 
     name: str
     root: Path
-    part: Extract
+    extract: Extract
     progress: bool = False
 
     def __post_init__(self) -> None:
@@ -75,8 +75,8 @@ class QueryEngine:
         snapshots.
         """
         before = 1 if table == "map" else 0
-        first = self.part.since // layout.DAY_NS - before
-        last = self.part.until // layout.DAY_NS
+        first = self.extract.since // layout.DAY_NS - before
+        last = self.extract.until // layout.DAY_NS
         pattern = "*.parquet" if table == "map" else "*/*.parquet"
         return [
             path
@@ -99,9 +99,9 @@ class QueryEngine:
             )
         t = self._read("observations", paths, "leave_time", "time")
         t = t.mutate(day=t.date.cast("date"))
-        t = t.filter(t.time >= self.part.since // NS, t.time < -(-self.part.until // NS))
-        if self.part.bbox is not None:
-            west, south, east, north = self.part.bbox
+        t = t.filter(t.time >= self.extract.since // NS, t.time < -(-self.extract.until // NS))
+        if self.extract.bbox is not None:
+            west, south, east, north = self.extract.bbox
             t = t.filter(
                 t.longitude >= west, t.longitude < east, t.latitude >= south, t.latitude < north
             )

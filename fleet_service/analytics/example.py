@@ -40,7 +40,7 @@ def draw_figures(root: Path, folder: Path) -> dict[str, pa.Table]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     engine = QueryEngine("duckdb", root, whole_archive(root))
-    middle = (engine.part.since + engine.part.until) // 2
+    middle = (engine.extract.since + engine.extract.until) // 2
     answers = {}
     for name, ending in (
         ("grip", "html"),

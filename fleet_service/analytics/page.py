@@ -51,7 +51,7 @@ class DrawnCells:
 
     Attributes:
         boxes: west, south, east, north [deg] of each square.
-        part: for each square, the index of its row; None if every row has one square.
+        row_of_box: for each square, the index of its row; None if every row has one square.
         sector: heading sector of each row: 0 east, 1 north, 2 west, 3 south.
         panels: for each panel (map), its name and one value per row; None means 'not measured'.
         names: labels of the texts that the page shows about a row when its place is selected.
@@ -67,7 +67,7 @@ class DrawnCells:
     panels: Mapping[str, Sequence[Value]]
     names: Sequence[str]
     rows: Sequence[Sequence[str]]
-    part: Sequence[int] | None = None
+    row_of_box: Sequence[int] | None = None
     frames: Sequence[str] = ("",)
     frame: Sequence[int] | None = None
     lasting: Sequence[bool] | None = None
@@ -97,7 +97,7 @@ def render_page(
             "unknown": scale.unknown,
         },
         "boxes": cells.boxes,
-        "part": cells.part,
+        "part": cells.row_of_box,
         "sector": cells.sector,
         "panels": [{"name": name, "values": values} for name, values in cells.panels.items()],
         "names": cells.names,

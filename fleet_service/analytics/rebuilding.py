@@ -58,7 +58,7 @@ class RebuildResult(NamedTuple):
 
     zone: int
     cells: int
-    parts: int
+    rollup_files: int
 
 
 def require_empty(out: Path) -> None:

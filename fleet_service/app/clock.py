@@ -36,14 +36,14 @@ class TimeNow(NamedTuple):
             later reports at the start.
         doubt: reports whose time is after `now` + `slack`, by at most this much, are neither
             accepted nor refused; their senders repeat them.
-        least: lower bound of the true time.
+        earliest: lower bound of the true time.
         sure: False while the clock may be wrong; alerts whose time is over are then not ended.
     """
 
     now: int
     slack: int = 0
     doubt: int = 0
-    least: int | None = None
+    earliest: int | None = None
     sure: bool = True
 
 

@@ -93,7 +93,7 @@ class Intake:
         """
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         ahead = int(self._config.clock_ahead_s * NS) + at.slack
-        clock = Clock(at.now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
+        clock = Clock(at.now, ahead, int(self._config.oldest_s * NS), at.doubt, at.earliest)
         self.now = clock.now
         out: list[Alert] = []
         for kind, accepted in self.batches.accept(messages, clock).items():

@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         problem = f"cannot write {error.filename or out} ({error.strerror})"
         raise InputError("out", problem, "give a folder that you may write to") from error
-    for word, names in (("issued", done.made), ("kept", done.kept), ("revoked", done.revoked)):
+    for word, names in (("issued", done.issued), ("kept", done.kept), ("revoked", done.revoked)):
         if names:
             more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
             print(f"{word} {len(names)}: {', '.join(names[:SHOWN])}{more}")

@@ -76,11 +76,11 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
     done = _erase_or_request(root, Erasure(month, vehicle), arguments.config)
     copy_notice = (
         ""
-        if done.kept is None
-        else f"; the copy still contains them, and the service tries again ({done.kept})"
+        if done.reason_kept is None
+        else f"; the copy still contains them, and the service tries again ({done.reason_kept})"
     )
     if vehicle is None:
-        return ArchiveReport(what + copy_notice, {"rows": 0, "key": True, "copy": done.kept})
+        return ArchiveReport(what + copy_notice, {"rows": 0, "key": True, "copy": done.reason_kept})
     removed = (
         f"{done.rows} rows removed"
         if done.rows
@@ -91,7 +91,7 @@ def _forget_data(arguments: argparse.Namespace) -> ArchiveReport:
         "rows": done.rows,
         "key": False,
         "files": len(done.files),
-        "copy": done.kept,
+        "copy": done.reason_kept,
     }
     if arguments.put_to is not None:
         report["put"] = mirror.copy_new_files(root, arguments.put_to, done.files)

@@ -58,7 +58,7 @@ def _rebuild_maps(arguments: argparse.Namespace) -> ArchiveReport:
         )
     )
     cells = sum(one.cells for one in done)
-    parts = sum(one.parts for one in done)
+    parts = sum(one.rollup_files for one in done)
     line = (
         f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"
     )

@@ -44,7 +44,7 @@ class EnrolmentResult:
     revoked names.
     """
 
-    made: list[str] = field(default_factory=list)
+    issued: list[str] = field(default_factory=list)
     kept: list[str] = field(default_factory=list)
     revoked: list[str] = field(default_factory=list)
 
@@ -95,7 +95,7 @@ class Registry:
                 ca.issue_certificate(signer, name, hosts, self._periods.days, self._now).write(
                     self._folder / name
                 )
-                done.made.append(name)
+                done.issued.append(name)
         done.revoked += self._revoke(self.list_leaving(fleet))
         self._write_trusted()
         for name in fleet.routers:

@@ -70,26 +70,26 @@ class Clock(NamedTuple):
     Attributes:
         now: time of the service.
         ahead: how much later than `now` the time of an accepted record may be.
-        oldest: largest age of an accepted record. Its age is counted from `now`, or from `least` if
-            that is earlier.
+        oldest: largest age of an accepted record. Its age is counted from `now`, or from
+            `earliest` if that is earlier.
         doubt: records that are later than `now` + `ahead`, by at most this much, are neither
             accepted nor refused; their senders repeat them.
-        least: earliest time that the true time may be, if the service's clock may be wrong; None if
-            the clock is reliable.
+        earliest: earliest time that the true time may be, if the service's clock may be wrong;
+            None if the clock is reliable.
     """
 
     now: int
     ahead: int
     oldest: int
     doubt: int = 0
-    least: int | None = None
+    earliest: int | None = None
 
     @property
     def horizon(self) -> int:
         """Return the oldest time [ns] that an accepted record may have. Streams (batches of one
         vehicle, start, kind and region) without newer records are dropped.
         """
-        return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
+        return (self.now if self.earliest is None else min(self.earliest, self.now)) - self.oldest
 
 
 class Refusal(NamedTuple):

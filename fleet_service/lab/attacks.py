@@ -203,7 +203,7 @@ def replay_messages(rng: Generator, drive: AttackedDrive) -> int:
     key, and with an attacker's name.
     """
     sent = make_messages(drive.visits)
-    at = drive.visits.seconds[[m.last for m in sent]]
+    at = drive.visits.seconds[[m.last_visit for m in sent]]
     old = np.flatnonzero(at < 60.0 * BEGIN)
     again = rng.choice(old, min(len(old), 600), replace=False)
     forged = [

@@ -115,14 +115,12 @@ class AlertWatch:
     Attributes:
         beliefs: beliefs about the cells by minute, (cells, 32).
         alerted: for each minute read, a mask of cells with an alert.
-        late: number of observations that came too late.
     """
 
     fusion: Fusion
     alerts: Alerts
     beliefs: dict[int, FloatArray] = field(default_factory=dict)
     alerted: list[BoolArray] = field(default_factory=list)
-    late: int = 0
 
     def snapshot(self, minute: int) -> None:
         """Read the map's beliefs (probabilities of each friction) and alerts at a minute of the
@@ -167,7 +165,6 @@ def watch_drive(
         if len(part.time):
             updated = fusion.update(part)
             watched.alerts.update(updated.slots)
-            watched.late += int(updated.late.sum())
         if snapshot_minutes is None or minute in snapshot_minutes:
             watched.snapshot(minute)
     return watched

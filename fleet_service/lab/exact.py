@@ -76,7 +76,9 @@ def replay_difference(rng: Generator) -> float:
     """
     visits = drive_town(rng)
     sent = make_messages(visits)
-    at = visits.seconds[[m.last for m in sent]] + rng.uniform(0.0, 1.5 * LATENESS_S, len(sent))
+    at = visits.seconds[[m.last_visit for m in sent]] + rng.uniform(
+        0.0, 1.5 * LATENESS_S, len(sent)
+    )
     with tempfile.TemporaryDirectory() as folder:
         engine = Engine(ServiceConfig(), Path(folder))
         for portion in np.array_split(np.argsort(at), PARTS):

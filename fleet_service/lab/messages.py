@@ -24,7 +24,7 @@ class SentMessage(NamedTuple):
     """Message of a simulated vehicle, and the index of the last visit that it reports."""
 
     message: Message
-    last: int
+    last_visit: int
 
 
 def name_of(vehicle: int) -> str:

@@ -30,13 +30,13 @@ class MirroredTile:
         cells: records of the cells.
         version: number of changes of the tile so far.
         last_received: time at which the tile was received [s since 1970].
-        made: blocks (encoded cells of the tile) by zoom level, kept for the next request.
+        encoded_blocks: blocks (encoded cells of the tile) by zoom level, kept for the next request.
     """
 
     cells: Records = field(default_factory=lambda: _EMPTY)
     version: int = 0
     last_received: float = 0.0
-    made: dict[int, bytes] = field(default_factory=dict)
+    encoded_blocks: dict[int, bytes] = field(default_factory=dict)
 
 
 class _Before(NamedTuple):
@@ -72,7 +72,7 @@ class MapMirror:
             self._before.setdefault(tile, _Before(mirrored.cells, mirrored.version))
             mirrored.cells = cells
             mirrored.version = mirrored.version + 1
-            mirrored.made = {}
+            mirrored.encoded_blocks = {}
 
     @property
     def last_received(self) -> float:
@@ -159,11 +159,11 @@ class MapMirror:
             mirrored = self._tiles.get(tile)
             if mirrored is None or not mirrored.version:
                 return b""
-            if level not in mirrored.made:
-                mirrored.made[level] = block_at(
+            if level not in mirrored.encoded_blocks:
+                mirrored.encoded_blocks[level] = block_at(
                     level, tile, mirrored.cells, mirrored.version, mirrored.last_received
                 )
-            return mirrored.made[level]
+            return mirrored.encoded_blocks[level]
 
     def version(self, tile: int) -> int:
         """Return the number of changes of a tile; 0 if the tile is unknown."""

@@ -57,7 +57,7 @@ class PageSettings:
         roads: road lines along which coloured ribbons of friction are drawn; None to derive them
             from the cells.
         datex: DATEX II publication to keep up to date and to serve; None without one.
-        most: maximum number of browsers that receive live changes.
+        max_browsers: maximum number of browsers that receive live changes.
     """
 
     connection: ZenohSettings
@@ -70,7 +70,7 @@ class PageSettings:
     base_map: BaseMap | None = None
     roads: RoadMap | None = None
     datex: DatexFile | None = None
-    most: int = MOST
+    max_browsers: int = MOST
 
 
 def run(settings: PageSettings, stop: threading.Event, log_line: Callable[[str], None]) -> None:
@@ -88,7 +88,7 @@ def run(settings: PageSettings, stop: threading.Event, log_line: Callable[[str],
         unserved = [region for region in reader.regions() if not region["served"]]
         return {"router": reader.is_connected, "served": reader.is_served, "away": unserved}
 
-    watchers = Watchers(world, reader_state, settings.most)
+    watchers = Watchers(world, reader_state, settings.max_browsers)
     sources = Sources(
         world,
         reader,

@@ -74,18 +74,18 @@ class Since(NamedTuple):
 
     Attributes:
         begin: day and segment at which the replay starts.
-        known: record of the batches (messages with records) that are already included at the start.
-            Their rows are left out; a compacted (sorted) file may contain them too.
+        included: record of the batches (messages with records) that are already included at the
+            start. Their rows are left out; a compacted (sorted) file may contain them too.
         until: only rows received until this time are selected [ns].
         box: only rows near this box are selected [deg].
-        most: maximum number of rows; if there are more, an error is raised.
+        max_rows: maximum number of rows; if there are more, an error is raised.
     """
 
     begin: Begin = Begin()
-    known: SequenceTrackers | None = None
+    included: SequenceTrackers | None = None
     until: int | None = None
     box: Box | None = None
-    most: int | None = None
+    max_rows: int | None = None
 
     def near(self) -> Box | None:
         """Return `box` enlarged by 2·MARGIN_DEG on each side [deg]; None if `box` is None. A replay
@@ -165,7 +165,7 @@ def past_fusion(
     """
     day = until // layout.DAY_NS - layout.MAP_DAYS
     fusion = fusion_with_weather(root, lateness_s, until, (day - 1) * layout.DAY_NS)
-    selection = Since(Begin(day), until=until, box=box, most=most)
+    selection = Since(Begin(day), until=until, box=box, max_rows=most)
     listener = ignore_observations if make_listener is None else make_listener(fusion)
     for _ in replay(root, fusion, selection, listener=listener):
         pass  # a past map has no alerts
@@ -219,10 +219,12 @@ def replay(
     # late rows that were fused after the end of their table, with the recorded result
     waiting: list[tuple[Observations, RecordedResult]] = []
     known = vehicle_ids.read_numbers(root / "keys")
-    for table in in_order(reading.Listing(root, Kind.OBSERVATION, selection, damaged), since.most):
+    for table in in_order(
+        reading.Listing(root, Kind.OBSERVATION, selection, damaged), since.max_rows
+    ):
         rows = segments.rows_of(table)
-        if since.known is not None:
-            new = ~_are_known(rows, since.known)
+        if since.included is not None:
+            new = ~_are_known(rows, since.included)
             rows = {name: column[new] for name, column in rows.items()}
         observations = observations_of(rows, vehicle_ids.numbers_of(known, rows["vehicle"]))
         before = _recorded_result(rows)

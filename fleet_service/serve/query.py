@@ -152,7 +152,7 @@ def _select_rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
             bisect_right(columns["north"], south),
             bisect_left(columns["south"], north),
         )
-    if query.min_vehicles <= shown.least and (
+    if query.min_vehicles <= shown.least_vehicles and (
         query.bbox is None or grid.touches(query.bbox, shown.common)
     ):
         return run

@@ -45,23 +45,23 @@ class ShownTile(NamedTuple):
         columns: the columns by which a query selects cells (SELECTED_BY), as arrays (k,).
         payload: all cells as an Arrow stream, ordered from south to north. It shares memory with
             `cells`. It is empty if the cells have another order and are used for one query only.
-        least: smallest number of vehicles of any cell. If a query requires no more vehicles, it
-            selects every cell.
+        least_vehicles: smallest number of vehicles of any cell. If a query requires no more
+            vehicles, it selects every cell.
         common: box (west, south, east, north) [deg] for a quick test. If a query's box overlaps
             `common`, its range of longitudes overlaps that of every cell, so that cells must be
             selected only by latitude. West is the largest western edge of all cells, and east is
             the smallest eastern edge. South and north are infinite. If the cells are not ordered
             from south to north, `common` is NOTHING, which overlaps no box.
-        made: time at which this tile was made [ns].
+        made_at: time at which this tile was made [ns].
         change: number of the newest change of the map that this tile includes.
     """
 
     cells: pa.RecordBatch
     columns: Mapping[str, NDArray[Any]]
     payload: bytes = b""
-    least: int = 0
+    least_vehicles: int = 0
     common: tuple[float, float, float, float] = NOTHING
-    made: int = 0
+    made_at: int = 0
     change: int = 0
 
 
@@ -108,7 +108,7 @@ class TileCache:
 
     def _recent_tile(self, tile: int, now: int) -> ShownTile | None:
         cached = self._kept.get(tile)
-        if cached is None or not 0 <= now - cached.made <= SHOWN_NS:
+        if cached is None or not 0 <= now - cached.made_at <= SHOWN_NS:
             return None
         is_current = cached.change >= min(self._acknowledged, self.state.changed_at(tile))
         return cached if is_current else None

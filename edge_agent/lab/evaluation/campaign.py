@@ -123,7 +123,7 @@ def run_campaign(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str],
     results.faults = faults.run_fault_campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
     log_line(f"{len(faults.CASES) - 1} sensor faults")
     results.rough = real_world.run_real_world_campaign(seeds, names, quick=quick)
-    results.world = results.rough.found
+    results.world = results.rough.measures
     log_line(
         f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes"
     )

@@ -135,20 +135,13 @@ OWN: Final = {
 DEFAULT: Final = "aco-fckf"
 
 
-def compared_names() -> list[str]:
-    """Return the names of the evaluation's results that are compared with printed numbers, and the
-    names of their standard deviations.
+def compared_names(row: Printed) -> tuple[str, str, str]:
+    """Return the names of the results that are compared with a printed number; "" for no result.
+    They are the paper's estimator with the paper's conditions, the same estimator with ordinary
+    sensors, and the default estimator with ordinary sensors.
     """
-    listed = []
-    for row in PRINTED:
-        for template in (row.same, row.real):
-            if "ESTIMATOR" in template:
-                names = [template.replace("ESTIMATOR", own) for own in (OWN[row.paper], DEFAULT)]
-            else:
-                names = [template] if template else []
-            for name in names:
-                listed += [name, f"{name}.sd"]
-    return listed
+    own, default = (row.real.replace("ESTIMATOR", name) for name in (OWN[row.paper], DEFAULT))
+    return row.same, own, default
 
 
 WHY_NOT: Final = """\

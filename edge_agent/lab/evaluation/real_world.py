@@ -271,7 +271,7 @@ class RealWorldResults:
     is for comparison: v_x is the wheels' mean speed, and the friction interval is the prior's.
     """
 
-    found: dict[str, dict[str, float]]
+    measures: dict[str, dict[str, float]]
     batch: DriveSet
     reported: dict[str, Estimates]
 
@@ -295,9 +295,11 @@ def run_real_world_campaign(
             world.reported.setdefault(name, reported)
     if world is None:
         raise InputError("seeds", "are none", "give at least one")
-    world.found = {name: tally.means() for name, tally in tallies.items()}
+    world.measures = {name: tally.means() for name, tally in tallies.items()}
     for slope in STANDING_SLOPES:
         batches = simulate_standing(slope, seeds, 10.0 if quick else STANDING_S)
         for name in estimators:
-            world.found[name][f"standing_{100 * slope:.0f}pct.v_max"] = largest_speed(name, batches)
+            world.measures[name][f"standing_{100 * slope:.0f}pct.v_max"] = largest_speed(
+                name, batches
+            )
     return world

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from edge_agent.lab.evaluation.faults import CASES
-from edge_agent.lab.evaluation.printed import DEFAULT, OWN, PRINTED, WHY_NOT
+from edge_agent.lab.evaluation.printed import DEFAULT, PRINTED, WHY_NOT, compared_names
 from edge_agent.lab.evaluation.reliability import LEVELS
 from schemas.runtime.figures import Figure, format_table
 
@@ -136,14 +136,8 @@ def paper_table(values: dict[str, float]) -> str:
     """
     rows = []
     for row in PRINTED:
-        cells = (
-            row.same,
-            row.real.replace("ESTIMATOR", OWN[row.paper]),
-            row.real.replace("ESTIMATOR", DEFAULT),
-        )
-        rows.append(
-            [row.paper, row.what, row.value, *(format_value(values, name) for name in cells)]
-        )
+        cells = [format_value(values, name) for name in compared_names(row)]
+        rows.append([row.paper, row.what, row.value, *cells])
     return markdown_table(
         ("paper", "figure", "printed", "ours", "realistic", "default, realistic"), rows
     )

@@ -58,7 +58,7 @@ class Study:
 
     train: StudySet
     held_out: StudySet
-    found: dict[str, list[Result]] = field(default_factory=dict)
+    results: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
         """Return the memberships found by each search of the kind `way`.
@@ -68,7 +68,7 @@ class Study:
         """
         if way in GIVEN:
             return [GIVEN[way]]
-        return [memberships_of(result.best) for result in self.found[way]]
+        return [memberships_of(result.best) for result in self.results[way]]
 
     def best(self, way: str) -> Memberships:
         """Return the best memberships found by the searches of the kind `way`, judged by the
@@ -79,7 +79,7 @@ class Study:
         """
         if way in GIVEN:
             return GIVEN[way]
-        return memberships_of(max(self.found[way], key=lambda result: result.value).best)
+        return memberships_of(max(self.results[way], key=lambda result: result.value).best)
 
 
 def run(
@@ -110,7 +110,7 @@ def run(
                 seed=seed,
                 progress=reporter(f"{way} {seed}"),
             )
-            done.found.setdefault(way, []).append(result)
+            done.results.setdefault(way, []).append(result)
     return done
 
 
@@ -137,7 +137,7 @@ def study_figures(done: Study) -> list[Figure]:
         listed.append(
             Figure(f"tuning.colony_over_random.{drives}.wins", float((gain > 0.0).mean()), "1")
         )
-    for way, results in done.found.items():
+    for way, results in done.results.items():
         for lines in zip(*(result.history for result in results), strict=True):
             best = [line.best for line in lines]
             listed += _mean_sd(f"tuning.convergence.{way}.{lines[0].iteration:03d}", best, "nat/s")

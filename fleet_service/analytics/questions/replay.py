@@ -40,11 +40,11 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
             f"{options.step_s:g} s is not a valid step",
             "give the time between two frames in seconds, e.g. 600",
         )
-    at = options.at if options.at is not None else engine.part.until
+    at = options.at if options.at is not None else engine.extract.until
     fusion = fusion_with_weather(engine.root, options.lateness_s, at)
     if options.step_s is None:
         rows = 0
-        for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
+        for updated in replay(engine.root, fusion, Since(until=at, box=engine.extract.bbox)):
             rows += len(updated.late)
             if rows // REPORT_ROWS > (rows - len(updated.late)) // REPORT_ROWS:
                 options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
@@ -53,7 +53,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     due = None
     frames = []
     for updated in replay(
-        engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)
+        engine.root, fusion, Since(until=engine.extract.until, box=engine.extract.bbox)
     ):
         if not len(updated.slots):
             continue
@@ -67,7 +67,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
                 f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} "
                 "cells"
             )
-    return pa.concat_tables([*frames, _map_frame(engine, fusion, engine.part.until)])
+    return pa.concat_tables([*frames, _map_frame(engine, fusion, engine.extract.until)])
 
 
 def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
@@ -79,8 +79,8 @@ def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
     """
     days = layout.day_folders(engine.root, layout.TABLES[Kind.OBSERVATION])
     last = (max(map(layout.day_of, days), default=first // layout.DAY_NS) + 1) * layout.DAY_NS
-    begin = max(engine.part.since, first - first % step)
-    frames = (min(engine.part.until, max(last, first)) - begin) // step
+    begin = max(engine.extract.since, first - first % step)
+    frames = (min(engine.extract.until, max(last, first)) - begin) // step
     if frames > MOST_FRAMES:
         problem = (
             f"makes {frames} frames from {np.datetime64(begin, 'ns').astype('datetime64[s]')} on"
@@ -94,6 +94,6 @@ def _frames_begin(engine: QueryEngine, first: int, step: int) -> int:
 
 
 def _map_frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
-    table = visited_cells(fusion, at, engine.part.bbox)
+    table = visited_cells(fusion, at, engine.extract.bbox)
     frame = pa.array(np.full(table.num_rows, at // US_STEP)).cast(tables.US)
     return table.append_column("frame", frame)

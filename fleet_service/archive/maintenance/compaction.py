@@ -116,7 +116,7 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> CompactionResult:
 
 
 class _Uncompacted(NamedTuple):
-    """Segments whose rows are not yet in compacted (sorted) files, oldest first. `done` contains,
+    """Segments whose rows are not yet in compacted (sorted) files, oldest first. `moved` contains,
     for each segment, the partitions (date and map square) to which an earlier, interrupted run
     already moved its rows. `term` is the lease term, a number in the names of new files.
     """
@@ -124,7 +124,7 @@ class _Uncompacted(NamedTuple):
     root: Path
     kind: Kind
     segments: Iterator[Path]
-    done: dict[str, set[layout.Partition]]
+    moved: dict[str, set[layout.Partition]]
     term: int
 
 
@@ -145,7 +145,7 @@ def _compact_round(uncompacted: _Uncompacted, row_limit: int) -> CompactionResul
             newest = max(newest, found.version)
             tables.append(
                 reading.drop_compacted(
-                    found.table, uncompacted.kind, uncompacted.done.get(path.name, set())
+                    found.table, uncompacted.kind, uncompacted.moved.get(path.name, set())
                 )
             )
     if not sources:

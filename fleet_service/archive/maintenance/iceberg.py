@@ -45,12 +45,12 @@ class Place(NamedTuple):
         catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue
             (`sqlite:////var/lib/tables.db`).
         namespace: namespace of the tables `observations` and `states`.
-        at: URL at which readers of the tables find the archive's folder, its mirror or its copy.
+        url: URL at which readers of the tables find the archive's folder, its mirror or its copy.
     """
 
     catalog: str
     namespace: str
-    at: str
+    url: str
 
 
 class RegistrationResult(NamedTuple):
@@ -140,7 +140,7 @@ def _record_registration(root: Path, place: Place) -> None:
     if before is not None and before != place:
         problem = (
             f"this archive is registered at {before.catalog}, namespace {before.namespace}, "
-            f"files at {before.at}"
+            f"files at {before.url}"
         )
         raise InputError(
             "catalog", problem, f"give the same values; or drop those tables and remove {path}"
@@ -239,7 +239,7 @@ def _files_by_name(table: Table) -> dict[str, Any]:
 
 
 def _folder_url(place: Place) -> str:
-    return place.at.rstrip("/") + "/"
+    return place.url.rstrip("/") + "/"
 
 
 def _file_url(root: Path, place: Place, path: Path) -> str:

@@ -146,12 +146,12 @@ def _newest_first_time(
 
 class ErasureResult(NamedTuple):
     """Result of `forget_vehicle`: number of removed rows, and the files that were rewritten or
-    removed. `kept` is the reason why the archive's copy still contains the rows, or None.
+    removed. `reason_kept` is the reason why the archive's copy still contains the rows, or None.
     """
 
     rows: int
     files: tuple[Path, ...]
-    kept: str | None = None
+    reason_kept: str | None = None
 
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:

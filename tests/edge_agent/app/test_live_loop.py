@@ -226,7 +226,7 @@ def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
     stop = WaitingClock()
     progress, basket, _ = run(iter(parts), fleet, stop, clock=lambda: stop.now)
     assert stop.now == pytest.approx(progress.signals_s)
-    assert (progress.blocks, progress.behind) == (8, 0)
+    assert (progress.blocks, progress.late_blocks) == (8, 0)
     assert progress.signals_s == pytest.approx(8 * 0.1 - 1 / RATE)
     assert len(basket.column(Kind.STATE, "time"))
 
@@ -238,8 +238,8 @@ def test_a_loop_that_cannot_keep_up_counts_each_late_block_and_skips_none() -> N
         iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds))
     )
     assert progress.blocks == 20
-    assert progress.behind >= 19
-    assert progress.lag_s > 10
+    assert progress.late_blocks >= 19
+    assert progress.longest_lag_s > 10
     assert len(reported) > 2
 
 

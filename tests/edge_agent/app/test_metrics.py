@@ -101,7 +101,7 @@ def test_an_agent_without_a_router_or_behind_its_time_is_in_trouble(
     publisher = publisher_of(settings(router, tmp_path))
     until(lambda: publisher.status.links == 3 and not publisher.status.cut_off)
     assert metrics.health_problems(publisher, Progress()) == []
-    assert metrics.health_problems(publisher, Progress(now_s=4.0)) == ["4.0 s behind real time"]
+    assert metrics.health_problems(publisher, Progress(lag_s=4.0)) == ["4.0 s behind real time"]
     publisher.close(within_s=0.0)
     router.stop()
     alone = publisher_of(settings(router, tmp_path))

@@ -11,5 +11,5 @@ from edge_agent.app.plausible import Plausibility
 def test_reset_at_every_sample_is_implausible_with_any_unit_of_time(
     last: float, resets: int, bad: int
 ) -> None:
-    found = Plausibility(0.3, first=0.0, last=last, samples=6000, resets=resets)
+    found = Plausibility(0.3, first_s=0.0, last_s=last, samples=6000, resets=resets)
     assert len(found.problems()) == bad

@@ -51,7 +51,7 @@ def test_group_that_makes_held_out_drives_worse_is_left_out(drive: Recorded) -> 
     assert found.calibration.ax[0] == pytest.approx(0.5, abs=3.0 * found.calibration.ax[1])
     assert found.calibration.radius_fl is None
     assert found.refused == ["radii"]
-    assert found.after.log_likelihood > found.before.log_likelihood
+    assert found.score_with.log_likelihood > found.score_without.log_likelihood
 
 
 def test_calibration_is_empty_if_no_group_helps(drive: Recorded) -> None:
@@ -60,7 +60,7 @@ def test_calibration_is_empty_if_no_group_helps(drive: Recorded) -> None:
 
     found = learn_validated([(drive.t, drive.signals)], drive.vehicle, refuse)
     assert found.calibration == Calibration(drives=1)
-    assert found.after == found.before
+    assert found.score_with == found.score_without
 
 
 def test_short_single_drive_cannot_be_validated(drive: Recorded) -> None:

@@ -67,7 +67,7 @@ def test_a_corrected_clock_is_followed_when_most_reports_agree(wrong: int) -> No
     system = System(true + wrong * DAY)
     clock = system.clock()
     assert clock.moment().doubt > 40 * YEAR, "nothing is known: nothing is refused"
-    assert clock.moment().least == 0
+    assert clock.moment().earliest == 0
     system.passes(SECOND, jump=-wrong * DAY)
     for second in range(1, 12):
         system.passes(SECOND)
@@ -94,7 +94,7 @@ def test_records_seen_before_a_restart_are_not_in_the_future() -> None:
     clock = system.clock(seen)
     system.passes(SECOND)
     at = clock.moment()
-    assert (at.now, at.slack, at.least, clock.lag()) == (
+    assert (at.now, at.slack, at.earliest, clock.lag()) == (
         seen - HOUR + SECOND,
         HOUR,
         seen - HOUR + SECOND,
@@ -106,7 +106,7 @@ def test_records_seen_before_a_restart_are_not_in_the_future() -> None:
 def test_restart_with_a_clock_a_year_ahead_is_not_sure_of_the_time() -> None:
     seen = time.time_ns()
     clock = System(seen + YEAR).clock(seen)
-    assert clock.moment().least == seen
+    assert clock.moment().earliest == seen
     assert not clock.moment().sure
     assert System(seen + HOUR).clock(seen).moment().sure, "off for an hour is nothing unusual"
 

@@ -179,7 +179,7 @@ def test_new_vehicle_is_admitted_during_a_rolling_router_restart(running: Networ
         assert is_heard(honest, HONEST, service)
         assert open_registry(running.folder).enrol(
             make_enrolment(vehicles=[HONEST, "new-001"])
-        ).made == ["new-001"]
+        ).issued == ["new-001"]
         for router in ROUTERS:
             running.stop(router)
             assert is_heard(honest, HONEST, service), "the other router is there"

@@ -71,14 +71,14 @@ def test_repeated_enrolment_changes_no_file(folder: Path) -> None:
 
 
 def test_expiring_certificates_are_issued_again(folder: Path) -> None:
-    assert not at(folder, 334.0).enrol(make_enrolment()).made
-    assert set(at(folder, 336.0).enrol(make_enrolment()).made) == EVERYONE
+    assert not at(folder, 334.0).enrol(make_enrolment()).issued
+    assert set(at(folder, 336.0).enrol(make_enrolment()).issued) == EVERYONE
     assert certificate(folder, SERVICE).not_valid_after_utc == NOW + timedelta(days=336 + 365)
 
 
 def test_a_router_with_another_address_gets_another_certificate(folder: Path) -> None:
     moved = make_enrolment(routers={"router-a": {"hosts": ["10.0.0.7"]}, "router-b": {}})
-    assert at(folder).enrol(moved).made == ["router-a"]
+    assert at(folder).enrol(moved).issued == ["router-a"]
     names = (
         certificate(folder, "router-a")
         .extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -89,7 +89,7 @@ def test_a_router_with_another_address_gets_another_certificate(folder: Path) ->
 
 def test_a_pair_that_was_cut_off_half_way_is_made_whole(folder: Path) -> None:
     (folder / f"{READER}.key").write_bytes((folder / f"{SERVICE}.key").read_bytes())
-    assert at(folder).enrol(make_enrolment()).made == [READER]
+    assert at(folder).enrol(make_enrolment()).issued == [READER]
     assert ca.read_pair(folder / READER) is not None
 
 
@@ -103,7 +103,7 @@ def test_removed_name_is_revoked_and_not_issued_until_expiry(folder: Path) -> No
         InputError, match=f"^fleet: '{gone}' was revoked .* until 2027-03-01; give another name$"
     ):
         at(folder, 1.0).enrol(make_enrolment())
-    assert gone in at(folder, 366.0).enrol(make_enrolment()).made
+    assert gone in at(folder, 366.0).enrol(make_enrolment()).issued
 
 
 def test_revoked_name_is_refused_as_long_as_its_authority_is_trusted(folder: Path) -> None:
@@ -112,17 +112,17 @@ def test_revoked_name_is_refused_as_long_as_its_authority_is_trusted(folder: Pat
     at(folder).enrol(fewer, "switch")
     with pytest.raises(InputError, match=f"^fleet: '{VEHICLES[0]}' was revoked"):
         at(folder).enrol(make_enrolment())
-    assert VEHICLES[0] in at(folder).enrol(make_enrolment(), "drop").made
+    assert VEHICLES[0] in at(folder).enrol(make_enrolment(), "drop").issued
 
 
 def test_change_of_authority_takes_three_steps_with_both_trusted(folder: Path) -> None:
     (first,) = read_trusted(folder)
-    assert not at(folder).enrol(make_enrolment(), "next").made, (
+    assert not at(folder).enrol(make_enrolment(), "next").issued, (
         "everyone must trust it before it signs"
     )
     assert first in read_trusted(folder)
     assert len(read_trusted(folder)) == 2
-    assert set(at(folder).enrol(make_enrolment(), "switch").made) == EVERYONE
+    assert set(at(folder).enrol(make_enrolment(), "switch").issued) == EVERYONE
     second = read_trusted(folder)[0]
     assert set(read_trusted(folder)) == {first, second}
     assert ca.is_signed_by(certificate(folder, SERVICE), second)

@@ -153,7 +153,7 @@ def test_tiles_that_are_made_together_equal_tiles_that_are_made_alone(least: int
     for tile, one in zip(tiles, together, strict=True):
         (alone,) = TileCache(state, nullcontext(), least).make_tiles([tile], NOW)
         assert decode_tile(one.payload).equals(decode_tile(alone.payload))
-        assert one.least == alone.least
+        assert one.least_vehicles == alone.least_vehicles
         assert one.common == alone.common
         assert one.cells.equals(alone.cells)
 
@@ -163,7 +163,7 @@ def test_a_recent_tile_is_not_made_again_with_others() -> None:
     (first,) = made.read_tiles([TILE], NOW)
     again, other = made.read_tiles([TILE, TILE + 1], NOW + 1)
     assert again is first
-    assert other.made == NOW + 1
+    assert other.made_at == NOW + 1
 
 
 def test_a_query_for_the_whole_map_gets_every_tile_once(monkeypatch: pytest.MonkeyPatch) -> None:
