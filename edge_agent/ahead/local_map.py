@@ -156,15 +156,15 @@ class LocalMap:
         """Replace the active alerts of a map tile by `alerts`; return the keys (cell·4 + sector) of
         the places whose alerts changed.
         """
-        stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
-        news = [
+        standing = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
+        ended = [
             key
             for key in self._alerts
-            if key not in stand and int(grid.tile_of(key // grid.SECTORS)) == tile
+            if key not in standing and int(grid.tile_of(key // grid.SECTORS)) == tile
         ]
-        for key in news:
+        for key in ended:
             del self._alerts[key]
-        return news + [key for key, alert in stand.items() if self.store_alert(alert, now)]
+        return ended + [key for key, alert in standing.items() if self.store_alert(alert, now)]
 
     def drop_old(self, now: int) -> None:
         """Remove from the local map all tiles and alerts that the car received too long before

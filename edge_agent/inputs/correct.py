@@ -151,5 +151,5 @@ def _device_waits(known: Calibration | None) -> dict[tuple[int, int], float]:
     return {channels: latest - lag for channels, lag in late.items() if lag < latest}
 
 
-def _value_or(estimate: tuple[float, float] | None, sound: float) -> float:
-    return sound if estimate is None else estimate[0]
+def _value_or(estimate: tuple[float, float] | None, default: float) -> float:
+    return default if estimate is None else estimate[0]

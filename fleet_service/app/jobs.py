@@ -271,16 +271,16 @@ class BackgroundJobs:
             line = job.work(self._stop)
             self._counts.runs[job.name] += 1
             self.failed.pop(job.name, None)
-            well = True
+            has_succeeded = True
         except Exception as error:
             self._counts.failures[job.name] += 1
             self.failed[job.name] = self.failed.get(job.name, 0) + 1
             line = f"{job.name} failed: {error}"
-            well = False
+            has_succeeded = False
             if not isinstance(error, (OSError, InputError)):
                 log.exception("%s failed", job.name)
         self._busy = None
         trim_memory()
         if line:
             self._log_line(line)
-        return well
+        return has_succeeded

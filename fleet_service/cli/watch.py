@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.client import map_client, watching
 
     stop = stop_on_signals()
-    wishes = watching.WatchOptions(
+    options = watching.WatchOptions(
         arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json
     )
     settings = map_client.connection_settings(arguments.connect, arguments.config)
@@ -58,10 +58,11 @@ def run(arguments: argparse.Namespace) -> int:
         for name in ("webhook_queue", "health_port"):
             if getattr(arguments, name) is not None:
                 raise InputError(name, "needs a webhook", "add --webhook URL")
-        watching.watch_map(settings, wishes, stop, _print_line)
+        watching.watch_map(settings, options, stop, _print_line)
         return 0
     return _watch_with_webhook(
-        arguments, lambda hear: watching.watch_map(settings, wishes, stop, _print_line, hear)
+        arguments,
+        lambda on_alert: watching.watch_map(settings, options, stop, _print_line, on_alert),
     )
 
 

@@ -133,9 +133,9 @@ def query_map(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answe
     fully_served |= {
         one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)
     }
-    somewhere = map_query.bbox is not None or map_query.route is not None
+    has_place = map_query.bbox is not None or map_query.route is not None
     missing = (
-        regions.unserved_expressions(map_query, fully_served) if somewhere else sorted(withdrawn)
+        regions.unserved_expressions(map_query, fully_served) if has_place else sorted(withdrawn)
     )
     found = tuple(sorted({token.region for token in after}))
     return replace(answer, missing=tuple(missing), regions=found)

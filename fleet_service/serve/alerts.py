@@ -120,13 +120,13 @@ class Alerts:
         likely = likely[
             self._fusion.beliefs_for_alerts(likely) @ mugrid.SLIPPERY_SHARE > RAISE_ABOVE
         ]
-        believed = self._fusion.beliefs_at_last_report(likely) @ mugrid.SLIPPERY_SHARE
+        p_slippery = self._fusion.beliefs_at_last_report(likely) @ mugrid.SLIPPERY_SHARE
         # An alert that an update of a neighbouring cell causes gets the newest time of the update.
         time = self._fusion.live.time
         raised = np.where(np.isin(likely, updated), time[likely], time[updated].max(initial=0))
         out = []
         for slot, when, probability in zip(
-            likely.tolist(), raised.tolist(), believed.tolist(), strict=True
+            likely.tolist(), raised.tolist(), p_slippery.tolist(), strict=True
         ):
             if probability > RAISE_ABOVE and self._is_admitted(slot, when):
                 reason = f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"

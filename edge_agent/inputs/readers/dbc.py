@@ -199,8 +199,8 @@ def _parse_signal(found: re.Match[str]) -> tuple[Signal | None, str]:
         )
     except ValueError:
         return None, mux
-    sound = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST
-    return (signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None), mux
+    is_valid = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST
+    return (signal if is_valid and np.isfinite([signal.factor, signal.offset]).all() else None), mux
 
 
 def database_of(profile: Profile | None, folder: Path, given_file: Path | None) -> Database | None:

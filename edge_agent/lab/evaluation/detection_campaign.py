@@ -145,13 +145,13 @@ def town_named(text: str) -> DetectionTown:
     usual = ("", "rough", "120", "")
     parts = text.split(":")
     seed, kind, seconds, season = [*parts, *usual[len(parts) :]][:4]
-    sound = (
+    is_valid = (
         seed.isdecimal()
         and kind in KINDS
         and seconds.replace(".", "", 1).isdecimal()
         and season in ("", "winter")
     )
-    if len(parts) > len(usual) or not sound:
+    if len(parts) > len(usual) or not is_valid:
         raise InputError(
             "town", f"{text!r} is not a town", "give SEED, SEED:plain:900 or SEED:plain:900:winter"
         )

@@ -198,12 +198,12 @@ def judge_estimates(
     width = values[:, Column.MU_UPPER] - values[:, Column.MU_LOWER]
     is_informative = moving & (width < INFORMATIVE * float(width[0]))
     least = known_friction(t, signals, moving, known)
-    met = values[:, Column.MU_UPPER] >= least - MARGIN
+    is_above_least = values[:, Column.MU_UPPER] >= least - MARGIN
     exact = np.isfinite(truth["mu"])
     inside = (values[:, Column.MU_LOWER] <= truth["mu"]) & (
         truth["mu"] <= values[:, Column.MU_UPPER]
     )
-    right = np.where(exact, inside, met)
+    right = np.where(exact, inside, is_above_least)
     grips = np.where(exact, truth["mu"] >= GRIPS, known is None or known >= GRIPS)
     contradicted = (values[:, Column.HEALTH].astype(int) & int(Health.CONTRADICTION)) != 0
     fast = (t - t[0] > BEGIN_S) & (truth["vx"] > FAST_M_S)

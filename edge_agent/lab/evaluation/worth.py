@@ -188,8 +188,8 @@ def _score_drives(batches: Sequence[DriveSet], design: MixtureDesign) -> dict[st
     score, mu = (np.concatenate([pair[k] for pair in samples]) for k in range(2))
     found = {"all": float(np.concatenate(drives).mean())}
     for name, (above, most) in SURFACES.items():
-        met = (mu > above) & (mu <= most)
-        found[name] = float(score[met].mean()) if met.any() else np.nan
+        on_surface = (mu > above) & (mu <= most)
+        found[name] = float(score[on_surface].mean()) if on_surface.any() else np.nan
     return found
 
 

@@ -279,10 +279,9 @@ def detection_scores(
     surfaces = [(truth > above) & (truth <= most) for above, most in SURFACES.values()]
     called = upper < SLIPPERY_MU
     is_noticeable = (truth < SLIPPERY_MU - SURE_MARGIN) & (used >= FELT_SHARE)
+    means = [score[on_surface].mean() for on_surface in surfaces if on_surface.any()]
     return {
-        "surface_score": float(
-            np.mean([score[met].mean() for met in surfaces if met.any()] or [np.nan])
-        ),
+        "surface_score": float(np.mean(means or [np.nan])),
         "false_ice": _share(called, truth > SURFACES["wet"][0]),
         "missed_ice": _share(~called, is_noticeable),
     }

@@ -51,7 +51,7 @@ FACTORS: Final = (0.7, 1.4)
 SMALL: Final = 1.0
 
 
-class JudgedDrives(NamedTuple):
+class ScoredDrives(NamedTuple):
     """Simulated drives, and a mask (T, N) of the samples in which a wheel uses much of its grip."""
 
     batch: DriveSet
@@ -95,20 +95,20 @@ class ConstantChange(NamedTuple):
 
 def simulate_drives(
     seeds: Sequence[int], *, cars: int = CARS, town_s: float = TOWN_S, drive_s: float = DRIVE_S
-) -> list[JudgedDrives]:
+) -> list[ScoredDrives]:
     """Simulate, for each seed, `cars` cars in one town for `town_s` [s], and one drive of each
     manoeuvre for `drive_s` [s].
     """
     drives = []
     for seed in seeds:
         batch, used = simulate_town(seed, cars, town_s)
-        drives.append(JudgedDrives(batch, used >= EXCITED_SHARE))
+        drives.append(ScoredDrives(batch, used >= EXCITED_SHARE))
         other = simulate_manoeuvres(seed, drive_s)
-        drives.append(JudgedDrives(other, np.zeros(other.mu.shape, bool)))
+        drives.append(ScoredDrives(other, np.zeros(other.mu.shape, bool)))
     return drives
 
 
-def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeasures:
+def measure(design: MixtureDesign, drives: Sequence[ScoredDrives]) -> FilterMeasures:
     """Run the default filter with the parameter tables `design` on all drives, and return its
     measures.
 
@@ -117,22 +117,24 @@ def measure(design: MixtureDesign, drives: Sequence[JudgedDrives]) -> FilterMeas
     not count for `found`.
     """
     scores = []
-    cried = 0
-    grippy = 0
-    warned = 0
-    slippery = 0
+    false_ice = 0
+    high_count = 0
+    found = 0
+    low_count = 0
     for batch, excited in drives:
         estimates, score = run_filter(batch, design)
         scores.append(score.mean(axis=0))
         called = estimates.p_slippery > CALLED_SHARE
         high = batch.mu > SURE_GRIP
         low = excited & (batch.mu < SLIPPERY_MU)
-        cried += int((called & high).sum())
-        grippy += int(high.sum())
-        warned += int((called & low).sum())
-        slippery += int(low.sum())
+        false_ice += int((called & high).sum())
+        high_count += int(high.sum())
+        found += int((called & low).sum())
+        low_count += int(low.sum())
     return FilterMeasures(
-        float(np.concatenate(scores).mean()), cried / max(grippy, 1), warned / max(slippery, 1)
+        float(np.concatenate(scores).mean()),
+        false_ice / max(high_count, 1),
+        found / max(low_count, 1),
     )
 
 
@@ -160,7 +162,7 @@ def vary_numbers(memberships: Memberships) -> Iterator[tuple[str, float, Mixture
 
 
 def vary_constants(
-    drives: Sequence[JudgedDrives],
+    drives: Sequence[ScoredDrives],
     *,
     only: str = "",
     log_line: Callable[[str], None] = lambda _line: None,

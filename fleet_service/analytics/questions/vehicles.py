@@ -42,10 +42,10 @@ def expression(t: Table) -> Table:
     each = each.mutate(
         others=each.n.sum().over(w) - each.n, other_sum=each.s.sum().over(w) - each.s
     )
-    met = each.filter(each.others > 0)
-    met = met.mutate(d=met.s / met.n - met.other_sum / met.others)
-    bias = met.group_by("vehicle").aggregate(
-        meetings=met.count(), bias=met.d.mean(), spread=met.d.var(how="pop")
+    shared = each.filter(each.others > 0)
+    shared = shared.mutate(d=shared.s / shared.n - shared.other_sum / shared.others)
+    bias = shared.group_by("vehicle").aggregate(
+        meetings=shared.count(), bias=shared.d.mean(), spread=shared.d.var(how="pop")
     )
     values = each.group_by("vehicle").aggregate(values=each.n.sum())
     found = (

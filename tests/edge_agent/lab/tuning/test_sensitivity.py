@@ -18,14 +18,14 @@ from edge_agent.lab.tuning.sensitivity import ConstantChange
 
 
 @pytest.fixture(scope="module")
-def drives() -> list[sensitivity.JudgedDrives]:
+def drives() -> list[sensitivity.ScoredDrives]:
     """Simulate short drives for two seeds: manoeuvres, a town, and a town in winter. Return the
     drives.
     """
     return sensitivity.simulate_drives([8001, 8002], cars=2, town_s=8.0, drive_s=2.0)
 
 
-def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.JudgedDrives]) -> None:
+def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.ScoredDrives]) -> None:
     changes = sensitivity.vary_constants(drives, only="curve_c")
     assert [change.name for change in changes] == ["curve_c"] * 2
     assert {change.factor for change in changes} == set(sensitivity.FACTORS)
@@ -34,7 +34,7 @@ def test_a_constant_that_matters_changes_the_score(drives: list[sensitivity.Judg
 
 
 def test_repeated_measurement_of_a_filter_gives_the_same_result(
-    drives: list[sensitivity.JudgedDrives],
+    drives: list[sensitivity.ScoredDrives],
 ) -> None:
     usual = design_of(shipped_memberships(worth.ESTIMATOR), adaptive=True)
     assert sensitivity.measure(usual, drives) == sensitivity.measure(usual, drives)
@@ -62,7 +62,7 @@ def test_a_number_has_an_effect_if_one_of_its_factors_has() -> None:
 
 
 def test_the_command_writes_table_and_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drives: list[sensitivity.JudgedDrives]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drives: list[sensitivity.ScoredDrives]
 ) -> None:
     monkeypatch.setattr(sensitivity, "simulate_drives", lambda _seeds: drives)
     sensitivity.main(["--out", str(tmp_path), "--only", "hazard"])
@@ -70,6 +70,6 @@ def test_the_command_writes_table_and_numbers(
     assert (tmp_path / "sensitivity.json").exists()
 
 
-def test_excited_samples_are_judged_in_towns_only(drives: list[sensitivity.JudgedDrives]) -> None:
+def test_excited_samples_are_judged_in_towns_only(drives: list[sensitivity.ScoredDrives]) -> None:
     assert all(np.shape(excited) == batch.mu.shape for batch, excited in drives)
     assert not drives[1].excited.any()
