@@ -55,6 +55,7 @@ VISITS = 6
 SECOND = 10**9
 JSON_SENDER = "berta"
 PROTOBUF_SENDER = "anna"
+SENDERS: Final = (PROTOBUF_SENDER, JSON_SENDER)
 
 
 def protobuf_batch(now: int) -> bytes:
@@ -167,25 +168,30 @@ def find_blocked() -> list[str]:
     return out
 
 
+def publish_reports(session: zenoh.Session) -> None:
+    """Publish one batch of observations in each encoding, when a service listens to them."""
+    sent = {
+        PROTOBUF_SENDER: (protobuf_batch(time.time_ns()), wire.ENCODING[Kind.OBSERVATION]),
+        JSON_SENDER: (json_batch(time.time_ns()), wire.JSON),
+    }
+    for vehicle, (payload, encoding) in sent.items():
+        publisher = session.declare_publisher(
+            keys.observation_key(REGION, vehicle), encoding=encoding
+        )
+        matched(publisher)
+        publisher.put(payload)
+
+
 def main(endpoint: str) -> None:
     """Publish reports, receive messages, query the map, and print the results."""
     with open_session(endpoint) as session:
         listener = Heard(session)
-        sent = {
-            PROTOBUF_SENDER: (protobuf_batch(time.time_ns()), wire.ENCODING[Kind.OBSERVATION]),
-            JSON_SENDER: (json_batch(time.time_ns()), wire.JSON),
-        }
-        for vehicle, (payload, encoding) in sent.items():
-            publisher = session.declare_publisher(
-                keys.observation_key(REGION, vehicle), encoding=encoding
-            )
-            matched(publisher)
-            publisher.put(payload)
+        publish_reports(session)
         until(
             lambda: (
                 listener.errors
                 or (
-                    len(listener.acks) == len(sent)
+                    len(listener.acks) == len(SENDERS)
                     and listener.alerts
                     and listener.tiles
                     and listener.batches
@@ -223,7 +229,7 @@ def main(endpoint: str) -> None:
                     "cell": CELL,
                     "region": REGION,
                     "visits": VISITS,
-                    "vehicles": [PROTOBUF_SENDER, JSON_SENDER],
+                    "vehicles": list(SENDERS),
                 },
                 "loaded": sorted({name.partition(".")[0] for name in sys.modules} & set(FORBIDDEN)),
                 "blocked": find_blocked(),
