@@ -118,18 +118,21 @@ def _read_bag(path: Path, profile: Profile | None, database: Database | None) ->
     )
     with rosbag.open_bag(path) as reader:
         if not needs_frames or not rosbag.has_frames(reader):
-            return rosbag.read_bag(reader, path, requested_signals)
-        frames = partial(rosbag.bag_frames, reader, path)
-        decoded = _decode_frames(frames, path, profile, database)
-        return rosbag.add_topics(decoded, rosbag.read_bag(reader, path, requested_signals))
+            return rosbag.read_bag(reader, path, requested_signals).topics
+        content = rosbag.read_bag(reader, path, requested_signals, _identifiers_of(database))
+    frames = content.frames, content.first_frame_s
+    decoded = _decode_frames(lambda _: frames, path, profile, database)
+    return rosbag.add_topics(decoded, content.topics)
+
+
+def _identifiers_of(database: Database | None) -> set[int] | None:
+    """Return the identifiers of the messages in a CAN database; None without a database."""
+    return None if database is None else {message.identifier for message in database.values()}
 
 
 def _read_mdf(path: Path, profile: Profile | None, database: Database | None) -> Recording:
-    identifiers = (
-        None if database is None else {message.identifier for message in database.values()}
-    )
     requested_signals = None if profile is None else profile.needed_signals()
-    content = mdf.read_isolated(path, identifiers, requested_signals)
+    content = mdf.read_isolated(path, _identifiers_of(database), requested_signals)
     if content.recording is not None:
         return content.recording
     return _decode_frames(lambda _: content.frames or ({}, 0.0), path, profile, database)

@@ -3,11 +3,13 @@ without a ROS installation.
 
 A signal is called `/topic.field.field`; elements of short arrays are `/topic.field[0]`, and joints
 `/topic.velocity[NAME]`. The time of a reading is the time stamp in the message if there is one,
-else the recorder's; see `align_stamps`. Topics with the type can_msgs/Frame are read as a CAN log.
+else the recorder's; see `align_stamps`. Topics with the type can_msgs/Frame are read as a CAN log,
+on the same clock.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.inputs.readers.can_log import DATED_S, Frames, Log
+from edge_agent.inputs.readers.can_log import DATED_S, Frames, Key, Log
 from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -75,56 +77,90 @@ def has_frames(reader: Any) -> bool:  # noqa: ANN401
     return any(connection.msgtype == FRAME for connection in reader.connections)
 
 
-def bag_frames(reader: Any, path: Path, identifiers: set[int]) -> tuple[Log, float]:  # noqa: ANN401
-    """Return the CAN frames of a ROS bag whose identifier is in `identifiers`, and the time of the
-    first frame [s since 1970 UTC]. Each topic counts as a bus.
+@dataclass
+class BagContent:
+    """Content of a ROS bag: its CAN frames, the time of the first frame [s since 1970 UTC, or since
+    the start of the recorder's clock], and the signals of its other topics.
+
+    Frames and signals have the same clock. The time of the topics' signals counts from the first
+    frame; in a bag without frames, from the first message.
     """
-    log: Log = {}
-    first = np.inf
-    topics = [connection for connection in reader.connections if connection.msgtype == FRAME]
-    with foreign_errors(path, "ROS bag"):
-        for connection, stored, stamp, message in _read_messages(reader, topics):
-            time = stamp or stored
-            first = min(first, time)
-            if message.id in identifiers and not message.is_error and not message.is_rtr:
-                key = topics.index(connection), int(message.id), bool(message.is_extended)
-                log.setdefault(key, Frames()).add(time / NS, bytes(message.data)[: message.dlc])
-    return log, first / NS if np.isfinite(first) else 0.0
+
+    frames: Log
+    first_frame_s: float
+    topics: Recording
 
 
-def read_bag(reader: Any, path: Path, requested: set[str] | None) -> Recording:  # noqa: ANN401
-    """Return the signals `requested` of a ROS bag by name; all signals if it is None. CAN frames
-    are not signals.
+def read_bag(
+    reader: Any,  # noqa: ANN401
+    path: Path,
+    requested: set[str] | None,
+    identifiers: set[int] | None = None,
+) -> BagContent:
+    """Return the content of a ROS bag.
+
+    Args:
+        reader: the open bag.
+        path: path of the bag, for messages.
+        requested: names of the topics' signals to read; None for all signals.
+        identifiers: identifiers of the CAN frames to read; None for no frames. Each topic of
+            frames counts as a bus.
     """
-    topics = [
-        c
-        for c in reader.connections
-        if c.msgtype != FRAME
-        and (requested is None or any(name.startswith(f"{c.topic}.") for name in requested))
+    with_frames = [c for c in reader.connections if c.msgtype == FRAME and identifiers is not None]
+    connections = with_frames + [
+        connection
+        for connection in reader.connections
+        if connection.msgtype != FRAME and _is_requested(connection.topic, requested)
     ]
-    stamps: dict[str, list[tuple[int, int]]] = {}
+    stamps: dict[str, array[int]] = {}
     readings: dict[str, _Readings] = {}
+    frames = _BagFrames([connection.topic for connection in with_frames], identifiers or set())
     numbers = RequestedNumbers(requested)
     with foreign_errors(path, "ROS bag"):
-        for connection, stored, stamp, message in _read_messages(reader, topics):
+        for connection, stored, stamp, message in _read_messages(reader, connections):
             topic = connection.topic
-            leaves = numbers.find_leaves(topic, message)
-            if not leaves:
+            if connection.msgtype == FRAME:
+                frames.add(topic, message)
+            elif leaves := numbers.find_leaves(topic, message):
+                row = len(stamps.get(topic, ())) // 2
+                for name, take in leaves:
+                    one = readings.setdefault(name, _Readings(topic))
+                    one.rows.append(row)
+                    one.values.append(float(take(message)))
+            else:
                 continue
-            times = stamps.setdefault(topic, [])
-            for name, take in leaves:
-                one = readings.setdefault(name, _Readings(topic))
-                one.rows.append(len(times))
-                one.values.append(float(take(message)))
-            times.append((stored, stamp))
-    clocks, notes = align_stamps({topic: np.array(pairs) for topic, pairs in stamps.items()})
-    first = min((int(pairs[0][0]) for pairs in stamps.values()), default=None)
-    recording = Recording(path.name, {}, first, notes=[f"{path.name}: {note}" for note in notes])
+            stamps.setdefault(topic, array("q")).extend((stored, stamp))
+    clocks, notes = align_stamps(
+        {topic: np.array(pairs, np.int64).reshape(-1, 2) for topic, pairs in stamps.items()}
+    )
+    first = min((int(clocks[topic].min()) for topic in frames.counts or clocks), default=0)
+    return BagContent(
+        frames.to_log(clocks), first / NS, _make_recording(path, readings, clocks, first, notes)
+    )
+
+
+def _make_recording(
+    path: Path,
+    readings: Mapping[str, _Readings],
+    clocks: Mapping[str, IntArray],
+    first: int,
+    notes: list[str],
+) -> Recording:
+    """Return the readings of a bag's topics as a recording with the notes. `clocks` are the times
+    [ns] of the messages of each topic, and `first` the time [ns] of t = 0.
+    """
+    start_ns = first if first > DATED_NS else None
+    recording = Recording(path.name, {}, start_ns, notes=[f"{path.name}: {note}" for note in notes])
     for name, one in readings.items():
-        t = (clocks[one.topic][one.rows] - (first or 0)) / NS
+        t = (clocks[one.topic][one.rows] - first) / NS
         order = np.argsort(t, kind="stable")
         recording.signals[name] = Series(t[order], np.array(one.values)[order])
     return recording
+
+
+def _is_requested(topic: str, requested: set[str] | None) -> bool:
+    """Return True if the names `requested` include a signal of a topic; None means all signals."""
+    return requested is None or any(name.startswith(f"{topic}.") for name in requested)
 
 
 @dataclass
@@ -134,6 +170,35 @@ class _Readings:
     topic: str
     rows: list[int] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
+
+
+class _BagFrames:
+    """CAN frames of a bag whose times are not aligned yet."""
+
+    def __init__(self, topics: list[str], identifiers: set[int]) -> None:
+        """Collect the frames of these topics with these identifiers."""
+        self.counts: dict[str, int] = {}  # number of messages by topic
+        self._topics = topics  # a topic's position is the number of its bus
+        self._identifiers = identifiers
+        self._log: Log = {}
+        self._rows: dict[Key, list[int]] = {}
+
+    def add(self, topic: str, message: Any) -> None:  # noqa: ANN401
+        """Count the next message of a topic, and keep its frame if it is requested."""
+        row = self.counts.get(topic, 0)
+        self.counts[topic] = row + 1
+        if message.id in self._identifiers and not message.is_error and not message.is_rtr:
+            key = self._topics.index(topic), int(message.id), bool(message.is_extended)
+            self._log.setdefault(key, Frames()).add(0.0, bytes(message.data)[: message.dlc])
+            self._rows.setdefault(key, []).append(row)
+
+    def to_log(self, clocks: Mapping[str, IntArray]) -> Log:
+        """Return the frames with their times. `clocks` are the times [ns] of the messages of each
+        topic.
+        """
+        for key, frames in self._log.items():
+            frames.times = (clocks[self._topics[key[0]]][self._rows[key]] / NS).tolist()
+        return self._log
 
 
 def align_stamps(stamps: Mapping[str, IntArray]) -> tuple[dict[str, IntArray], list[str]]:
@@ -177,20 +242,14 @@ def align_stamps(stamps: Mapping[str, IntArray]) -> tuple[dict[str, IntArray], l
 
 def add_topics(decoded: Recording, topics: Recording) -> Recording:
     """Return the signals of CAN frames (`decoded`) together with the signals of other topics of
-    the same bag, on the clock of the frames. Without frames, return the topics.
+    the same bag, whose times also count from the first frame.
     """
-    if not decoded.signals or not topics.signals:
-        return decoded if decoded.signals else topics
-    if decoded.start_ns is None or topics.start_ns is None:
-        note = f"{decoded.name}: only CAN frames are read, because they have no date"
-        return replace(decoded, notes=[*decoded.notes, note])
-    lead = (topics.start_ns - decoded.start_ns) / NS
-    others = {
-        name: replace(series, t=series.t + lead)
-        for name, series in topics.signals.items()
-        if name not in decoded.signals
-    }
-    return replace(decoded, signals=decoded.signals | others, notes=[*decoded.notes, *topics.notes])
+    return replace(
+        decoded,
+        signals=topics.signals | decoded.signals,
+        start_ns=topics.start_ns,
+        notes=[*decoded.notes, *topics.notes],
+    )
 
 
 def _read_messages(

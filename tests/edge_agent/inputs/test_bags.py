@@ -200,3 +200,31 @@ def test_other_topics_of_a_bag_with_frames_are_read(tmp_path: Path) -> None:
     assert recording.signals["/fix.latitude"].t[0] == pytest.approx(0.003, abs=1e-6)
     topics = Profile(name="own", channels={"latitude": Channel(signal="/fix.latitude")})
     assert read_source(bag, topics, None).signals.keys() == {"/fix.latitude"}
+
+
+def test_frames_that_count_from_a_start_are_put_on_the_clock_of_the_bag(tmp_path: Path) -> None:
+    database = parse_dbc('BO_ 170 M: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] "" X\n')
+    messages = []
+    for k in range(10):
+        at = DATE + k * 10 * MS
+        messages.append((at + 2 * MS, "/can", make_frame(5 * NS + k * 10 * MS, k)))
+        messages.append((at + 3 * MS, "/fix", make_fix(at, 0)))
+    recording = read_source(write_bag(tmp_path / "bag", messages), None, database)
+    assert recording.start_ns == DATE + 2 * MS
+    assert recording.signals["M.S"].t == pytest.approx(np.arange(10) * 0.01, abs=1e-6)
+    assert recording.signals["/fix.latitude"].t[0] == pytest.approx(-0.002, abs=1e-9)
+    shift = DATE / NS - 5 + 0.002
+    assert recording.notes == [f"bag: /can has a clock of its own; {shift:.3f} s added"]
+
+
+def test_recorder_without_a_date_gives_a_recording_without_one(tmp_path: Path) -> None:
+    database = parse_dbc('BO_ 170 M: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] "" X\n')
+    messages = []
+    for k in range(10):
+        at = 7 * NS + k * 10 * MS
+        messages.append((at, "/can", make_frame(at, k)))
+        messages.append((at, "/fix", make_fix(at + 4 * MS, 0)))
+    recording = read_source(write_bag(tmp_path / "bag", messages), None, database)
+    assert recording.start_ns is None
+    assert recording.signals.keys() >= {"M.S", "/fix.latitude"}
+    assert recording.signals["/fix.latitude"].t[0] == pytest.approx(0.004, abs=1e-9)
