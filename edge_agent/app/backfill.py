@@ -259,7 +259,7 @@ def estimate_drive(task: Task, estimator: str, memberships: Memberships | None =
         recorded = read_log(task.log)  # before the vehicle file, whose place depends on it
         log, vehicle, diagnosis, _ = prepare_log(recorded, load_vehicle(task.vehicle))
         bank = bank_of(estimator, [vehicle], memberships)
-        plausibility = Plausibility(vehicle.wheel_radius)
+        plausibility = Plausibility(vehicle.wheel_radius, bool(diagnosis.findings))
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):
                 estimates = bank.advance(block.t, block.signals)

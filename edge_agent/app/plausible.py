@@ -45,10 +45,12 @@ def grip_in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
 @dataclass
 class Plausibility:
     """Counts and errors of the samples of one recorded drive, from which this class judges the
-    plausibility of the estimates.
+    plausibility of the estimates. `radius` is that of the wheels [m]. Estimates from signals in
+    which the signal doctor found faults are implausible.
     """
 
     radius: float
+    has_faulty_signals: bool = False
     first_s: float = np.inf
     last_s: float = -np.inf
     samples: int = 0
@@ -100,6 +102,8 @@ class Plausibility:
         n = max(self.samples, 1)
         most_resets = 1 + min(MOST_RESETS_PER_S * self.seconds, MOST_RESETS_PER_SAMPLE * n)
         found = []
+        if self.has_faulty_signals:
+            found.append("signals have faults")
         if self.median_speed_error > MOST_SPEED_ERROR:
             found.append("speed differs much from that of the wheels")
         if self.violations / n > MOST_VIOLATION:

@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="publish a log that did not pass the signal doctor",
+        help="publish a log that did not pass the signal doctor, and ignore its faults",
     )
     add_connection(parser, ", for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
@@ -156,7 +156,7 @@ def _replay_one(
         _require_position(path, log)
     start_ns = _start_time(args.start, log)
     log, vehicle, diagnosis, notes = prepare_log(log, vehicle)
-    plausibility = Plausibility(vehicle.wheel_radius)
+    plausibility = Plausibility(vehicle.wheel_radius, bool(diagnosis.findings) and not args.trust)
     if args.publish and not args.trust:
         require_valid_signals(diagnosis)
     else:

@@ -52,6 +52,8 @@ JUMPS = 0.01  # share of a wheel's readings that may differ strongly from the ot
 CONSTANT_S = 10.0  # [s] no wheel turns at exactly the same speed, or stands, for that long
 CHANGES = 0.2  # share of its largest value by which the speed of another wheel must change
 FASTEST_HZ = 2000.0
+# other units of time, in seconds; spreadsheets count days
+TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86_400.0))
 
 
 def diagnose(
@@ -184,12 +186,13 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
         diagnosis.findings.append(Finding("t", "repeats", words))
         return t, True
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
-        for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0)):
+        for unit, factor in TIME_UNITS:
             if 1.0 / FASTEST_HZ <= step * factor <= 1.0 / SLOWEST_HZ:
                 words = f"a sample every {step:g}: are these {unit}?"
                 diagnosis.findings.append(Finding("t", unit, words, scale=factor))
                 return t * factor, False
-        words = f"a sample every {step:g} s; friction needs {SLOWEST_HZ:g} a second"
+        bound = f"least {SLOWEST_HZ:g}" if step * SLOWEST_HZ > 1.0 else f"most {FASTEST_HZ:g}"
+        words = f"a sample every {step:g} s; friction needs at {bound} a second"
         diagnosis.findings.append(Finding("t", "rate", words))
         return t, True
     return t, False

@@ -55,6 +55,7 @@ LONGEST_STEP_S: Final = 2.0
 SHORTEST_STEP_S: Final = 1e-4
 DAY_BACK_S: Final = 43_200.0  # [s] a larger step back is midnight
 MOST_NAMES: Final = 20  # maximum number of column names in an error message
+MOST_LETTERS: Final = 60  # maximum length of one column name in an error message
 RACECHRONO: Final = "racechrono"
 LONGEST_PREAMBLE: Final = 50  # [lines] maximum length of the text before the table
 _WORD: Final = re.compile(r"[a-z]+")
@@ -269,6 +270,9 @@ def _time_column(path: Path, titles: dict[str, str], requested: str | None) -> s
     for name in titles:  # take the first name with such a word, such as "INS_time_sec"
         if {"time", "timestamp", "datetime"} & set(_WORD.findall(name.lower())):
             return name
+    if len(titles) == 1:
+        problem = f"{path} has one column, {next(iter(titles))[:MOST_LETTERS]!r}"
+        raise InputError("source", problem, "separate its columns by commas, semicolons or tabs")
     seen = ", ".join(list(titles)[:MOST_NAMES])
     raise InputError(
         "time",

@@ -238,7 +238,21 @@ def test_faulty_signals_and_implausible_estimates_are_reported(
     reported = capsys.readouterr().err
     assert f"warning: {coarse}: t repeats: most samples repeat a time" in reported
     assert f"warning: {strong}: 100 samples" in reported
-    assert "NOT PLAUSIBLE: the upper bound lies below the grip in use" in reported
+    assert "NOT PLAUSIBLE: signals have faults, the upper bound lies below the grip" in reported
+
+
+def test_log_with_a_fault_has_implausible_estimates_unless_trusted(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = pq.read_table(drives / "d0.parquet")
+    coarse = pa.array(np.floor(table["t"].to_numpy() * 10.0) / 10.0)
+    log = tmp_path / "coarse.parquet"
+    pq.write_table(table.set_column(table.column_names.index("t"), "t", coarse), log)
+    words = ["replay", str(log), "--vehicle", str(drives / "d0.json"), "--estimator", "ckf"]
+    assert main([*words, "--out", str(tmp_path / "o.csv")]) == 3
+    assert "NOT PLAUSIBLE: signals have faults; run edge-agent check" in capsys.readouterr().err
+    assert main([*words, "--trust", "--out", str(tmp_path / "o.csv")]) == 0
+    assert capsys.readouterr().err.endswith("; plausible\n")
 
 
 def test_several_logs_are_not_published_or_compared(

@@ -13,3 +13,8 @@ def test_reset_at_every_sample_is_implausible_with_any_unit_of_time(
 ) -> None:
     found = Plausibility(0.3, first_s=0.0, last_s=last, samples=6000, resets=resets)
     assert len(found.problems()) == bad
+
+
+def test_estimates_of_faulty_signals_are_implausible() -> None:
+    found = Plausibility(0.3, has_faulty_signals=True, first=0.0, last=60.0, samples=6000)
+    assert found.summary_line().endswith("NOT PLAUSIBLE: signals have faults; run edge-agent check")

@@ -223,6 +223,22 @@ def test_time_stamps_in_whole_seconds_are_a_fault(rough: Recorded) -> None:
     assert [(one.channel, one.kind) for one in diagnosis.findings] == [("t", "repeats")]
 
 
+@pytest.mark.parametrize(
+    ("scale", "kind", "words"),
+    [
+        (1.0 / 86400.0, "days", "are these days?"),
+        (30.0, "rate", "friction needs at least 5 a second"),
+        (4e-4, "rate", "friction needs at most 2000 a second"),
+    ],
+)
+def test_times_in_another_unit_are_a_fault(
+    rough: Recorded, scale: float, kind: str, words: str
+) -> None:
+    found = diagnose(rough.t * scale, rough.signals, rough.vehicle).findings[0]
+    assert (found.channel, found.kind) == ("t", kind)
+    assert words in str(found)
+
+
 @pytest.mark.parametrize("rows", [2, 3])
 def test_log_of_a_few_rows_gives_no_finding(rough: Recorded, rows: int) -> None:
     diagnosis = diagnose(rough.t[:rows], rough.signals[:rows], rough.vehicle)

@@ -278,6 +278,12 @@ def test_table_with_a_preamble_is_refused_with_its_columns(tmp_path: Path) -> No
         read_source(path, None, None)
 
 
+def test_table_with_another_separator_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "t|ax|ay\n0.0|1.0|0.0\n0.1|1.0|0.0\n")
+    with pytest.raises(InputError, match="has one column, 't|ax|ay'; separate its columns by"):
+        read_source(path, None, None)
+
+
 def test_column_that_is_not_only_numbers_is_noted(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", "t,ax,ay\n0.0,1.0,-\n0.1,1.0,0.5\n")
     recording = read_source(path, None, None)
