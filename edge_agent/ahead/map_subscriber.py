@@ -19,7 +19,13 @@ import zenoh
 from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells, decode_standing_alerts
 from edge_agent.ahead.local_map import LocalMap
 from edge_agent.ahead.path import Path, Pose
-from edge_agent.ahead.request_log import Box, RequestLog, Tiles, keys_of
+from edge_agent.ahead.request_log import (
+    Box,
+    RequestLog,
+    Tiles,
+    keys_of,
+    split_at_antimeridian,
+)
 from schemas import grid, keys
 from schemas.errors import WireError
 from schemas.runtime.zenoh_session import connected_routers, quality_of
@@ -162,11 +168,12 @@ class MapSubscriber:
         self._publisher.undeclare()
 
     def _query_box(self, box: Box) -> None:
-        text = ",".join(f"{side:.6f}" for side in box)
-        for region in keys_of(box):
-            key = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*?bbox={text}"
-            self._send_query(key, self._on_cells)
-            self.counts["questions"] += 1
+        for part in split_at_antimeridian(box):
+            text = ",".join(f"{side:.6f}" for side in part)
+            for region in keys_of(part):
+                key = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*?bbox={text}"
+                self._send_query(key, self._on_cells)
+                self.counts["questions"] += 1
 
     def _send_query(self, selector: str, take: Callable[[str, bytes], None]) -> None:
         def receive_reply(reply: zenoh.Reply) -> None:

@@ -123,13 +123,26 @@ class Tiles:
         return fresh, dropped
 
 
+def split_at_antimeridian(box: Box) -> list[Box]:
+    """Return the parts of a box on both sides of the 180° meridian, with longitudes from -180° to
+    180°; a box that does not cross it is its only part. The map accepts only such boxes.
+    """
+    shift = 360.0 * np.floor((box.west + 180.0) / 360.0)
+    west = float(box.west - shift)
+    east = float(box.east - shift)
+    if east <= 180.0:
+        return [box._replace(west=west, east=east)]
+    return [box._replace(west=west, east=180.0), box._replace(west=-180.0, east=east - 360.0)]
+
+
 def keys_of(box: Box) -> list[int]:
     """Return the regions (zoom-10 grid squares, by number) that a box (rectangle of the map)
-    touches, each once.
+    overlaps, each once. The box lies between the longitudes -180° and 180°.
     """
+    east = np.nextafter(box.east, box.west)  # a region that begins at 180° is another one
     corners = grid.cell_of(
         np.array([box.south, box.south, box.north, box.north]),
-        np.array([box.west, box.east, box.west, box.east]),
+        np.array([box.west, east, box.west, east]),
     )
     return _in_order(grid.region_of(corners))
 

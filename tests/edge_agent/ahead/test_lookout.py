@@ -18,10 +18,19 @@ from edge_agent.ahead import local_map, lookout
 from edge_agent.ahead.cell_decoder import decode_alert_message, decode_cells, decode_standing_alerts
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
-from edge_agent.ahead.request_log import LEAVE_S, MOST_TILES, REFRESH_S, RequestLog, Tiles
+from edge_agent.ahead.request_log import (
+    LEAVE_S,
+    MOST_TILES,
+    REFRESH_S,
+    RequestLog,
+    Tiles,
+    keys_of,
+    split_at_antimeridian,
+)
 from schemas import grid, keys, wire
 from schemas.errors import WireError
 from schemas.numeric import FloatArray, IntArray
+from schemas.query import parse as parse_query
 from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING, GripWarning, Outlook, decode_ahead, encode_ahead
@@ -442,6 +451,20 @@ def test_boxes_ahead_are_requested_once_and_again_when_old() -> None:
     )
     asked.request_again()
     assert asked.missing_boxes(path, pose, 100.0), "the session has come back"
+
+
+@pytest.mark.parametrize("longitude", [179.9995, -179.9995])
+def test_boxes_over_the_antimeridian_are_requested_on_both_sides(longitude: float) -> None:
+    yaw = 0.0 if longitude > 0.0 else np.pi
+    pose = Pose(-16.8, longitude, yaw, 14.0, NOW)
+    boxes = RequestLog().missing_boxes(straight_path(pose, 150.0), pose, 100.0)
+    parts = [part for box in boxes for part in split_at_antimeridian(box)]
+    for part in parts:
+        assert parse_query({"bbox": ",".join(map(str, part))}).bbox == part
+    west = grid.region_of(grid.cell_of(-16.8, 179.9))
+    east = grid.region_of(grid.cell_of(-16.8, -179.9))
+    assert {key for part in parts for key in keys_of(part)} == {west, east}
+    assert [keys_of(part)[0] for part in parts if part.west < 0.0] == [east]
 
 
 def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
