@@ -18,6 +18,12 @@ from schemas.thresholds import NS, SLIPPERY_MU
 
 NAME_PATTERN = r"^[a-z][a-z0-9-]{2,62}$"
 REGION_PATTERN = r"^([0-3]{4}|\*)/([0-3]{3}|\*)/([0-3]{3}|\*)$"
+PLACE_PATTERN = r"^(/|[a-z][a-z0-9+.-]*://)."
+FORMS: Final = {  # pattern -> words for error messages
+    NAME_PATTERN: "3 to 63 of a-z, 0-9 and -, a letter first",
+    REGION_PATTERN: "4, 3 and 3 digits from 0 to 3, or *, as in 1202/310/*",
+    PLACE_PATTERN: "a URI such as s3://bucket/folder, or a folder from /",
+}
 VehicleName = Annotated[str, Field(pattern=NAME_PATTERN)]
 # Shortest time [days] for which rows are kept. A batch may be sent again for thirty days
 # (ServiceConfig.oldest_s), and its rows are needed to recognise it.
@@ -236,7 +242,7 @@ class ServiceConfig(MonitoringSettings):
     )
     put_to: str | None = Field(
         default=None,
-        pattern=r"^(/|[a-z][a-z0-9+.-]*://).",
+        pattern=PLACE_PATTERN,
         description="URI to which compacted files are copied, e.g. s3://bucket/a",
     )
     queue_batches: int = Field(
@@ -376,6 +382,8 @@ def explain_validation_error(
     shown = given if len(given) <= 60 else given[:57] + "..."
     text = first["msg"].removeprefix("Value error, ")
     problem = f"{text[0].lower()}{text[1:]}"
+    if (form := FORMS.get(first.get("ctx", {}).get("pattern", ""))) is not None:
+        problem = f"should be {form}"
     if first["type"] == "missing":
         problem = "is missing"
     elif first["loc"]:  # otherwise the input is the whole file

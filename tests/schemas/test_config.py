@@ -94,3 +94,19 @@ def test_an_accuracy_that_a_service_rejects_is_refused_at_the_start(
     path.write_text(json.dumps({name: 1.01 * limits[1]}))
     with pytest.raises(InputError, match=name):
         load_config(path, AgentConfig)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"regions": ["1202/x"]}, "regions.0: should be 4, 3 and 3 digits from 0 to 3"),
+        ({"name": "Shard 1"}, "name: should be 3 to 63 of a-z"),
+    ],
+)
+def test_form_of_a_setting_is_explained_in_words(
+    tmp_path: Path, settings: dict[str, object], words: str
+) -> None:
+    path = tmp_path / "service.json"
+    path.write_text(json.dumps(settings))
+    with pytest.raises(InputError, match=words):
+        load_config(path, ServiceConfig)
