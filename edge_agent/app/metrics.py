@@ -112,6 +112,11 @@ def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
         found.append(f"nothing was acknowledged for {status.unanswered_s:.0f} s")
     if status.fill_share > FULL:
         found.append("the outbox is full: the oldest states are dropped first")
+    if error := publisher.disk_error:
+        found.append(
+            f"the outbox {status.outbox_path} cannot be read or written ({error}); make room on "
+            "its disk"
+        )
     if abs(status.clock_behind_s) > CLOCK_OFF_S:
         found.append(describe_clock(status.clock_behind_s))
     if status.stranded_records:

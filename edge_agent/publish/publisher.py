@@ -79,7 +79,7 @@ class Publisher:
         )
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._waiting: list[Draft] = []
-        self._disk_error = ""  # last error of the outbox, until a batch is stored
+        self._disk_error = ""  # last error of the outbox, until a round succeeds
         self._closing = threading.Event()
         self._deadline = float("inf")
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
@@ -101,6 +101,11 @@ class Publisher:
             and not self._sender.is_alive()
             and not self._closing.is_set()
         )
+
+    @property
+    def disk_error(self) -> str:
+        """Return the reason why the outbox cannot be read or written; "" if it can."""
+        return self._disk_error
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of records of one kind, or of all kinds, that no service has settled
@@ -174,6 +179,8 @@ class Publisher:
         self._store_and_send()
         self._resend_due()  # before the deletion, which a full disk may refuse
         self._outbox.delete_settled()
+        if not self._waiting:
+            self._disk_error = ""
 
     def _recover_outbox(self) -> None:
         """Recover the readable content of an outbox (store of batches on disk) that was damaged
@@ -228,7 +235,6 @@ class Publisher:
             log.exception("a batch cannot be written")
             self._drop_unwritable()
             return
-        self._disk_error = ""
         for draft in self._waiting:
             self.counts.published[draft.kind] += draft.records
         self._waiting = []

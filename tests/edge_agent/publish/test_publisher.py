@@ -270,7 +270,10 @@ def test_a_full_disk_is_waited_for(
     publisher.offer(observations, states)
     until(lambda: "the outbox refuses" in caplog.text)
     assert publisher.count_unsettled() == len(observations.vehicle) + len(states.vehicle)
+    problem = f"the outbox {config.spool} cannot be read or written (database or disk is full)"
+    assert any(text.startswith(problem) for text in health_problems(publisher, Progress()))
     database.execute("PRAGMA max_page_count = 1000000")
+    until(lambda: not publisher.disk_error)
     assert publisher.close(within_s=PATIENCE_S)
     assert publisher.count_unsettled() == publisher.status.dropped_records == 0
     assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
