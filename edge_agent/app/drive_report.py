@@ -33,7 +33,6 @@ ENDINGS: Final = (PAGE, *IMAGES)
 # Largest number of points of a curve on the page. Longer curves are thinned, but the extremes of
 # the interval remain.
 MOST_POINTS: Final = 1500
-WIDTH = 900
 HEIGHT = 150
 LEFT = 56
 _TEMPLATE: Final = Path(__file__).with_name("drive.html")
@@ -135,7 +134,6 @@ def page_of(drive: RecordedDrive) -> str:
         "plots": plots,
         "health": _health_spans(drive),
         "track": _track_of(drive),
-        "width": WIDTH,
         "height": HEIGHT,
         "left": LEFT,
         "slippery": SLIPPERY_MU,
@@ -202,8 +200,9 @@ def _track_of(drive: RecordedDrive) -> dict[str, Any] | None:
         return None
     rows = known[:: max(1, len(known) // MOST_POINTS)]
     latitude, longitude = position[rows].T
+    eastward = np.unwrap(longitude, period=360.0)  # continuous over the 180° meridian
     x = (
-        (longitude - longitude.mean())
+        (eastward - eastward.mean())
         * math.cos(math.radians(float(latitude.mean())))
         * METRES_PER_DEGREE
     )

@@ -86,6 +86,14 @@ def test_a_track_without_knowledge_has_no_colour() -> None:
     assert None not in data_of(page_of(drive_of()))["track"]["colour"]
 
 
+def test_track_over_the_antimeridian_is_continuous() -> None:
+    drive = drive_of()
+    drive.log.signals[:, S.LATITUDE] = -16.8
+    drive.log.signals[:, S.LONGITUDE] = (179.9998 + drive.log.t * 1e-5 + 180.0) % 360.0 - 180.0
+    track = data_of(page_of(drive))["track"]
+    assert max(track["x"]) - min(track["x"]) == pytest.approx(42.6, abs=0.5)
+
+
 def test_title_of_a_report_is_escaped() -> None:
     text = page_of(drive_of())
     assert "<drive>" not in text
@@ -123,4 +131,20 @@ def test_straight_drive_leaves_all_values_in_the_window(tmp_path: Path) -> None:
     assert values is not None
     assert box["height"] < 0.6 * DESK["height"]
     assert values["y"] + values["height"] <= DESK["height"]
+    assert seen.errors == []
+
+
+@pytest.mark.campaign
+def test_times_of_health_and_letters_are_right_on_a_phone(tmp_path: Path) -> None:
+    write_report(drive_of(), tmp_path / "drive.html")
+    with open_page(tmp_path / "drive.html", phone=True) as seen:
+        plots = seen.page.locator("#plots svg")
+        letter = seen.page.locator("#plots text").first.bounding_box()
+        bar = plots.last.locator("rect").bounding_box()
+        axis = plots.first.locator(".grid").first.bounding_box()
+    assert letter is not None
+    assert letter["height"] > 10.0
+    assert bar is not None
+    assert axis is not None
+    assert bar["x"] - axis["x"] == pytest.approx(20.01 / 39.99 * axis["width"], abs=2.0)
     assert seen.errors == []
