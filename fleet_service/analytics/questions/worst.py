@@ -135,8 +135,16 @@ def _stretch_cells(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]
 
 
 def _bounding_boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:
+    """Return west, south, east and north edges [deg] of the stretches, (count,) each. The east of a
+    stretch over the 180° meridian is above 180°.
+    """
+    west, south, east, north = grid.bounds(cell)
+    furthest_east = np.full(count, -np.inf)
+    np.maximum.at(furthest_east, label, east)
+    shift = np.where(furthest_east[label] - east > 180.0, 360.0, 0.0)
     out = []
-    for side, least in zip(grid.bounds(cell), (True, True, False, False), strict=True):
+    sides = (west + shift, south, east + shift, north)
+    for side, least in zip(sides, (True, True, False, False), strict=True):
         extreme = np.full(count, np.inf if least else -np.inf)
         choose = np.minimum if least else np.maximum
         choose.at(extreme, label, side)

@@ -335,3 +335,16 @@ def test_a_box_and_times_leave_other_rows_out(asked: Ask, rows: pd.DataFrame) ->
         & rows["latitude"].between(57.69, 57.72, inclusive="left")
     ]
     assert 0 < found["observations"].to_numpy().sum() == len(inside) < len(rows)
+
+
+def test_stretch_over_the_antimeridian_has_its_true_length() -> None:
+    latitude = np.full(8, -16.8)
+    longitude = (179.9994 + 0.00018 * np.arange(8) + 180.0) % 360.0 - 180.0
+    cell = np.unique(grid.cell_of(latitude, longitude))
+    n = len(cell)
+    columns: dict[str, object] = dict.fromkeys(("observations", "values", "slippery"), np.ones(n))
+    columns |= {"cell": cell, "sector": np.zeros(n, np.int8), "mu_sum": np.full(n, 0.3)}
+    found = join_stretches(pa.table(columns)).to_pylist()
+    assert len(found) == 1
+    assert found[0]["length_m"] == pytest.approx(n * 18.3, rel=0.1)
+    assert found[0]["west"] < 180.0 < found[0]["east"]
