@@ -151,8 +151,7 @@ def _decode_frames(
     buses = {rule.message: rule.bus for rule in rules if rule.message and rule.bus is not None}
     with foreign_errors(path, "CAN log"):
         recording = can_log.decode_log(frames, path.name, database, requested_signals, buses)
-    if path.suffix.lower() == ".blf":
-        recording.notes += can_log.notes_if_cut(path)
+    recording.notes += can_log.notes_if_cut(path)
     return recording
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -26,6 +26,7 @@ from schemas.thresholds import NS
 
 SUFFIXES: Final = (".blf", ".asc", ".log", ".trc")
 MICRO: Final = 1_000_000
+LONGEST_LINE: Final = 1024  # [bytes] of an ASC file
 BLF_SIZE: Final = slice(16, 24)  # bytes of a BLF file that state its size, 0 if it was not finished
 # The year 2000 [s UTC]. A smaller time counts from the start of the log.
 DATED_S: Final = 946_684_800.0
@@ -134,13 +135,16 @@ def no_database(path: Path) -> InputError:
 def log_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
     """Read a log of CAN frames with python-can. Return the frames whose identifier is in
     `identifiers`, and the time of the log's first frame [s].
+
+    Raises:
+        InputError: the log has no frame, or its clock was set back.
     """
     log: Log = defaultdict(Frames)
     first = np.inf
     # The library reports versions of traces at the levels INFO and WARNING.
     logging.getLogger("can").setLevel(logging.ERROR)
     with import_optional("can").LogReader(path) as reader:
-        for message in reader:
+        for message in _whole_messages(reader, path):
             time = message.timestamp
             first = min(first, time)
             if (
@@ -151,11 +155,41 @@ def log_frames(path: Path, identifiers: set[int]) -> tuple[Log, float]:
                 log[bus_of(message.channel), message.arbitration_id, message.is_extended_id].add(
                     time, message.data
                 )
-    return require_steady_clock(path, log), float(first) if np.isfinite(first) else 0.0
+    if not np.isfinite(first):
+        raise InputError("source", f"{path} holds no CAN frame", "record it again")
+    return require_steady_clock(path, log), float(first)
+
+
+def _whole_messages(reader: Iterable[Any], path: Path) -> Iterator[Any]:
+    """Yield the messages of a log without an incomplete last line, which the library python-can
+    cannot read in an ASC file.
+    """
+    try:
+        yield from reader
+    except ValueError:
+        file = getattr(reader, "file", None)
+        if not _has_cut_line(path) or file is None or file.read(1):
+            raise
+
+
+def _has_cut_line(path: Path) -> bool:
+    """Return True if an ASC file ends within a line."""
+    if path.suffix.lower() != ".asc":
+        return False
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - LONGEST_LINE))
+        last = file.read().splitlines(keepends=True)[-1:]
+    return bool(last) and not last[0].endswith((b"\n", b"\r")) and b"End" not in last[0]
 
 
 def notes_if_cut(path: Path) -> list[str]:
-    """Return a note if a BLF file is shorter than its header states, because it was truncated."""
+    """Return a note if a BLF file is shorter than its header states, or an ASC file ends within a
+    line, because it was truncated.
+    """
+    if _has_cut_line(path):
+        return [f"{path.name}: cut off, its last line is incomplete"]
+    if path.suffix.lower() != ".blf":
+        return []
     with path.open("rb") as file:
         header = file.read(BLF_SIZE.stop)
     size = path.stat().st_size

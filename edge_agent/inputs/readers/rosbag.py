@@ -9,6 +9,7 @@ on the same clock.
 
 from __future__ import annotations
 
+import shlex
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ import numpy as np
 
 from edge_agent.inputs.readers.can_log import DATED_S, Frames, Key, Log
 from edge_agent.inputs.recording import Recording, Series, foreign_errors, import_optional
+from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
@@ -46,7 +48,13 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path) -> Iterator[Any]:
     """Open a ROS bag for a `with` block, and close it at the end of the block. If `path` is a
     database file of a bag folder, the folder is opened.
+
+    Raises:
+        InputError: the bag cannot be read, or its metadata are missing.
     """
+    if path.suffix == ".db3" and path.exists() and not (path.parent / "metadata.yaml").is_file():
+        fix = f"run ros2 bag reindex {shlex.quote(str(path.parent))}, then give the folder"
+        raise InputError("source", f"{path} has no metadata.yaml next to it", fix)
     highlevel = import_optional("rosbags.highlevel")
     typesys = import_optional("rosbags.typesys")
     inside = (

@@ -403,3 +403,27 @@ def test_import_does_not_overwrite_a_recording_or_ignore_a_clock(
     assert message in capsys.readouterr().err
     assert path.read_text() == text
     assert not Path("out.parquet").exists()
+
+
+def test_log_that_ends_within_a_line_is_read_and_noted(tmp_path: Path) -> None:
+    header = "date Mon Jan 1 00:00:00 2026\nbase hex timestamps absolute\n"
+    frame = "   {:.6f} 1  AA   Rx   d 8 01 02 03 04 05 06 07 08\n"
+    text = header + "".join(frame.format(0.01 * k) for k in range(10))
+    whole = read_source(write(tmp_path / "a.asc", text), None, DATABASE)
+    cut = read_source(write(tmp_path / "b.asc", text + "   0.1"), None, DATABASE)
+    assert whole.notes == []
+    assert cut.notes == ["b.asc: cut off, its last line is incomplete"]
+    assert {name: len(one.t) for name, one in cut.signals.items()} == {
+        name: len(one.t) for name, one in whole.signals.items()
+    }
+
+
+@pytest.mark.parametrize("name", ["a.asc", "a.log"])
+def test_log_without_frames_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="holds no CAN frame"):
+        read_source(write(tmp_path / name, ""), None, DATABASE)
+
+
+def test_database_of_a_bag_without_metadata_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no metadata.yaml next to it; run ros2 bag reindex"):
+        read_source(write(tmp_path / "a.db3", ""), None, None)
