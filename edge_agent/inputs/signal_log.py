@@ -31,14 +31,17 @@ from edge_agent.inputs.log_columns import (
     fill_steering,
     remove_null_positions,
 )
+from edge_agent.inputs.units import FIRST_DATE, LAST_DATE, TIME_UNITS
 from schemas.errors import InputError
-from schemas.numeric import FloatArray
+from schemas.numeric import FloatArray, IntArray
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
 # 2.4 MB of signals. This bounds the memory, and is long enough to make the cost per block
 # negligible.
 BLOCK_ROWS: Final = 16_384
+# [ns] A log in ns has less than 3300 samples a second, and a log in us more than 3.
+SHORTEST_STEP_NS: Final = 300_000
 PARQUET: Final = b"PAR1"  # first bytes of a Parquet file
 LONGEST_HEADER: Final = 4096  # [bytes] of the first line of a CSV file that are read
 
@@ -78,7 +81,7 @@ def read_log(path: Path) -> SignalLog:
         InputError: the log is not valid. The error names log, column (and row) and fix. Reasons:
             - The file is not a readable Parquet file, or has no rows.
             - A required column is missing, or has no reading.
-            - A column is not numeric.
+            - A column is not numeric, or occurs twice.
             - A time is missing, or time goes backwards.
     """
     table = _read_table(path)
@@ -166,14 +169,15 @@ def _read_table(path: Path) -> pa.Table:
     require_log(path)
     try:
         with pq.ParquetFile(path) as file:
-            present = set(file.schema_arrow.names)
-            return file.read(
-                columns=[
-                    name
-                    for name in ("t", "timestamp", GROUND, *CHANNELS, *CONTEXT)
-                    if name in present
-                ]
-            )
+            names = file.schema_arrow.names
+            used = [
+                name for name in ("t", "timestamp", GROUND, *CHANNELS, *CONTEXT) if name in names
+            ]
+            for name in used:
+                if names.count(name) > 1:
+                    problem = f"{path} has this column {names.count(name)} times"
+                    raise InputError(name, problem, "keep one of them")
+            return file.read(columns=used)
     except (OSError, pa.ArrowException) as error:
         raise _not_parquet(path, str(error).splitlines()[0]) from error
 
@@ -253,13 +257,28 @@ def _seconds_from_first(column: Any) -> tuple[FloatArray, int | None]:  # noqa: 
         t = np.asarray(values - first, dtype=np.float64)
         start_ns = round(first * NS) if np.isfinite(first) else None
     else:
-        t = (values - values[0]) / NS
         start_ns = int(values[0])
+        _require_nanoseconds(values)
+        t = (values - values[0]) / NS
     if start_ns is not None and abs(start_ns) > np.iinfo(np.int64).max:
         raise InputError(
             "timestamp", "is beyond the year 2262", "write ns as int64, or seconds as float64"
         )
     return t, start_ns
+
+
+def _require_nanoseconds(values: IntArray) -> None:
+    """Raise an InputError if the times (n,) of a log, taken as ns since 1970, are too dense, but
+    begin with a date in a larger unit.
+    """
+    first = int(values[0])
+    if int(values[-1]) - first >= SHORTEST_STEP_NS * (len(values) - 1):
+        return
+    for unit, factor in TIME_UNITS.items():
+        is_date = FIRST_DATE < first * factor < LAST_DATE
+        if is_date and unit != "ns":
+            fix = f"multiply it by {round(factor * NS)}, or use edge-agent import"
+            raise InputError("timestamp", f"is a date in {unit}, not in ns", fix)
 
 
 def _check_log(table: pa.Table, signals: FloatArray) -> None:

@@ -20,6 +20,10 @@ DEGREES: Final = {"deg": 1.0, "rad": 1.0 / DEG}
 FLAG: Final = {"1": 1.0}
 TEMPERATURE: Final = {"degC": 1.0, "degF": 5.0 / 9.0, "K": 1.0}
 SHARE: Final = {"1": 1.0, "%": 0.01}
+TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# [s] Unix times of the years 2000 and 2100: a first time between them is a date.
+FIRST_DATE: Final = 946_684_800.0
+LAST_DATE: Final = 4_102_444_800.0
 # Value of 0 degC in other units; it is subtracted before the factor is applied.
 ZEROS: Final = {
     "degF": 32.0,

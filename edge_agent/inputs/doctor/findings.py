@@ -53,7 +53,7 @@ CONSTANT_S = 10.0  # [s] no wheel turns at exactly the same speed, or stands, fo
 CHANGES = 0.2  # share of its largest value by which the speed of another wheel must change
 FASTEST_HZ = 2000.0
 # other units of time, in seconds; spreadsheets count days
-TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86_400.0))
+WRONG_TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86_400.0))
 
 
 def diagnose(
@@ -178,15 +178,18 @@ def _in_seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     """Return the times of the samples (n,) in seconds, and True if the sampling rate is unusable.
 
     Times `t` (n,) in another unit are converted. A wrong unit and an unusable rate are added to the
-    diagnosis as faults.
+    diagnosis as faults; the time of a single sample is unknown.
     """
-    step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-    if len(t) > 1 and np.percentile(np.diff(t), 60) == 0.0:
+    if len(t) < 2:
+        diagnosis.list_channel("t", is_sound=False)
+        return t, True
+    step = float(np.median(np.diff(t)))
+    if np.percentile(np.diff(t), 60) == 0.0:
         words = "most samples repeat a time: does the column lack the fraction of a second?"
         diagnosis.findings.append(Finding("t", "repeats", words))
         return t, True
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
-        for unit, factor in TIME_UNITS:
+        for unit, factor in WRONG_TIME_UNITS:
             if 1.0 / FASTEST_HZ <= step * factor <= 1.0 / SLOWEST_HZ:
                 words = f"a sample every {step:g}: are these {unit}?"
                 diagnosis.findings.append(Finding("t", unit, words, scale=factor))

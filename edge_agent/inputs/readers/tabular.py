@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from edge_agent.inputs.readers.racelogic import convert_vbo, has_vbo_columns
 from edge_agent.inputs.recording import Recording, Series, foreign_errors
+from edge_agent.inputs.units import FIRST_DATE, LAST_DATE, TIME_UNITS
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.thresholds import NS
@@ -40,16 +41,12 @@ TIMES: Final = (
     "sec",
     "seconds",
 )
-TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 UNIT_SPELLINGS: Final = {
     "s": ("s", "sec", "secs", "second", "seconds"),
     "ms": ("ms", "msec", "millisecond", "milliseconds"),
     "us": ("us", "usec", "\u00b5s", "\u03bcs", "microsecond", "microseconds"),
     "ns": ("ns", "nsec", "nanosecond", "nanoseconds"),
 }
-# [s] Unix times of the years 2000 and 2100: a first time between them is a date.
-FIRST_DATE: Final = 946_684_800.0
-LAST_DATE: Final = 4_102_444_800.0
 # [s] Time steps beyond these suggest that the unit of the numbers is not the assumed one.
 LONGEST_STEP_S: Final = 2.0
 SHORTEST_STEP_S: Final = 1e-4

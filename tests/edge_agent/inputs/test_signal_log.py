@@ -121,3 +121,30 @@ def test_a_bad_log_is_refused_in_one_line_that_names_field_and_fix(
         read_log(path)
     assert "\n" not in str(caught.value)
     assert caught.value.fix
+
+
+def test_a_column_that_occurs_twice_is_refused(tmp_path: Path) -> None:
+    table = pa.table(a_log(3))
+    pq.write_table(table.append_column("ax", table["ay"]), tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="^ax: .* has this column 2 times; keep one of them"):
+        read_log(tmp_path / "log.parquet")
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", NS), ("ms", 1_000_000), ("us", 1000)])
+def test_whole_timestamps_in_another_unit_are_refused(
+    tmp_path: Path, unit: str, factor: int
+) -> None:
+    columns = {name: c for name, c in a_log(3).items() if name != "t"}
+    columns["timestamp"] = pa.array(MOMENTS // factor, pa.int64())
+    words = f"^timestamp: is a date in {unit}, not in ns .*; multiply it by {factor}, or"
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, columns)
+
+
+def test_whole_timestamps_of_a_clock_that_counts_from_its_start_are_accepted(
+    tmp_path: Path,
+) -> None:
+    columns = {name: c for name, c in a_log(3).items() if name != "t"}
+    uptime = 1200 * NS + MOMENTS - MOMENTS[0]  # as ms, a date in the year 2008
+    log = read(tmp_path, columns | {"timestamp": pa.array(uptime, pa.int64())})
+    assert log.t.tolist() == [0.0, 0.1, 0.25]
