@@ -141,7 +141,7 @@ def _replay_one(
     from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.cli.common import require_valid_signals, warn_about_faults
+    from edge_agent.cli.common import checked_name, require_valid_signals, warn_about_faults
     from edge_agent.inputs.doctor.adopt import prepare_log
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
@@ -150,6 +150,7 @@ def _replay_one(
     vehicle_file = args.vehicle or vehicle_file_of(path)
     _check_output(args, vehicle_file)
     vehicle = load_vehicle(vehicle_file)
+    name = checked_name(args.name or vehicle.name) if args.publish else vehicle.name
     bank_of(estimator, [vehicle], memberships)  # raises for a wrong name before the log is read
     log = read_log(path)
     if args.publish:
@@ -166,7 +167,7 @@ def _replay_one(
         names = [estimator, *_split_names(args.compare)]
         notes += _write_report(args, log, vehicle, names, plausibility)
     else:
-        drive = _Drive(log, vehicle.name, start_ns, bank_of(estimator, [vehicle], memberships))
+        drive = _Drive(log, name, start_ns, bank_of(estimator, [vehicle], memberships))
         if args.publish:
             code, further_notes = _replay_and_publish(args, config, estimator, drive, plausibility)
             notes += further_notes
@@ -183,7 +184,7 @@ class _Drive(NamedTuple):
 
     Attributes:
         log: signals of the drive.
-        vehicle_name: name in the vehicle file.
+        vehicle_name: name under which the records are published.
         start_ns: time of t = 0 [ns UTC].
         bank: estimator bank that has not seen the drive yet.
     """
@@ -205,11 +206,10 @@ def _replay_and_publish(
     the user. Add the estimates to `plausibility`.
     """
     from edge_agent.app.publishing import open_publisher
-    from edge_agent.cli.common import checked_name
     from edge_agent.observe.pipeline import Pipeline
     from edge_agent.publish.batching import batch_drive
 
-    name = checked_name(args.name or drive.vehicle_name)
+    name = drive.vehicle_name
     pipeline = Pipeline(drive.bank, 1, config)
     records, progress = _make_records(args.out, drive, pipeline, plausibility)
     batches = batch_drive(records, name, estimator, config.batch_rows)

@@ -106,6 +106,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the agent until the source of samples ends, the duration has passed, or a signal
     (SIGTERM, Ctrl-C) arrives; return the exit code.
     """
+    config = config_of(args)
+    _check_options(args)
     with progress_messages.show_status("loading"):
         from edge_agent.app.native_library import use_agent_library
 
@@ -115,8 +117,6 @@ def run(args: argparse.Namespace) -> int:
         from edge_agent.inputs.live.sources import is_live
         from schemas.errors import InputError
 
-    config = config_of(args)
-    _check_options(args)
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _run_live(args, sources, config)
@@ -132,9 +132,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    """Raise an InputError if an option is given without the option that it needs."""
+    """Raise an InputError if an option is given without the option that it needs, or the name is
+    invalid.
+    """
+    from edge_agent.cli.common import checked_name
     from schemas.errors import InputError
 
+    if args.name is not None:
+        checked_name(args.name)
     if args.route is not None and not args.ahead:
         raise InputError("route", "needs --ahead", "give both, or neither")
     if args.autoware is not None and not args.ahead:

@@ -350,7 +350,7 @@ BAD_ARGUMENTS = {
     ),
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
     "name for no key": (
-        ["--publish", "--trust", "--name", "My Car/**"],
+        ["--publish", "--name", "My Car/**"],
         "^error: name: 'My Car/\\*\\*' is not a vehicle name; give",
     ),
     "folder that is none": (["--out", "/dev/null/out"], "^error: out: cannot write /dev/null/out"),
@@ -364,6 +364,11 @@ def test_a_bad_argument_of_replay_is_one_line_and_exit_code_2(
     assert main(replay(drive, tmp_path / "out", *more)) == 2
     _one_error(capsys, message)
     assert not list(tmp_path.iterdir())
+
+
+def test_run_checks_the_name_before_it_opens_the_source(capsys: Output) -> None:
+    assert main(["run", "--source", "nowhere.parquet", "--name", "My Car"]) == 2
+    _one_error(capsys, "^error: name: 'My Car' is not a vehicle name; give")
 
 
 @pytest.mark.parametrize(("spoil", "message"), BAD_LOGS.values(), ids=BAD_LOGS)
