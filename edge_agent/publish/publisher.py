@@ -51,6 +51,8 @@ class Publisher:
 
     `on_open(name, session)` is called when the Zenoh session of a vehicle is open. Other components
     of the agent then publish and subscribe on the same session.
+
+    `disk_error` is the reason why the outbox cannot be read or written; "" if it can.
     """
 
     def __init__(
@@ -79,7 +81,7 @@ class Publisher:
         )
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._waiting: list[Draft] = []
-        self._disk_error = ""  # last error of the outbox, until a round succeeds
+        self.disk_error = ""
         self._closing = threading.Event()
         self._deadline = float("inf")
         self._sender = threading.Thread(target=self._send_loop, name="sender", daemon=True)
@@ -101,11 +103,6 @@ class Publisher:
             and not self._sender.is_alive()
             and not self._closing.is_set()
         )
-
-    @property
-    def disk_error(self) -> str:
-        """Return the reason why the outbox cannot be read or written; "" if it can."""
-        return self._disk_error
 
     def count_unsettled(self, kind: Kind | None = None) -> int:
         """Return the number of records of one kind, or of all kinds, that no service has settled
@@ -163,7 +160,7 @@ class Publisher:
                     self._recover_outbox()
                 else:
                     text = "the outbox cannot be read or written"
-                    self._disk_error = _log_if_changed(text, error, self._disk_error)
+                    self.disk_error = _log_if_changed(text, error, self.disk_error)
                 self._stopped.wait(TICK_S)
             except Exception:  # the sender must continue after any error
                 self.counts.failures += 1
@@ -180,7 +177,7 @@ class Publisher:
         self._resend_due()  # before the deletion, which a full disk may refuse
         self._outbox.delete_settled()
         if not self._waiting:
-            self._disk_error = ""
+            self.disk_error = ""
 
     def _recover_outbox(self) -> None:
         """Recover the readable content of an outbox (store of batches on disk) that was damaged
@@ -224,7 +221,7 @@ class Publisher:
             batches = self._outbox.store(self._waiting, self._clock())
         except sqlite3.Error as error:
             text = f"the outbox refuses {len(self._waiting)} batches"
-            self._disk_error = _log_if_changed(text, error, self._disk_error)
+            self.disk_error = _log_if_changed(text, error, self.disk_error)
             for draft in self._waiting[:-WAITING_LIMIT]:
                 self.counts.dropped[draft.kind] += draft.records
             self._waiting = self._waiting[-WAITING_LIMIT:]

@@ -141,7 +141,7 @@ def test_whole_timestamps_in_another_unit_are_refused(
         read(tmp_path, columns)
 
 
-def test_whole_timestamps_of_a_clock_that_counts_from_its_start_are_accepted(
+def test_whole_timestamps_that_count_from_a_start_are_accepted(
     tmp_path: Path,
 ) -> None:
     columns = {name: c for name, c in a_log(3).items() if name != "t"}
