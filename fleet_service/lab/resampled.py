@@ -6,10 +6,10 @@ too good. This module therefore uses errors that the real estimator made.
 
 A town vehicle drives in the town; a source vehicle comes from the simulated drives. Each town
 vehicle is assigned one source vehicle, so that all its reports have the same persistent errors
-(offsets, a tilted sensor, tyres). The report for a town visit is that of a visit of the source
-vehicle to a road of nearly the same friction. If the source vehicle has no such visit, a visit of
-any source vehicle is drawn. Both visits are "excited" (enough grip was used to measure the
-friction), or neither is. The report is then scaled to the town's friction:
+(offsets, a tilted sensor, tyres). The report for a town visit is drawn from all visits of the
+source vehicle to roads of similar friction. If the source vehicle has no such visit, a visit of any
+source vehicle is drawn. Both visits are "excited" (enough grip was used to measure the friction),
+or neither is. The report is then scaled to the town's friction:
 
     μ, μ_w   friction of the road in the town visit, and in the source visit             (n,)
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
@@ -36,9 +36,11 @@ from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
-NEAREST: Final = 8  # one of this number of visits with the most similar friction is drawn
-# Largest |ln c|; otherwise another vehicle's visit is drawn. Surfaces of one kind differ less.
-FARTHEST: Final = 0.35
+# Largest ratio of the frictions of a town visit and of the source visit drawn for it, and of their
+# inverses. Surfaces of one kind differ about as much. In one drive, hundreds of visits of a vehicle
+# are to the same friction. If only the visits with the most similar frictions were drawn, they
+# would be the first or last few of those, and visits to borders, whose frictions lie between.
+SIMILAR: Final = 1.22
 
 
 class TrueVisits(NamedTuple):
@@ -122,36 +124,37 @@ def resample_visits(rng: Generator, visits: Visits, ways: DrivenVisits, vehicles
         by_friction = by_friction[np.argsort(ways.mu[by_friction], kind="stable")]
         for vehicle in range(vehicles):
             visit_rows = np.flatnonzero((visits.vehicle == vehicle) & (visits.excited == excited))
-            of_same_vehicle = _nearest_friction(
-                rng,
-                visits.mu[visit_rows],
-                ways.mu,
-                by_friction[ways.vehicle[by_friction] == who[vehicle]],
-            )
-            of_any_vehicle = _nearest_friction(rng, visits.mu[visit_rows], ways.mu, by_friction)
-            far = (of_same_vehicle < 0) | (
-                np.abs(np.log(visits.mu[visit_rows] / ways.mu[of_same_vehicle])) > FARTHEST
-            )
-            row[visit_rows] = np.where(far, of_any_vehicle, of_same_vehicle)
+            mu = visits.mu[visit_rows]
+            drawn, _ = _draw_similar(rng, mu, ways.mu, by_friction)
+            own_rows = by_friction[ways.vehicle[by_friction] == who[vehicle]]
+            if len(own_rows):
+                own, is_similar = _draw_similar(rng, mu, ways.mu, own_rows)
+                drawn = np.where(is_similar, own, drawn)
+            row[visit_rows] = drawn
     return replace(visits, reports=_scale_reports(ways.reports, row, visits.mu / ways.mu[row]))
 
 
-def _nearest_friction(rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray) -> IntArray:
-    """Return a visit of similar friction for each friction in `mu` (n,), drawn at random from the
-    NEAREST visits with the most similar friction. The result (n,) contains indices into `of`; they
-    are -1 if `rows` is empty.
+def _draw_similar(
+    rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray
+) -> tuple[IntArray, BoolArray]:
+    """Draw a visit of similar friction (SIMILAR) for each friction in `mu` (n,). All such visits
+    are equally probable, so that visits near the border of two surfaces are as frequent as in the
+    drives.
+
+    Return indices into `of` (n,), and a mask (n,): False where no visit has a similar friction. The
+    visit is then the one with the next higher friction, or else the one with the highest.
 
     Args:
         rng: random generator.
         mu: wanted frictions (n,).
         of: friction of every visit (k,).
-        rows: indices into `of` of the visits that may be drawn (m,), in increasing order of their
-            friction.
+        rows: indices into `of` of the visits that may be drawn (m,), at least one, in increasing
+            order of their friction.
     """
-    if not len(rows):
-        return np.full(len(mu), -1)
-    first = np.clip(np.searchsorted(of[rows], mu) - NEAREST // 2, 0, max(len(rows) - NEAREST, 0))
-    return np.asarray(rows[first + rng.integers(0, min(NEAREST, len(rows)), len(mu))])
+    first = np.searchsorted(of[rows], mu / SIMILAR)
+    last = np.searchsorted(of[rows], mu * SIMILAR, side="right")
+    drawn = first + rng.integers(0, np.maximum(last - first, 1))
+    return rows[np.minimum(drawn, len(rows) - 1)], last > first
 
 
 def _scale_reports(reports: SimulatedReports, row: IntArray, by: FloatArray) -> SimulatedReports:

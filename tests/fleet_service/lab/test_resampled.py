@@ -74,6 +74,18 @@ def test_where_a_vehicle_never_was_on_such_a_road_another_s_visit_is_drawn() -> 
     assert found.reports.reading == pytest.approx(np.full(len(visits), 0.15))
 
 
+def test_visits_to_one_friction_are_all_drawn_and_borders_rarely() -> None:
+    visits, rng = a_town(3)
+    visits = replace(visits, mu=np.full(len(visits), 0.32))
+    visit = np.arange(200)
+    mu = np.where(visit < 190, 0.3, 0.32)  # the last ten are at the border to another surface
+    ways = visits_on(mu, np.zeros(len(mu), np.int64), np.array([1.0]))
+    ways = ways._replace(reports=replace(ways.reports, manoeuvre=visit))
+    found = resampled.resample_visits(rng, visits, ways, VEHICLES).reports.manoeuvre
+    assert len(np.unique(found)) > 100
+    assert np.mean(found >= 190) == pytest.approx(0.05, abs=0.03)
+
+
 def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
     truth = TrueVisits(
         np.array([0, 0, 1]),
