@@ -47,10 +47,13 @@ class AskedWay(NamedTuple):
         scores: scores of the cells that several vehicles had visited.
         measured: mask of these cells: True if a vehicle measured friction there, and not only a
             lower bound.
+        one_surface: mask of these cells: True if all visits so far truly had the same friction. The
+            true friction of the other cells, which contain a border, is a mean.
     """
 
     scores: Scores
     measured: BoolArray
+    one_surface: BoolArray
 
 
 def ask_moments(folder: Path) -> list[AskedWay]:
@@ -84,6 +87,7 @@ def ask_moments(folder: Path) -> list[AskedWay]:
                 is_measured(
                     lower, upper, fusion.live.values[slots], belief @ mugrid.SLIPPERY_SHARE
                 ),
+                end_to_end.one_surface(fusion, past)[slots],
             )
         )
     return out
@@ -104,12 +108,18 @@ def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str,
         rmse = np.array([float(end_to_end.mean_or_nan(s.error**2) ** 0.5) for s in known])
         cover = np.array([end_to_end.mean_or_nan(s.covered) for s in known])
         every = join_scores([moment.scores for moment in now])
+        pure = [moment.scores.taken(moment.measured & moment.one_surface) for moment in now]
+        border = [moment.scores.taken(moment.measured & ~moment.one_surface) for moment in now]
         out |= {f"{prefix}.rmse.{name}": rmse.mean(), f"{prefix}.rmse.{name}.worst": rmse.max()}
         out |= {
             f"{prefix}.rmse.{name}.spread": rmse.std(),
             f"{prefix}.coverage90.measured.{name}": cover.mean(),
         }
         out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest_coverage(cover)}
+        out |= {
+            f"{prefix}.coverage90.{kind}.{name}": end_to_end.mean_or_nan(join_scores(of).covered)
+            for kind, of in (("one_surface", pure), ("border", border))
+        }
         out |= {f"{prefix}.false_grip.{name}": false_grip(join_scores(known))}
         out |= {f"{prefix}.false_ice.{name}": false_ice(join_scores(known))}
         out |= {f"{prefix}.crps.{name}": end_to_end.mean_or_nan(every.crps)}
