@@ -15,8 +15,8 @@ or neither is. The report is then scaled to the town's friction:
     c        μ/μ_w, scale factor: value, interval and grip used are multiplied by c, because
              forces scale with the grip; the log-likelihood ℓ(x) becomes ℓ(x/c)
 
-A visit at the border of two surfaces is drawn like any other. Each visit is drawn separately, so an
-error that all vehicles share in one place does not occur here. The evaluation of complete drives
+Visits at the border of two surfaces are drawn too, see SIMILAR. Each visit is drawn separately, so
+an error that all vehicles share in one place does not occur here. The evaluation of complete drives
 (`end_to_end`) includes such errors.
 """
 
@@ -37,9 +37,11 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, Z_95
 
 # Largest ratio of the frictions of a town visit and of the source visit drawn for it, and of their
-# inverses. Surfaces of one kind differ about as much. In one drive, hundreds of visits of a vehicle
-# are to the same friction. If only the visits with the most similar frictions were drawn, they
-# would be the first or last few of those, and visits to borders, whose frictions lie between.
+# inverses. In one drive, hundreds of visits of a vehicle are to the same friction, and visits to
+# borders of surfaces have frictions between. Of the excited visits of ten drives, 11 % are at a
+# border. Of the visits drawn in three towns, 71 % were with the eight most similar frictions, and
+# 61, 50, 27 and 19 % with the ratios 1.05, 1.1, 1.22 and 1.35. In six towns, these four ratios gave
+# coverages of .918, .938, .955 and .983.
 SIMILAR: Final = 1.22
 
 
@@ -138,8 +140,8 @@ def _draw_similar(
     rng: Generator, mu: FloatArray, of: FloatArray, rows: IntArray
 ) -> tuple[IntArray, BoolArray]:
     """Draw a visit of similar friction (SIMILAR) for each friction in `mu` (n,). All such visits
-    are equally probable, so that visits near the border of two surfaces are as frequent as in the
-    drives.
+    are equally probable. Visits near the border of two surfaces are still more frequent than in the
+    drives, because their frictions lie between those of the surfaces.
 
     Return indices into `of` (n,), and a mask (n,): False where no visit has a similar friction. The
     visit is then the one with the next higher friction, or else the one with the highest.
