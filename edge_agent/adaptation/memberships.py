@@ -13,13 +13,8 @@ Legend
 Each triangle ends at its neighbours' peaks. Therefore the memberships of a mismatch sum to one, and
 the sets cover the whole range.
 
-The other fields belong to the rules of the default estimator (`rule_base.py`). The set FAR contains
-large mismatches of the wheel speeds, the set WIDE large steering angles.
+The other fields belong to the rules of the default estimator (`rule_base.py`):
 
-    far         mismatch at which the membership in FAR is 0, and mismatch at which it is 1 [1] (2,)
-    consequents two outputs of rules (2,): ln of the factor on the axles' R while steering is
-                WIDE [nat], and rate at which offsets, slope and bank return to their prior
-                while the mismatch is FAR [1/s]
     shares      ln of the share of a block's evidence on friction that is used [nat]: one value
                 for each combination of three inputs (12,)
     strained    term added to `shares` if the estimated states of the car are far from their
@@ -45,21 +40,18 @@ SETS = len(MISMATCH_PEAKS)
 CHANNELS = 2  # groups of measurements: wheels (longitudinal), axles (lateral)
 LARGEST_MISMATCH = 20.0  # [1] limit of `inputs`
 LARGEST_STEP = math.log(2.0)  # [nat] limit of `outputs`: one adaptation at most doubles R
-# [nat] limit of `ln_scales` and of `consequents`, and of an increase of ln R by adaptation
+# [nat] limit of `ln_scales`, and of an increase of ln R by adaptation
 LARGEST_SCALE = 2.5
 NOISE = 2 * SETS + CHANNELS  # number of parameters that concern R alone
 LENGTHS = {
     "inputs": SETS,
     "outputs": SETS,
     "ln_scales": CHANNELS,
-    "far": 2,
-    "consequents": 2,
     "shares": 12,
     "strained": 2,
 }
-# Fields of older files, which are ignored: a likelihood test has replaced these fuzzy sets.
-RETIRED = ("stretched", "lately")
-RAMPS = ("far",)  # fields with a foot and a peak
+# Fields of older files, which are ignored
+RETIRED = ("stretched", "lately", "far", "consequents")
 LEAST_SHARE = -8.0  # [nat] smallest ln of a share of evidence
 SHARE_REACH = 1.5  # [nat] largest change of `shares` and `strained` by an optimiser
 CLOSEST = 0.01  # [1] smallest distance of neighbouring peaks, and smallest overlap of two sets
@@ -83,9 +75,6 @@ class Memberships:
     inputs: tuple[float, ...] = MISMATCH_PEAKS
     outputs: tuple[float, ...] = STEP_PEAKS
     ln_scales: tuple[float, ...] = (0.0, 0.0)
-    far: tuple[float, ...] = (1.5, 4.0)
-    # Without the two rules of `consequents`, contradictions in town were three times as frequent.
-    consequents: tuple[float, ...] = (0.67, 0.25)
     shares: tuple[float, ...] = (
         -5.0,
         -3.1,
@@ -130,25 +119,19 @@ class Memberships:
         )
         is_in_range = max(map(abs, self.ln_scales)) <= LARGEST_SCALE
         _require(is_in_range, "ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat")
-        for name in RAMPS:
-            foot, peak = getattr(self, name)
-            fix = f"give a foot and a peak {CLOSEST:g} above it"
-            _require(0.0 <= foot <= peak - CLOSEST, name, "is not increasing", fix)
-        is_in_range = min(self.consequents) >= 0.0 and max(self.consequents) <= LARGEST_SCALE
-        _require(is_in_range, "consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}")
         for name in ("shares", "strained"):
             is_in_range = all(LEAST_SHARE <= value <= 0.0 for value in getattr(self, name))
             _require(is_in_range, name, "out of range", f"stay within {LEAST_SHARE:g} and 0 nat")
 
     def to_vector(self) -> FloatArray:
-        """Return the parameters of the fuzzy sets as a vector (30,) for an optimiser: all fields,
+        """Return the parameters of the fuzzy sets as a vector (26,) for an optimiser: all fields,
         one after the other.
         """
         return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """Convert the vector (30,) of an optimiser to memberships (fuzzy sets). The vector must lie
+        """Convert the vector (26,) of an optimiser to memberships (fuzzy sets). The vector must lie
         within `bounds`.
 
         The function sorts the peaks `inputs` and the levels `outputs`, so every vector within the
@@ -175,11 +158,9 @@ class Memberships:
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper limits of the optimiser's vector, (30,) each."""
+        """Return the lower and upper limits of the optimiser's vector, (26,) each."""
         lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -0.1, -0.1]
-        lower += [0.3, 2.5, 0.5, 0.1]
         upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 0.1, 0.1]
-        upper += [2.3, 8.0, 1.5, 0.5]
         for value in (*Memberships.shares, *Memberships.strained):
             lower.append(max(value - SHARE_REACH, LEAST_SHARE))
             upper.append(min(value + SHARE_REACH, 0.0))

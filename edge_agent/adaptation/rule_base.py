@@ -1,11 +1,9 @@
-"""Fuzzy rules of the default estimator. They adapt three quantities: the measurement noise R, the
-share of the evidence on friction that is used, and the rate at which sensor offsets are forgotten.
+"""Fuzzy rules of the default estimator. They adapt two quantities: the measurement noise R of the
+axles, and the share of the evidence on friction that is used.
 
 | if | then | kind |
 |---|---|---|
-| mismatch of wheels or axles is in one of five sets | ln R changes by the set's step | Sugeno |
-| the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
-| steering is WIDE | R of the axle that is steered is larger | Sugeno |
+| mismatch of the axles is in one of five sets | ln R changes by the set's step | Sugeno |
 | slide, demand, novelty, strain are in certain sets | evidence share changes | Takagi–Sugeno |
 
 Sugeno: the result is the consequent (output) of a rule times its membership (degree, 0 to 1).
@@ -20,9 +18,9 @@ the deviation of the estimated states of car and sensors from their prior. The r
 once per block (0.05 s of samples), after the block has ended. Therefore no rule changes its own
 input within a block.
 
-`plain_rules` is the baseline without fuzzy sets. It replaces the last row by the formula of
-`plain_share`, and switches off the second and third row. The evaluation divides the score with
-fuzzy rules by the score of this baseline; the ratio is the figure `fuzzy.worth`.
+`plain_rules` is the baseline without fuzzy sets: the formula of `plain_share` replaces the second
+row. The evaluation divides the score with fuzzy rules by the score of this baseline; the ratio is
+the figure `fuzzy.worth`.
 """
 
 from __future__ import annotations
@@ -39,22 +37,13 @@ from schemas.runtime.jit import compiled
 DEMAND_PEAKS = (0.06, 0.13, 0.3)  # [1] peaks of the sets low, middle and high of force over load
 # [1] foot and peak of the set of strained cars, in chi-square over degrees of freedom
 STRAINED = (1.0, 2.5)
-# [rad] foot and peak of the set WIDE: between these angles the gain of real steering changes
-WIDE = (0.1, 0.35)
 
 
 class RuleBase(NamedTuple):
-    """Parameters of the fuzzy rules: a ramp (foot, peak) per fuzzy set, and the consequents
-    (outputs) of the rules.
-
-    Rules also determine the share of the evidence on friction that the filter uses. If `by_sets` is
-    False, the formula of `plain_share` replaces these rules.
+    """Consequents (outputs) of the rules that determine the share of the evidence on friction that
+    the filter uses [nat]. If `by_sets` is False, the formula of `plain_share` replaces these rules.
     """
 
-    far: Annotated[FloatArray, 2]
-    wide: Annotated[FloatArray, 2]
-    ln_noise: float  # [nat] added to ln R of an axle while its steering is WIDE
-    pace: float  # [1/s] return rate of offsets, slope and bank, added while the wheels are FAR
     shares: Annotated[FloatArray, 12]
     strained: Annotated[FloatArray, 2]
     by_sets: bool  # True if the fuzzy rules give the share of evidence, False for `plain_share`
@@ -62,18 +51,10 @@ class RuleBase(NamedTuple):
 
 
 def rule_base(memberships: Memberships) -> RuleBase:
-    """Return the fuzzy rules with the corners of the sets and the consequents (outputs) given in
-    `memberships`.
-    """
-    m = memberships
-    ln_noise, pace = m.consequents
+    """Return the fuzzy rules with the consequents (outputs) given in `memberships`."""
     return RuleBase(
-        np.array(m.far),
-        np.array(WIDE),
-        ln_noise,
-        pace,
-        np.array(m.shares),
-        np.array(m.strained),
+        np.array(memberships.shares),
+        np.array(memberships.strained),
         by_sets=True,
         steady=0.0,
     )
@@ -83,14 +64,10 @@ def plain_rules(steady: float) -> RuleBase:
     """Return a rule base without fuzzy sets, as a baseline. The formula of `plain_share` then gives
     the share of the evidence on friction that the filter uses.
 
-    Wide steering angles do not increase the measurement noise R. Sensor offsets, slope and bank
-    return to their prior at the usual rate, even if innovations are larger than expected.
-
     Args:
         steady: factor on the share while forces and slips equal their recent averages [1].
     """
-    idle = Memberships(consequents=(0.0, 0.0))
-    return rule_base(idle)._replace(by_sets=False, steady=steady)
+    return rule_base(Memberships())._replace(by_sets=False, steady=steady)
 
 
 @compiled
@@ -99,25 +76,6 @@ def is_high(value: float, ramp: FloatArray | tuple[float, float]) -> float:
     to 1 at ramp[1].
     """
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
-
-
-@compiled
-def forgetting_rate(rules: RuleBase, wheels: float) -> float:
-    """Return the rate [1/s] at which sensor offsets and the road's slope and bank (lateral slope)
-    return to their prior, in addition to the usual rate.
-
-    `wheels` is the mismatch of the wheel speeds' innovations (measurement minus prediction):
-    actual/theoretical variance - 1 [1].
-    """
-    return rules.pace * is_high(wheels, rules.far)
-
-
-@compiled
-def wide_noise(rules: RuleBase, angle: float) -> float:
-    """Return the factor on the measurement noise R of an axle whose wheels are steered by `angle`
-    [rad]; it is above 1 at wide angles.
-    """
-    return math.exp(rules.ln_noise * is_high(abs(angle), rules.wide))
 
 
 @compiled

@@ -138,8 +138,9 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
         side = memory.friction_left if wheel % 2 == 0 else memory.friction_right
         upper = side.upper if memory.split else reported_upper(memory.grip, side)
         _report_friction(side, upper, output, Column.WHEELS + 3 * wheel)
-    adaptation = max(memory.factor[0], memory.factor[1])
-    write_quality(output, memory.excitation.largest, memory.nis, adaptation, memory.log_likelihood)
+    write_quality(
+        output, memory.excitation.largest, memory.nis, memory.factor, memory.log_likelihood
+    )
 
 
 @compiled

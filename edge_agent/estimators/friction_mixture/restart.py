@@ -135,9 +135,8 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
     # The states learned while the motion was wrong are wrong too.
     forget_vehicle(memory)
     restart_motion(memory, speed, FIRST_V_STD)
-    for group in range(2):
-        memory.actual[group] = memory.theoretical[group]
-        memory.factor[group] = 1.0
+    memory.actual = memory.theoretical
+    memory.factor = 1.0
     put_split_to_sleep(memory)
     clear_vector(memory.patch)
     clear_vector(memory.built_along)

@@ -112,7 +112,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     share_weights(memory, scratch)
     match_moments(memory, scratch)
     memory.health = health | reset_to_wheel_speed(memory, design)
-    ratio = scratch.actual_sum[1] / max(scratch.stated_sum, TINY)
+    ratio = scratch.actual_sum / max(scratch.stated_sum, TINY)
     update_consistency(memory, design, features.duration, ratio, memory.health)
     if memory.trust.distrust > 0.0:
         memory.health |= flags.CONTRADICTION
@@ -142,8 +142,6 @@ def prepare_prediction(memory: MixtureMemory, design: MixtureDesign, scratch: Sc
         if i in (NodeState.SLOPE, NodeState.BANK):
             # A road has another slope after `slope_length`; so has a car that turned by 1 rad.
             pace += max(speed / constants.physical.slope_length, turning)
-        if i in (NodeState.BIAS_X, NodeState.BIAS_Y, NodeState.SLOPE, NodeState.BANK):
-            pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
 

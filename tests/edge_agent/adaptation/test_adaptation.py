@@ -61,7 +61,7 @@ def test_a_file_from_before_the_rules_has_the_untuned_ones() -> None:
 
 
 def test_file_older_than_the_consistency_test_keeps_its_valid_entries() -> None:
-    old = SETS.to_json() | {"stretched": [14.0, 22.0], "lately": [0.08, 0.15]}
+    old = SETS.to_json() | {"stretched": [14.0, 22.0], "far": [1.5, 4.0]}
     assert Memberships.from_json(old) == SETS
 
 
@@ -82,8 +82,8 @@ def test_every_vector_within_the_bounds_is_a_valid_set_of_memberships() -> None:
         ({"outputs": (-0.1, 0.0, 0.0, 0.0, float("nan"))}, "outputs"),
         ({"outputs": (0.01, 0.02, 0.03, 0.04, 0.05)}, "outputs"),
         ({"ln_scales": (9.0, 0.0)}, "ln_scales"),
-        ({"far": (4.0, 1.5)}, "far"),
-        ({"consequents": (-0.1, 0.0)}, "consequents"),
+        ({"shares": (0.1,) * 12}, "shares"),
+        ({"strained": (-9.0, 0.0)}, "strained"),
     ],
 )
 def test_impossible_memberships_are_refused_by_name(change: dict[str, Any], field: str) -> None:

@@ -53,10 +53,15 @@ def test_the_friction_of_dry_cobbles_stays_possible(name: str, most: float) -> N
 
 @pytest.mark.parametrize("name", ["moderate-braking", "stop-and-go", "pulses"])
 def test_icy_cobbles_are_found(name: str) -> None:
+    found = []
+    false_grip = []
     for vehicle, seed in CARS:
         estimates = drive(name, ICE, "cobbled", vehicle, seed)
-        assert np.mean(estimates.mu_upper[FIRST:] < 0.45) > 0.8
-        assert np.mean(estimates.mu_lower[FIRST:] > ICE + 0.05) < 0.03
+        found.append(np.mean(estimates.mu_upper[FIRST:] < 0.45))
+        false_grip.append(np.mean(estimates.mu_lower[FIRST:] > ICE + 0.05))
+    assert min(found) > 0.75
+    assert np.mean(found) > 0.85
+    assert np.mean(false_grip) < 0.01
 
 
 @pytest.mark.parametrize("name", ["braking", "stop-and-go", "throttle"])

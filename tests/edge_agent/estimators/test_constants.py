@@ -67,8 +67,8 @@ MOVES = {
     # Group: number and independence of the measurements.
     "block_time": Move("updates", "acceleration", 0.4),
     "correlation_time": Move("vy_std", "constant-radius", 1.3),
-    # R adapts faster to the spinning wheels.
-    "window": Move("adaptation", "acceleration", 2.0, LESS),
+    # R adapts faster to the sliding axles.
+    "window": Move("adaptation", "j-turn", 1.5, LESS),
     # Group: road.
     "hazard": Move("least probabilities", "j-turn", 1.5),
     # Ice is expected after a longer distance without grip demand.
@@ -117,8 +117,8 @@ MOVES = {
     "slip_hazard": Move("least probabilities", "braking without torque", 1.1),
     # More force is needed before the road counts as changed.
     "carried_share": Move("least probabilities", "braking without torque", 0.8),
-    # With a smaller factor on R, the rear axle moves the nodes of wrong friction further.
-    "rear_unlike": Move("nodes apart in v_x", "split-braking", 1.3, LESS),
+    # With a smaller factor on R, the rear axle pulls the states away from the other measurements.
+    "rear_unlike": Move("nis", "turn and straight", 1.15, LESS),
     # Group: sensors.
     "leak": Move("mean LEAK_Y", "acceleration", 2.0),
     "return_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
@@ -136,7 +136,6 @@ MOVES = {
     "floor_x": Move("nis", "acceleration", 0.92),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.85),
-    "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "constant-radius", 0.95),
     "lag": Move("nis", "pulses", 0.9),
     # Group: wheels that show the velocity without a tyre model.

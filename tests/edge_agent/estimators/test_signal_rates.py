@@ -15,6 +15,7 @@ from tests.edge_agent.estimators.drives import signals_of
 
 DRY = 0.85
 ICE = 0.15
+CARS = [("small", 811), ("sedan", 812), ("van", 813)]
 ROWS_HZ = 100
 FIRST = 300  # number of samples (3 s) that are not judged
 GROUPS = {
@@ -41,7 +42,8 @@ def thin(signals: FloatArray, group: str, rate: int) -> None:
 @pytest.mark.parametrize("manoeuvre", ["stop-and-go", "pulses"])
 @pytest.mark.parametrize("mu", [DRY, ICE])
 def test_slow_signals_leave_estimates_right(mu: float, manoeuvre: str, group: str) -> None:
-    for vehicle, seed in (("small", 811), ("sedan", 812), ("van", 813)):
+    false_grip = []
+    for vehicle, seed in CARS:
         log, known = simulate_manoeuvre(
             manoeuvre, mu=mu, seed=seed, setup=DriveSetup(vehicle=vehicle)
         )
@@ -54,8 +56,9 @@ def test_slow_signals_leave_estimates_right(mu: float, manoeuvre: str, group: st
         estimates = bank_of("aco-fckf", [known]).advance(t, signals[:, None])
         lower = estimates.mu_lower[FIRST:, 0]
         upper = estimates.mu_upper[FIRST:, 0]
-        assert np.mean(lower > mu + 0.05) < 0.02
+        false_grip.append(np.mean(lower > mu + 0.05))
         assert np.mean(upper < mu - 0.05) < 0.06
         assert np.mean(upper < 0.45) > 0.7 if mu == ICE else np.all(upper > 0.45)
         error = estimates.vx[FIRST:, 0] - log["true_vx"].to_numpy()[FIRST:]
         assert np.sqrt(np.mean(error**2)) < 0.5
+    assert np.mean(false_grip) < 0.01

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.adaptation.rule_base import wide_noise
 from edge_agent.dynamics.body import axle_lateral_forces, locked_axle_force
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body_of
@@ -308,7 +307,7 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
     constants = design.constants
     before = memory.last_side
     speed = max(features.speed, SLOWEST_SLIP_M_S)
-    scale = design.scales[0] * memory.factor[0]
+    scale = design.scales[0]
     for wheel in range(4):
         noise = max(
             constants.physical.omega_noise,
@@ -329,7 +328,7 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.slip_noise[wheel] = slip_variance * scale
     scale = (
         design.scales[1]
-        * memory.factor[1]
+        * memory.factor
         * (strained_noise(memory.trust, constants) if design.adaptive else 1.0)
     )
     features.axle_scale = scale
@@ -339,20 +338,14 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         side = features.side[axle]
         place = row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]
         angle = row[Parameter.SLOPE_Y] * YAW_STD * place / speed
-        share = constants.physical.axle_share * side
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.physical.lag * change / features.duration
         before[axle] = side
         shape = constants.physical.shape_share * side * side
-        variance = 0.5 * angle**2 + constants.physical.floor_y**2 + share**2 + shape**2 + lag**2
+        variance = 0.5 * angle**2 + constants.physical.floor_y**2 + shape**2 + lag**2
         variance += (locked / (features.loads[2 * axle] + features.loads[2 * axle + 1])) ** 2
-        wide = (
-            wide_noise(design.rules, math.asin(features.steer_sin[2 * axle]))
-            if design.adaptive
-            else 1.0
-        )
-        features.noise_std[4 + axle] = math.sqrt(variance * scale * wide)
-        features.slip_noise[4 + axle] = angle**2 * scale * wide
+        features.noise_std[4 + axle] = math.sqrt(variance * scale)
+        features.slip_noise[4 + axle] = angle**2 * scale
 
 
 @compiled

@@ -29,8 +29,6 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.adaptation.rule_base import forgetting_rate
-from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.state.constants import (
     ALL_NODES,
@@ -84,9 +82,6 @@ def update_consistency(
         degrees_of_freedom(memory.overall_covariance, design.nominal),
         constants.chosen.strain_prior,
     )
-    trust.hurry = forgetting_rate(
-        design.rules, memory.actual[0] / max(memory.theoretical[0], TINY) - 1.0
-    )
     if trust.distrust > 0.0:
         _await_next_trial(memory, duration)
         return
@@ -120,9 +115,9 @@ def _await_next_trial(memory: MixtureMemory, duration: float) -> None:
     trust.distrust = 0.0
     trust.odd = 0.0
     trust.ratio = 0.0
-    memory.actual[1] = 0.0
-    memory.theoretical[1] = 0.0
-    memory.factor[1] = 1.0
+    memory.actual = 0.0
+    memory.theoretical = 0.0
+    memory.factor = 1.0
 
 
 @compiled

@@ -60,7 +60,7 @@ from schemas.thresholds import UTILISED_WINDOW_S
 @compiled
 def weigh_nodes(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Recompute the weights (probabilities) of all nodes (friction hypotheses) from the likelihoods
-    of the block (0.05 s), and adapt the measurement noise R.
+    of the block (0.05 s), and adapt the measurement noise R of the axles.
     """
     temper_evidence(memory, design, scratch)
     count = active_nodes(memory)
@@ -84,9 +84,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     inflation *= slow_noise(fastest_speed(features, memory.overall_mean[NodeState.VX]))
     steady = design.constants.chosen.steady_share
     features.novelty = steady + (1.0 - steady) * features.new
-    for kind in range(2):
-        put_lanes(scratch.actual_lanes, kind, 0.0)
-        put_lanes(scratch.theoretical_lanes, kind, 0.0)
+    put_lanes(scratch.actual_lanes, 0, 0.0)
+    put_lanes(scratch.theoretical_lanes, 0, 0.0)
     put_lanes(scratch.stated_lanes, 0, 0.0)
     put_lanes(scratch.square_lanes, 0, 0.0)
     turn = (math.cos(memory.block.angle), math.sin(memory.block.angle))
@@ -102,9 +101,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
             velocity = lanes_at(memory.mean, (group, axis))
             put_lanes(scratch.updated, (group, axis), velocity)
         predict_nodes(memory, scratch, group, turn)
-    for kind in range(2):
-        scratch.actual_sum[kind] = sum_lanes(lanes_at(scratch.actual_lanes, kind))
-        scratch.theoretical_sum[kind] = sum_lanes(lanes_at(scratch.theoretical_lanes, kind))
+    scratch.actual_sum = sum_lanes(lanes_at(scratch.actual_lanes, 0))
+    scratch.theoretical_sum = sum_lanes(lanes_at(scratch.theoretical_lanes, 0))
     scratch.stated_sum = sum_lanes(lanes_at(scratch.stated_lanes, 0))
     squares = sum_lanes(lanes_at(scratch.square_lanes, 0))
     rows = 0
@@ -295,23 +293,23 @@ def axle_slip(row: FloatArray, features: BlockFeatures, vx: float, vy: float, ax
 
 @compiled
 def adapt_noise(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
-    """Update the actual and expected variance of the innovations, averaged over the latest blocks
-    (of 0.05 s each). Compute from them the factors on the measurement noise R for the next block.
+    """Update the actual and expected variance of the axles' innovations, averaged over the latest
+    blocks (of 0.05 s each). Compute from them the factor on the axles' measurement noise R for the
+    next block.
+
+    R of the wheels is not adapted: a slide also makes their innovations large, and a larger R would
+    hide it. It follows from the measured vibration of the wheel speeds instead.
     """
+    if scratch.theoretical_sum <= 0.0:
+        return
     keep = math.exp(-scratch.features.duration / design.constants.chosen.window)
-    for group in range(2):
-        if scratch.theoretical_sum[group] > 0.0:
-            memory.actual[group] = (
-                keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
-            )
-            memory.theoretical[group] = (
-                keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
-            )
-            if design.adaptive:
-                memory.factor[group] = adapted_factor(
-                    memory.factor[group],
-                    memory.actual[group],
-                    memory.theoretical[group],
-                    design.fuzzy_inputs,
-                    design.fuzzy_outputs,
-                )
+    memory.actual = keep * memory.actual + (1.0 - keep) * scratch.actual_sum
+    memory.theoretical = keep * memory.theoretical + (1.0 - keep) * scratch.theoretical_sum
+    if design.adaptive:
+        memory.factor = adapted_factor(
+            memory.factor,
+            memory.actual,
+            memory.theoretical,
+            design.fuzzy_inputs,
+            design.fuzzy_outputs,
+        )

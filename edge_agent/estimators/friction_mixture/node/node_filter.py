@@ -151,8 +151,8 @@ def weigh_rows(
       them.
     - Only at the rear: the front axle is already on another surface.
 
-    Squared innovations and their variances without the increase are added to the sums of the block,
-    weighted by the nodes' probabilities `share`.
+    The axles' squared innovations and their variances without the increase are added to the sums of
+    the block, weighted by the nodes' probabilities `share`.
     """
     constants = design.constants
     features = scratch.features
@@ -180,18 +180,17 @@ def weigh_rows(
         put_lanes(node.spread, (r, r), spread)
         squares += residual * residual / total
         product *= 2.0 * math.pi * total
-        kind = 0 if r < 4 else 1
-        _add_lanes(scratch.actual_lanes, kind, share * residual * residual)
-        _add_lanes(scratch.theoretical_lanes, kind, share * total)
-        if kind == 1:
-            _add_lanes(scratch.stated_lanes, 0, share * (total - surplus * noise))
-    _add_lanes(scratch.square_lanes, 0, share * squares)
+        if r >= 4:
+            _add_lanes(scratch.actual_lanes, share * residual * residual)
+            _add_lanes(scratch.theoretical_lanes, share * total)
+            _add_lanes(scratch.stated_lanes, share * (total - surplus * noise))
+    _add_lanes(scratch.square_lanes, share * squares)
     return -0.5 * (squares + log_lanes(product))
 
 
 @inlined
-def _add_lanes(sums: FloatArray, place: int, value: float) -> None:
-    put_lanes(sums, place, lanes_at(sums, place) + value)
+def _add_lanes(sums: FloatArray, value: float) -> None:
+    put_lanes(sums, 0, lanes_at(sums, 0) + value)
 
 
 @compiled
@@ -402,8 +401,8 @@ def certain_share(memory: MixtureMemory, inflation: float) -> float:
     would lose probability only because their variance is too large.
     """
     share = 1.0 / inflation
-    if memory.theoretical[1] > 0.0:
-        share = min(share, memory.actual[1] / memory.theoretical[1])
+    if memory.theoretical > 0.0:
+        share = min(share, memory.actual / memory.theoretical)
     return share
 
 

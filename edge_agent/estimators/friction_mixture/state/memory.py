@@ -165,7 +165,6 @@ class Trust:
     left: float  # [s] time until the model is tried again
     patience: float  # [s] duration of the last distrust, fading with time
     strain: float  # [1] chi-square of vehicle and sensor states over degrees of freedom
-    hurry: float  # [1/s] additional return rate of offsets, slope and bank to their prior
 
 
 class Quantiles:
@@ -203,10 +202,10 @@ class MixtureMemory:
     penalty: Annotated[FloatArray, PLACES]
     overall_mean: Annotated[FloatArray, STATES]  # of the whole mixture
     overall_covariance: Annotated[FloatArray, STATES, STATES]
-    # Averaged squared innovations and their expected variances: wheels, axles
-    actual: Annotated[FloatArray, 2]
-    theoretical: Annotated[FloatArray, 2]
-    factor: Annotated[FloatArray, 2]  # [1] adapted over nominal R: wheels, axles
+    # Averaged squared innovations of the axles, and their expected variances
+    actual: float
+    theoretical: float
+    factor: float  # [1] adapted over nominal R of the axles
     last_side: Annotated[FloatArray, 2]  # [1] axles' lateral force over load in the previous block
     usual_rolling: Annotated[FloatArray, 4]  # [m/s] smoothed forward speed according to each wheel
     # [rad/s] mean wheel speeds of the last block and of the one before it

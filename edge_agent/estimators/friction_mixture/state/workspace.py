@@ -152,14 +152,14 @@ class Scratch:
     plain: Annotated[FloatArray, PLACES]  # [nat] log-likelihood with R before inflation
     moved: Annotated[FloatArray, PLACES]  # [nat] change of `belief_cost`
     predicted: Annotated[FloatArray, ALL_NODES]  # probabilities after the road change
-    # Sums over the nodes, weighted by probability, of wheels and axles: first per lane, then total
-    actual_lanes: Annotated[LaneArray, 2]
-    theoretical_lanes: Annotated[LaneArray, 2]
+    # Sums over the nodes, weighted by probability: first per lane, then total
+    actual_lanes: Annotated[LaneArray, 1]
+    theoretical_lanes: Annotated[LaneArray, 1]
     stated_lanes: Annotated[LaneArray, 1]
     square_lanes: Annotated[LaneArray, 1]
-    actual_sum: Annotated[FloatArray, 2]  # squared innovations
-    theoretical_sum: Annotated[FloatArray, 2]  # their variances
-    stated_sum: float  # variances of the axles with the R that the constants state
+    actual_sum: float  # squared innovations of the axles
+    theoretical_sum: float  # their variances
+    stated_sum: float  # their variances with the R that the constants state
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
     blended: Annotated[FloatArray, NODES]

@@ -70,4 +70,3 @@ def test_without_sets_keeps_strain_and_the_consistency_test() -> None:
     assert design.adaptive
     assert not design.fuzzy_outputs.any()
     assert not design.rules.by_sets
-    assert design.rules.ln_noise == design.rules.pace == 0.0
