@@ -16,5 +16,5 @@ def test_reset_at_every_sample_is_implausible_with_any_unit_of_time(
 
 
 def test_estimates_of_faulty_signals_are_implausible() -> None:
-    found = Plausibility(0.3, has_faulty_signals=True, first=0.0, last=60.0, samples=6000)
+    found = Plausibility(0.3, has_faulty_signals=True, first_s=0.0, last_s=60.0, samples=6000)
     assert found.summary_line().endswith("NOT PLAUSIBLE: signals have faults; run edge-agent check")
