@@ -71,7 +71,7 @@ def register_files(root: Path, place: Place) -> RegistrationResult:
 
     Raises:
         InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at
-            the URL `place.at`.
+            the URL `place.url`.
         OSError: the archive cannot be read or written.
     """
     total = RegistrationResult(0, 0, 0)
@@ -118,10 +118,11 @@ def place_of(root: Path) -> Place | None:
     """
     path = root / RECORD
     try:
-        return Place(**json.loads(path.read_bytes()))
+        recorded = json.loads(path.read_bytes())
+        return Place(recorded["catalog"], recorded["namespace"], recorded["at"])
     except FileNotFoundError:
         return None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             "archive", f"{path} is damaged ({error})", "run export iceberg again"
         ) from error
@@ -146,8 +147,9 @@ def _record_registration(root: Path, place: Place) -> None:
             "catalog", problem, f"give the same values; or drop those tables and remove {path}"
         )
     if before is None:
+        record = {"catalog": place.catalog, "namespace": place.namespace, "at": place.url}
         with open_durably(path) as file:
-            file.write(json.dumps(place._asdict()).encode())
+            file.write(json.dumps(record).encode())
 
 
 def _open_catalog(place: Place) -> Catalog:

@@ -165,6 +165,22 @@ def test_iceberg_tables_can_refer_to_the_files_of_a_mirror(
         iceberg.register_files(root, iceberg.Place(uri(root), "other", root.as_uri()))
 
 
+def test_registration_is_stored_under_stable_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "archive"
+    fill(root, 1, 50)
+    compact(root)
+    export_tables(root, capsys)
+    record = root / iceberg.RECORD
+    stored = {"catalog": uri(root), "namespace": iceberg.NAMESPACE, "at": f"file://{root}"}
+    assert json.loads(record.read_bytes()) == stored
+    assert iceberg.place_of(root) == iceberg.Place(*stored.values())
+    record.write_text(json.dumps({"catalog": uri(root)}))
+    with pytest.raises(InputError, match="^archive: .* is damaged"):
+        iceberg.place_of(root)
+
+
 def test_the_namespace_is_the_one_that_is_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
