@@ -2,9 +2,10 @@
 large sensor errors, as real cars have. The drives were not used for tuning.
 
 Three mechanisms of the default estimator are switched on or off. Fuzzy rules decide how much of the
-evidence on friction is used, and adapt the measurement noise R to the innovations (measurement
-minus prediction). Strain, the deviation of the estimated vehicle and sensor states from their
-prior, also scales R. The consistency test detects measurements that contradict the model.
+evidence on friction is used, and adapt the axles' measurement noise R to the innovations
+(measurement minus prediction). Strain, the deviation of the estimated vehicle and sensor states
+from their prior, also scales this R. The consistency test detects measurements that contradict the
+model.
 
 Legend of the filter variants (for all scores, less is better)
     fuzzy        the default estimator with all its rules and the shipped vertices (corners of the
