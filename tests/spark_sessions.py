@@ -26,7 +26,7 @@ def spark_session(count: int) -> Iterator[Any]:
 
     if (other := SparkSession.getActiveSession()) is not None:
         other.stop()  # an active session would be reused with its own number of cores
-    # `spark.session` uses the same setting.
+    # `spark.open_session` uses the same setting.
     os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     # Spark reads the environment only when its Java process starts. Otherwise the second session
     # would equal the first one.

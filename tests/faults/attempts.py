@@ -389,7 +389,7 @@ def as_router(ground: Ground, mode: str) -> bool:
         received = json.loads(process.stdout.readline())
     ground.await_effects(ground.honest.session)
     own = set(task["put"])  # a client also receives its own messages
-    overheard = [name for name in received if "/map/" not in name and name not in own]
+    overheard = [name for name in set(received) - own if not name.startswith(f"{keys.ROOT}/map/")]
     return (
         bool(overheard)
         or received.count(key(HONEST)) > 1

@@ -258,15 +258,15 @@ def _outbox_recovers(folder: Path, mounted: bool) -> bool:
     """
     outbox = Outbox(folder / "spool.sqlite", boot=5)
     draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))
-    elapsed_s = len(outbox.store([draft], 0.0))
+    stored = len(outbox.store([draft], 0.0))
     refused = False
     if mounted:
         with fill_disk(folder, mounted):
             try:
-                elapsed_s += len(outbox.store([draft] * 50, 0.0))
+                stored += len(outbox.store([draft] * 50, 0.0))
             except Exception:  # noqa: BLE001 sqlite raises errors of its own
                 refused = True
-    elapsed_s += len(outbox.store([draft], 0.0))
-    whole = len(read_batches(outbox)) == elapsed_s and (refused or not mounted)
+    stored += len(outbox.store([draft], 0.0))
+    whole = len(read_batches(outbox)) == stored and (refused or not mounted)
     outbox.close()
     return whole

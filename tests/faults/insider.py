@@ -63,7 +63,7 @@ def run(site: Site) -> list[Figure]:
     sent = 0
     at = 0.0
     replayed = 0
-    queued = deque[Message](maxlen=100)
+    earlier = deque[Message](maxlen=100)
     config = ServiceConfig()
     limits = RateLimiter(
         config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at
@@ -77,15 +77,15 @@ def run(site: Site) -> list[Figure]:
             honest = [_make_message(_make_visit(name, second + 1, now, second)) for name in HONEST]
             attack: list[Message] = []
             while True:
-                is_repeated = sent % 7 == 6 and bool(queued)
+                is_repeated = sent % 7 == 6 and bool(earlier)
                 if is_repeated:
-                    one = queued[int(random_.integers(len(queued)))]
+                    one = earlier[int(random_.integers(len(earlier)))]
                 else:
                     one = _make_attack(sent, second, now, random_)
                 if not limits.allows(one.key, len(one.payload), one.encoding):
                     break
                 attack.append(one)
-                queued.append(one)
+                earlier.append(one)
                 sent += 1
                 replayed += is_repeated
             began = time.perf_counter()

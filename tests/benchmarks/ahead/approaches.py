@@ -45,7 +45,7 @@ BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
 # Least numbers of approaches and kilometres. With fewer, targets of 0.99 and of 1 in 1 000 km could
 # be met by chance.
-LEAST_CAME = 100
+LEAST_ARRIVED = 100
 LEAST_KM = 1000.0
 START_NS: Final = 1_800_000_000 * NS
 
@@ -115,7 +115,7 @@ def approach_figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -
                 f"ahead.warned_share{ending}",
                 counts.warned / counts.arrived if counts.arrived else float("nan"),
                 "",
-                0.99 if routed and counts.arrived >= LEAST_CAME else None,
+                0.99 if routed and counts.arrived >= LEAST_ARRIVED else None,
                 "more",
             ),
             Figure(

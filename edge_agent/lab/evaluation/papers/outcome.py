@@ -27,7 +27,7 @@ class PaperRow(NamedTuple):
             model.
         realistic: result of the paper's estimator with ordinary sensors and a vehicle file with
             errors of a few per cent.
-        default: result of the default estimator on the drives of `simulate_realistic`.
+        default: result of the default estimator on the drives of `realistic`.
         bar: target for `matched`. None: the printed number is the target, if there is one. NaN:
             there is no target.
         better: "less" or "more": the side of the target on which `matched` must lie.
