@@ -22,6 +22,7 @@ from edge_agent.lab.simulation.listeners import choose_warned
 from fleet_service.archive.format import reading
 from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
+from fleet_service.lab.score import mean_or_nan
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
@@ -222,10 +223,8 @@ def demo_figures(
     false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
-        Figure(
-            COVERAGE, _mean_or_nan(comparison.is_covered[several]), "", (0.80, WIDEST), "within"
-        ),
-        Figure("demo.map.rmse", float(np.sqrt(_mean_or_nan(error[value] ** 2))), "", 0.12),
+        Figure(COVERAGE, mean_or_nan(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
+        Figure("demo.map.rmse", float(np.sqrt(mean_or_nan(error[value] ** 2))), "", 0.12),
         Figure(
             DELAY,
             delay_passes(visits, ice, alerts),
@@ -267,7 +266,7 @@ class LostGrip:
         kinds = (("warned", self.warned), ("unwarned", ~self.warned))
         # Without passes there is no share.
         shares = [
-            Figure(f"demo.lost_grip.{name}", _mean_or_nan(self.lost[rows]), "of passes")
+            Figure(f"demo.lost_grip.{name}", mean_or_nan(self.lost[rows]), "of passes")
             for name, rows in kinds
             if rows.any()
         ]
@@ -375,7 +374,3 @@ def _cell_keys(table: pa.Table) -> list[tuple[int, int]]:
     return list(
         zip(table["cell"].to_numpy().tolist(), table["sector"].to_numpy().tolist(), strict=True)
     )
-
-
-def _mean_or_nan(values: FloatArray | BoolArray) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +25,6 @@ from fleet_service.cli.common import (
 )
 from schemas.errors import InputError
 from schemas.runtime import commandline, progress_messages
-from schemas.thresholds import NS
 
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
 WHAT: Final = ("map", "observations", "rollup")
@@ -197,6 +195,7 @@ def _publish_datex(arguments: argparse.Namespace) -> int:
 
 def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive.export import extract
+    from fleet_service.client.stretches import format_time
     from schemas import query
 
     commandline.check_ending("out", commandline.check_out_file("out", arguments.out), ENDINGS)
@@ -213,11 +212,11 @@ def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
         require_past(part.until, "to")
         progress_messages.set_status("replaying the archive")
         table = map_at(arguments.archive, part)
-        as_of = _format_time(part.until)
+        as_of = format_time(part.until)
     else:
         table = extract.WHAT[arguments.what](arguments.archive, part)
         if arguments.what == "map":
-            as_of = _format_time(extract.snapshot_time(arguments.archive, part))
+            as_of = format_time(extract.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
         table = extract.with_vehicles(table, arguments.min_vehicles)
     extract.write_extract(table, arguments.out)
@@ -228,7 +227,3 @@ def _export_rows(arguments: argparse.Namespace) -> ArchiveReport:
         line,
         {"rows": table.num_rows, "out": str(arguments.out), **({"as_of": as_of} if as_of else {})},
     )
-
-
-def _format_time(ns: int) -> str:
-    return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.resampled import DrivenVisits, TrueVisits, attach_truth
-from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe_share
+from fleet_service.lab.score import SURE_GRIP, Scores, mean_or_nan, of_beliefs, safe_share
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.view import LOWER, UPPER, is_measured
 from schemas import grid, mugrid, wire
@@ -180,13 +180,6 @@ def _score_figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, 
         "cells": float(len(scores.error)),
         "cells.measured": float(measured.sum()),
     }
-
-
-def mean_or_nan(values: np.ndarray[Any, Any]) -> float:
-    """Return the mean of the measured values, or NaN if there are none. A figure that is NaN misses
-    its target.
-    """
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def read_observations(path: Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from fleet_service.lab.score import (
     false_grip,
     false_ice,
     join_scores,
+    mean_or_nan,
     of_class,
     score_snapshots,
     slippery_scores,
@@ -106,7 +107,7 @@ def _town_figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> 
     others = [join_scores(list(of)) for of in zip(*theirs, strict=True)]
     out = {
         f"{prefix}.coverage90": coverage(whole),
-        f"{prefix}.interval_score": _mean_or_nan(whole.interval),
+        f"{prefix}.interval_score": mean_or_nan(whole.interval),
     }
     out |= {f"{prefix}.false_grip": false_grip(whole), f"{prefix}.false_ice": false_ice(whole)}
     out |= {f"{prefix}.slippery.{name}": value for name, value in slippery_scores([whole]).items()}
@@ -116,20 +117,16 @@ def _town_figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> 
         here = of_class(whole, n)
         out[f"{prefix}.coverage90.n{n}"] = coverage(here)
         out[f"{prefix}.rmse.n{n}"] = _root_mean_square(here.error)
-        out[f"{prefix}.width.n{n}"] = _mean_or_nan(here.width)
+        out[f"{prefix}.width.n{n}"] = mean_or_nan(here.width)
         best = min(
-            (_mean_or_nan(of_class(s, n).interval), label)
+            (mean_or_nan(of_class(s, n).interval), label)
             for s, label in zip(others, rules.RULES, strict=True)
         )
         out[f"{prefix}.vs_best_rule.n{n}"] = (
-            _mean_or_nan(here.interval) / best[0] if here.error.size else float("nan")
+            mean_or_nan(here.interval) / best[0] if here.error.size else float("nan")
         )
     return out
 
 
-def _mean_or_nan(values: FloatArray) -> float:
-    return float(values.mean()) if len(values) else float("nan")
-
-
 def _root_mean_square(error: FloatArray) -> float:
-    return float(np.sqrt(_mean_or_nan(error**2)))
+    return float(np.sqrt(mean_or_nan(error**2)))

@@ -27,6 +27,7 @@ from fleet_service.lab.score import (
     false_grip,
     false_ice,
     join_scores,
+    mean_or_nan,
     of_beliefs,
     slippery_scores,
 )
@@ -105,8 +106,8 @@ def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str,
         name = f"after{seconds / 60.0:.0f}"
         now = [way[k] for way in ways]
         known = [moment.scores.taken(moment.measured) for moment in now]
-        rmse = np.array([float(end_to_end.mean_or_nan(s.error**2) ** 0.5) for s in known])
-        cover = np.array([end_to_end.mean_or_nan(s.covered) for s in known])
+        rmse = np.array([float(mean_or_nan(s.error**2) ** 0.5) for s in known])
+        cover = np.array([mean_or_nan(s.covered) for s in known])
         every = join_scores([moment.scores for moment in now])
         pure = [moment.scores.taken(moment.measured & moment.one_surface) for moment in now]
         border = [moment.scores.taken(moment.measured & ~moment.one_surface) for moment in now]
@@ -117,13 +118,13 @@ def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str,
         }
         out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest_coverage(cover)}
         out |= {
-            f"{prefix}.coverage90.{kind}.{name}": end_to_end.mean_or_nan(join_scores(of).covered)
+            f"{prefix}.coverage90.{kind}.{name}": mean_or_nan(join_scores(of).covered)
             for kind, of in (("one_surface", pure), ("border", border))
         }
         out |= {f"{prefix}.false_grip.{name}": false_grip(join_scores(known))}
         out |= {f"{prefix}.false_ice.{name}": false_ice(join_scores(known))}
-        out |= {f"{prefix}.crps.{name}": end_to_end.mean_or_nan(every.crps)}
-        out |= {f"{prefix}.interval_score.{name}": end_to_end.mean_or_nan(every.interval)}
+        out |= {f"{prefix}.crps.{name}": mean_or_nan(every.crps)}
+        out |= {f"{prefix}.interval_score.{name}": mean_or_nan(every.interval)}
         out |= {
             f"{prefix}.slippery.{of}.{name}": value
             for of, value in slippery_scores([every]).items()
@@ -134,7 +135,7 @@ def moment_figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str,
         for surface, share in by_surface(join_scores(last)).items()
     }
     out |= {f"{prefix}.slippery.{of}": value for of, value in slippery_scores(last).items()}
-    return out | {f"{prefix}.crps": end_to_end.mean_or_nan(join_scores(last).crps)}
+    return out | {f"{prefix}.crps": mean_or_nan(join_scores(last).crps)}
 
 
 def _farthest_coverage(cover: FloatArray) -> float:

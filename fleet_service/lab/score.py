@@ -248,11 +248,11 @@ def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
     certain = np.clip(np.where(slippery, given, 1.0 - given), 1e-6, 1.0)
     found = calibration(scores)
     return {
-        "brier": _mean_or_nan(np.square(given - slippery)),
-        "log": _mean_or_nan(-np.log(certain)),
+        "brier": mean_or_nan(np.square(given - slippery)),
+        "log": mean_or_nan(-np.log(certain)),
         "ece": float(np.sum(found[:, 0] * np.abs(found[:, 1] - found[:, 2])) / max(len(given), 1)),
-        "missed": _mean_or_nan(given[slippery] < MISSED),
-        "grip_raised": _mean_or_nan(given[truth > SURE_GRIP] > RAISED),
+        "missed": mean_or_nan(given[slippery] < MISSED),
+        "grip_raised": mean_or_nan(given[truth > SURE_GRIP] > RAISED),
     }
 
 
@@ -260,17 +260,20 @@ def false_grip(s: Scores) -> float:
     """Return the share of false grip: answers of the map whose whole 90 % interval lies above the
     true friction, so that the road is more slippery than the map states.
     """
-    return _mean_or_nan(s.rank < ALPHA / 2.0)
+    return mean_or_nan(s.rank < ALPHA / 2.0)
 
 
 def false_ice(s: Scores) -> float:
     """Return the share of false ice: answers of the map whose whole 90 % interval lies below the
     true friction, so that the road has more grip than the map states.
     """
-    return _mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
+    return mean_or_nan(s.rank > 1.0 - ALPHA / 2.0)
 
 
-def _mean_or_nan(values: FloatArray | BoolArray) -> float:
+def mean_or_nan(values: FloatArray | BoolArray) -> float:
+    """Return the mean of the measured values, or NaN if there are none. A figure that is NaN misses
+    its target.
+    """
     return float(values.mean()) if len(values) else float("nan")
 
 

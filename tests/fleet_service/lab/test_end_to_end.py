@@ -14,6 +14,7 @@ import pytest
 from edge_agent.lab.end_to_end import main
 from fleet_service.fusion import Fusion
 from fleet_service.lab import end_to_end
+from fleet_service.lab.score import mean_or_nan
 from schemas import grid
 from schemas.thresholds import NS
 from schemas.wire import Alert
@@ -47,8 +48,8 @@ def test_observations_of_the_vehicles_are_joined_with_their_truth(tmp_path: Path
 
 
 def test_figure_without_data_is_nan_and_meets_no_target() -> None:
-    assert np.isnan(end_to_end.mean_or_nan(np.array([])))
-    assert end_to_end.mean_or_nan(np.array([True, False])) == 0.5
+    assert np.isnan(mean_or_nan(np.array([])))
+    assert mean_or_nan(np.array([True, False])) == 0.5
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
