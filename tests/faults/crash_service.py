@@ -191,8 +191,8 @@ class ServiceHistory(Lives[Sent]):
         def take_image() -> checkpoints.Taken:
             return engine.state.image(engine.settlement.newest_segment, weather.weather_files(root))
 
-        with ThreadPoolExecutor(1) as upkeep:
-            coming = upkeep.submit(engine.settlement.run_between_segments, take_image, stop)
+        with ThreadPoolExecutor(1) as executor:
+            coming = executor.submit(engine.settlement.run_between_segments, take_image, stop)
             try:
                 while not coming.done():
                     self._flush_acks(engine)

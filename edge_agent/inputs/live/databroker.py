@@ -76,7 +76,7 @@ class DatabrokerFeed(Feed):
                     is_first = place == 0  # the first update has the present values
                     if is_first:
                         self.openings += 1
-                    self._hear_update(update, standing=is_first)
+                    self._store_update(update, standing=is_first)
                     if self.stopping.is_set():
                         return
             except connection.grpc.RpcError as error:
@@ -119,7 +119,7 @@ class DatabrokerFeed(Feed):
                 self.log_problem(f"has no signal {path}")
         return known
 
-    def _hear_update(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
+    def _store_update(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
         for path, point in update.entries.items():
             kind = point.value.WhichOneof("typed_value")
             if kind in NUMBERS and (not standing or path in self._lasting):

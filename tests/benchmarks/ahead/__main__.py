@@ -59,7 +59,11 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     seeds = range(FIGURES, FIGURES + args.seeds)
     figures = measure_ahead(seeds, args.quick)
-    part = " --quick" if args.quick else f" --seeds {args.seeds}" if args.seeds < SEEDS else ""
+    part = ""
+    if args.quick:
+        part = " --quick"
+    elif args.seeds < SEEDS:
+        part = f" --seeds {args.seeds}"
     write_figures(args.out / "figures.json", TITLE + part, list(seeds), figures)
     text = f"# Road ahead\n\n{format_table(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")

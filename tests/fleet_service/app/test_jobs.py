@@ -82,10 +82,10 @@ def test_an_unforeseen_job_failure_ends_no_other_job_and_is_reported(tmp_path: P
 
     counts = ServiceCounts()
     jobs = [Job("broken", 0.001, work), Job("other", 0.001, lambda _: turns.append(1))]
-    with BackgroundJobs(jobs, counts, lambda _: None) as upkeep:
+    with BackgroundJobs(jobs, counts, lambda _: None) as background_jobs:
         until(lambda: len(turns) > 5 and counts.failures["broken"] > 5)
-        assert upkeep.health_problems()[0].startswith("broken failed ")
-        assert not upkeep.has_ended
+        assert background_jobs.health_problems()[0].startswith("broken failed ")
+        assert not background_jobs.has_ended
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -93,13 +93,15 @@ def test_dead_background_thread_is_detected_and_reported() -> None:
     def work(stop: threading.Event) -> str | None:
         raise KeyboardInterrupt
 
-    with BackgroundJobs([Job("fatal", 0.001, work)], ServiceCounts(), lambda _: None) as upkeep:
-        until(lambda: upkeep.has_ended)
+    with BackgroundJobs(
+        [Job("fatal", 0.001, work)], ServiceCounts(), lambda _: None
+    ) as background_jobs:
+        until(lambda: background_jobs.has_ended)
         assert (
-            upkeep.health_problems()[-1]
+            background_jobs.health_problems()[-1]
             == "the thread of background jobs has ended; restart the service"
         )
-    assert not upkeep.has_ended, "it was stopped"
+    assert not background_jobs.has_ended, "it was stopped"
 
 
 def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:

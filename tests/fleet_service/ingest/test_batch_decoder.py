@@ -47,7 +47,8 @@ def draw_message(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401
         if name == "log_likelihood":
             message.log_likelihood = draw(st.binary(min_size=32 * rows, max_size=32 * rows))
         else:
-            element = _FLOAT if dtype.kind == "f" else _I64 if dtype.itemsize == 8 else _I32
+            integer = _I64 if dtype.itemsize == 8 else _I32
+            element = _FLOAT if dtype.kind == "f" else integer
             getattr(message, name).extend(draw(st.lists(element, min_size=rows, max_size=rows)))
     return message
 
