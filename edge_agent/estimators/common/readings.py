@@ -79,7 +79,8 @@ def rolling_speed(row: FloatArray, now: FloatArray) -> float:
     vehicle's speed. If only one wheel has a reading, return the speed of this wheel. If no wheel
     has a reading, return NaN.
     """
-    first = second = math.nan
+    first = math.nan
+    second = math.nan
     for wheel in range(4):
         speed = row[Parameter.RADIUS] * now[S.OMEGA + wheel]
         if math.isnan(speed):

@@ -145,7 +145,9 @@ def write_estimates(memory: MixtureMemory, design: MixtureDesign, output: FloatA
 
 @compiled
 def _report_friction(friction: Quantiles, upper: float, output: FloatArray, first: int) -> None:
-    output[first], output[first + 1], output[first + 2] = friction.median, friction.lower, upper
+    output[first] = friction.median
+    output[first + 1] = friction.lower
+    output[first + 2] = upper
 
 
 @compiled

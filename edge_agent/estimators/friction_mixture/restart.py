@@ -49,19 +49,26 @@ def start_vehicle(
     block = memory.block
     read_plausible(sample, now)
     refuse_jumps(memory.row, now)
-    last.time = block.time = time
+    last.time = time
+    block.time = time
     for channel in range(INPUTS):
-        last.reading[channel], last.reading_time[channel] = now[channel], time
-    last.position_time = last.inertial_time = -math.inf
-    last.read_ax = last.read_ay = math.nan
+        last.reading[channel] = now[channel]
+        last.reading_time[channel] = time
+    last.position_time = -math.inf
+    last.inertial_time = -math.inf
+    last.read_ax = math.nan
+    last.read_ay = math.nan
     rate = now[S.YAW_RATE]
-    last.yaw_rate = block.start_yaw_rate = 0.0 if math.isnan(rate) else rate
+    last.yaw_rate = 0.0 if math.isnan(rate) else rate
+    block.start_yaw_rate = last.yaw_rate
     last.yaw_rate_var = UNKNOWN_YAW_VAR if math.isnan(rate) else YAW_STD**2
     for wheel in range(4):
-        block.start_omega[wheel] = last.omega[wheel] = now[S.OMEGA + wheel]
+        block.start_omega[wheel] = now[S.OMEGA + wheel]
+        last.omega[wheel] = block.start_omega[wheel]
         block.start_omega_time[wheel] = time
         angle = now[S.DELTA + wheel]
-        last.delta[wheel] = last.delta_before[wheel] = 0.0 if math.isnan(angle) else angle
+        last.delta[wheel] = 0.0 if math.isnan(angle) else angle
+        last.delta_before[wheel] = last.delta[wheel]
     speed = rolling_speed(memory.row, now)
     known = not math.isnan(speed)
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
@@ -71,7 +78,8 @@ def start_vehicle(
     covariance[NodeState.VX, NodeState.VX] = (first if known else UNKNOWN_V_STD) ** 2
     covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
-        memory.weight[j] = memory.visit_weight[j] = design.prior[j]
+        memory.weight[j] = design.prior[j]
+        memory.visit_weight[j] = memory.weight[j]
     spread_moments(memory)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
         find_interval(design, design.prior, memory.patch, scratch.blended, 0.0, friction)
@@ -99,7 +107,8 @@ def forget_vehicle(memory: MixtureMemory) -> None:
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         memory.overall_mean[i] = nominal.mean[i]
         for j in range(i + 1):
-            covariance[i, j] = covariance[j, i] = 0.0
+            covariance[i, j] = 0.0
+            covariance[j, i] = 0.0
         covariance[i, i] = nominal.std[i] ** 2
     clear_vector(memory.penalty)
 
@@ -142,5 +151,6 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
     clear_vector(memory.built_along)
     clear_vector(memory.built_across)
     for j in range(NODES):
-        memory.weight[j] = memory.visit_weight[j] = design.prior[j]
+        memory.weight[j] = design.prior[j]
+        memory.visit_weight[j] = memory.weight[j]
     return flags.RESET

@@ -172,7 +172,8 @@ def step_motion(memory: FederatedMemory, friction: FloatArray, dt: float) -> Non
     points = np.empty((2 * STATES, STATES))
     work = np.empty((2 * STATES, 4 * STATES))
     columns = np.empty((STATES, POINTS))
-    memory.nis = memory.log_likelihood = 0.0
+    memory.nis = 0.0
+    memory.log_likelihood = 0.0
     for sub in range(2):
         beta = motion.beta if sub == 0 else 1.0 - motion.beta
         share_information(motion.root, beta, root)
@@ -224,7 +225,8 @@ def _update_sub_filter(memory: FederatedMemory, at: SubFilter, dt: float) -> Non
     if not motion.wheel_speed:
         innovation[3] = math.nan
     if sub == 1:
-        innovation[0] = innovation[3] = math.nan
+        innovation[0] = math.nan
+        innovation[3] = math.nan
     for r in range(ROWS):
         motion.expected[sub, r] = std[r] ** 2 / (motion.factor[sub] if r < 3 else 1.0)
         for p in range(points.shape[0]):

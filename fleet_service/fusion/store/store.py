@@ -86,7 +86,8 @@ class Store:
         )
         self.peers = no_peers(0)
         self.names: RecordArray = np.zeros(0, VEHICLE)
-        self.size = self.vehicles = 0
+        self.size = 0
+        self.vehicles = 0
         self._slots: IntArray = np.full(LEAST, NONE, np.int64)
         self._known: IntArray = np.full(LEAST, NONE, np.int64)
         self.forgotten_at = 0

@@ -87,7 +87,8 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
         change = (last.omega[wheel] - block.start_omega[wheel]) / max(elapsed, features.duration)
         features.spin[wheel] = 0.0 if math.isnan(change) else change
     features.steering = 0.5 * (last.delta[0] + last.delta[1])
-    features.change, features.steer_rate = ax, _steer_rate(memory, features.duration)
+    features.change = ax
+    features.steer_rate = _steer_rate(memory, features.duration)
     health = _compute_wheel_forces(memory, constants, features)
     _compute_side_forces(memory, features)
     health |= _drop_unknown_sides(memory, features)
@@ -127,9 +128,12 @@ def _average_kinematics(block: BlockSums, features: BlockFeatures) -> None:
     features.sin = block.sin_sum * share
     mean = features.gain
     total = block.gain_sum
-    mean.measured.x, mean.measured.y = total.measured.x * share, total.measured.y * share
-    mean.leak_y.x, mean.leak_y.y = total.leak_y.x * share, total.leak_y.y * share
-    mean.unit.x, mean.unit.y = total.unit.x * share, total.unit.y * share
+    mean.measured.x = total.measured.x * share
+    mean.measured.y = total.measured.y * share
+    mean.leak_y.x = total.leak_y.x * share
+    mean.leak_y.y = total.leak_y.y * share
+    mean.unit.x = total.unit.x * share
+    mean.unit.y = total.unit.y * share
 
 
 @compiled
@@ -184,10 +188,8 @@ def _compute_wheel_forces(
                 unit = 0.5 * row[Parameter.MASS]
                 force = 0.5 * (known - axle_force(memory, features, lone))
                 spread = math.hypot(spread, constants.physical.force_share * unit * features.change)
-        features.force[wheel], features.force_unit[wheel] = (
-            force / loads[wheel],
-            unit / loads[wheel],
-        )
+        features.force[wheel] = force / loads[wheel]
+        features.force_unit[wheel] = unit / loads[wheel]
         features.noise_std[wheel] = spread / loads[wheel]
     return health
 
@@ -289,7 +291,8 @@ def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
         features.side[1] = math.nan
         health |= flags.NO_STEERING
     if counts[S.YAW_RATE] == 0:  # the axle's force and its slip both need the yaw rate
-        features.side[0] = features.side[1] = math.nan
+        features.side[0] = math.nan
+        features.side[1] = math.nan
     return health
 
 

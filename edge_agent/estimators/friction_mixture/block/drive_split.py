@@ -44,7 +44,8 @@ def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, fl
     front = row[Parameter.DRIVE_FRONT]
     spread = 0.0
     if math.isnan(front):
-        front = square = 0.0
+        front = 0.0
+        square = 0.0
         for kind in range(3):
             front += odds[kind] * DRIVES[kind]
             square += odds[kind] * DRIVES[kind] ** 2

@@ -108,7 +108,8 @@ def hold_readings(last: LastInputs, time: float, chosen: DesignConstants) -> Non
         interval = last.reading_interval[channel]
         if not math.isnan(last.now[channel]):
             last.reading_interval[channel] = max(age, interval * math.exp(-age / chosen.window))
-            last.reading[channel], last.reading_time[channel] = last.now[channel], time
+            last.reading[channel] = last.now[channel]
+            last.reading_time[channel] = time
         elif channel < S.OMEGA:
             longest = min(max(interval, chosen.block_time), 1.0 / SLOWEST_HZ)
             if age <= longest + EARLY_S:
@@ -124,8 +125,11 @@ def begin_block(memory: MixtureMemory) -> None:
     block = memory.block
     block.time = last.time
     block.samples = 0
-    block.angle = block.cos_sum = block.sin_sum = 0.0
-    block.missing_x = block.missing_y = 0.0
+    block.angle = 0.0
+    block.cos_sum = 0.0
+    block.sin_sum = 0.0
+    block.missing_x = 0.0
+    block.missing_y = 0.0
     _clear_gain(block.gain)
     _clear_gain(block.gain_sum)
     block.start_yaw_rate = last.yaw_rate
@@ -133,14 +137,19 @@ def begin_block(memory: MixtureMemory) -> None:
         block.sums[channel] = 0.0
         block.counts[channel] = 0
     for wheel in range(4):
-        block.start_omega[wheel], last.delta_before[wheel] = last.omega[wheel], last.delta[wheel]
+        block.start_omega[wheel] = last.omega[wheel]
+        last.delta_before[wheel] = last.delta[wheel]
         block.start_omega_time[wheel] = last.reading_time[S.OMEGA + wheel]
 
 
 @compiled
 def _clear_gain(gain: VelocityGain) -> None:
-    gain.measured.x = gain.measured.y = 0.0
-    gain.leak_y.x = gain.leak_y.y = gain.unit.x = gain.unit.y = 0.0
+    gain.measured.x = 0.0
+    gain.measured.y = 0.0
+    gain.leak_y.x = 0.0
+    gain.leak_y.y = 0.0
+    gain.unit.x = 0.0
+    gain.unit.y = 0.0
 
 
 @compiled

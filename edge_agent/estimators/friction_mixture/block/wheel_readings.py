@@ -30,7 +30,8 @@ def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
     """Set wheel speeds in the readings `now` (15,) to NaN where they are impossibly far above the
     speeds of the other wheels. Return the health flags.
     """
-    slowest = second = math.inf
+    slowest = math.inf
+    second = math.inf
     for wheel in range(4):
         slowest, second = two_smallest(slowest, second, now[S.OMEGA + wheel])
     health = 0

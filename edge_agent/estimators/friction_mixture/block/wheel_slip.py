@@ -68,7 +68,8 @@ def learn_vibration(memory: MixtureMemory, constants: Constants, features: Block
     For the same reason a large difference counts as `huber` standard deviations.
     """
     earlier = memory.earlier_omega
-    smallest = second = math.inf
+    smallest = math.inf
+    second = math.inf
     for wheel in range(4):
         omega = features.rolling[wheel] / memory.row[Parameter.RADIUS]
         bend = abs(omega - 2.0 * earlier[0, wheel] + earlier[1, wheel])

@@ -81,7 +81,8 @@ def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch
             weight[j] *= 1.0 - constants.physical.split_prior
             visit[j] *= 1.0 - constants.physical.split_prior
         for j in range(NODES, ALL_NODES):
-            weight[j] = visit[j] = design.sides.prior[j]
+            weight[j] = design.sides.prior[j]
+            visit[j] = weight[j]
             memory.penalty[j] = 0.0
             _put_moments(memory, j)
 
@@ -133,7 +134,8 @@ def apply_road_change(
     change_road(weight, prior, NODES, change, predicted)
     for j in range(PLACES):
         # An inactive node takes the state of the whole mixture, so that its values stay finite.
-        gained = scratch.mixing[j] = 1.0
+        gained = 1.0
+        scratch.mixing[j] = 1.0
         if j < count:
             scratch.mixing[j] = min(hazard * prior[j] / predicted[j], 1.0)
             gained = max(1.0 - (1.0 - hazard) * weight[j] / predicted[j], scratch.mixing[j])

@@ -203,7 +203,9 @@ def update_novelty(
     """
     constants = design.constants
     keep = math.exp(-features.duration / constants.chosen.window)
-    force = slip = slides = 0.0
+    force = 0.0
+    slip = 0.0
+    slides = 0.0
     for r in range(6):
         now = features.force[r] if r < 4 else features.side[r - 4]
         force = max(force, advance_usual(memory.usual_force, r, now, keep))

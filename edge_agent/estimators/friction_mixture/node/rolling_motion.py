@@ -58,11 +58,13 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
     rolling = memory.rolling
     row = memory.row
     time = memory.last.time
-    rolling.ahead = rolling.left = math.nan
+    rolling.ahead = math.nan
+    rolling.left = math.nan
     least = math.inf
     most = -math.inf
     total = 0.0
-    seen = recent = 0
+    seen = 0
+    recent = 0
     step = 0.0
     fastest = 0.0
     free = free_axle(row, memory.drive_odds, features.change)

@@ -137,7 +137,8 @@ def probability_below(mu: FloatArray, width: FloatArray, w: FloatArray, limit: f
     grid values mu (K,). The density between grid values is interpolated linearly.
     """
     count = mu.shape[0]
-    below = total = 0.0
+    below = 0.0
+    total = 0.0
     for j in range(count + 1):
         mass = _segment_mass(mu, width, w, j)
         total += mass

@@ -67,16 +67,16 @@ def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
     If `speed` is NaN, all nodes keep the mixture's v_x with standard deviation `spread` [m/s].
     """
     if not math.isnan(speed):
-        memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
+        memory.overall_mean[NodeState.VX] = speed
+        spread = FIRST_V_STD
     memory.overall_mean[NodeState.VY] = 0.0
     covariance = memory.overall_covariance
     for i in range(covariance.shape[0]):
         for axis in range(2):
-            covariance[i, axis] = covariance[axis, i] = 0.0
-    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = (
-        spread**2,
-        FIRST_V_STD**2,
-    )
+            covariance[i, axis] = 0.0
+            covariance[axis, i] = 0.0
+    covariance[NodeState.VX, NodeState.VX] = spread**2
+    covariance[NodeState.VY, NodeState.VY] = FIRST_V_STD**2
     spread_moments(memory)
 
 

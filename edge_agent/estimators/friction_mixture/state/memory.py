@@ -245,8 +245,12 @@ def new_filters(
     """
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]
-    prior["mean"], prior["std"], prior["time"] = means, spreads, nominal.time
-    filters["row"], filters["factor"] = rows, 1.0
-    filters["last_side"] = filters["usual_rolling"] = np.nan
+    prior["mean"] = means
+    prior["std"] = spreads
+    prior["time"] = nominal.time
+    filters["row"] = rows
+    filters["factor"] = 1.0
+    filters["last_side"] = np.nan
+    filters["usual_rolling"] = np.nan
     filters["earlier_omega"] = np.nan
     return filters
