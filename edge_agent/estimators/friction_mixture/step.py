@@ -11,8 +11,8 @@ computes together in vector registers. A step has three parts.
 2. Filters, for each group: mix the state of each node with the state of the whole mixture according
    to the probability that has moved, apply the measurements at the state of the block's beginning,
    and predict to the block's end.
-3. Mixture: update the node probabilities, adapt the measurement noise R, and compute mean and
-   covariance of the whole mixture.
+3. Mixture: update the node probabilities, adapt the axles' measurement noise R, and compute mean
+   and covariance of the whole mixture.
 
 Between the ends of blocks, the velocity is advanced by integrating the measured accelerations.
 """

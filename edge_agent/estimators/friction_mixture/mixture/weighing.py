@@ -1,5 +1,5 @@
 """Weights (probabilities) of the friction hypotheses (nodes) after a block of 0.05 s. Fuzzy rules
-weaken (temper) the likelihoods, and the measurement noise R is adapted.
+weaken (temper) the likelihoods, and the measurement noise R of the axles is adapted.
 
 While nothing changes, errors of the tyre curve and of offsets repeat from block to block. Therefore
 the evidence of such blocks counts less. Where the road becomes icy in a bend or while the driver
