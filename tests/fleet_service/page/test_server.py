@@ -202,7 +202,7 @@ def test_subscriber_receives_an_alert_with_its_reason(page: RunningPage, drive: 
 
 
 def test_event_stream_beyond_the_limit_gets_503_and_retry_after(router: ZenohSettings) -> None:
-    with page_of(router, most=1) as address:
+    with page_of(router, max_browsers=1) as address:
         with listening(address) as events:
             next(events)
             status, headers, _ = ask(address, "/events")
