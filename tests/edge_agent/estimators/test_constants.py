@@ -136,6 +136,7 @@ MOVES = {
     "floor_x": Move("nis", "acceleration", 0.92),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.85),
+    "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "constant-radius", 0.95),
     "lag": Move("nis", "pulses", 0.9),
     # Group: wheels that show the velocity without a tyre model.

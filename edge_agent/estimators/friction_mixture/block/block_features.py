@@ -344,8 +344,9 @@ def _compute_noise(memory: MixtureMemory, design: MixtureDesign, features: Block
         change = side - before[axle]
         lag = 0.0 if math.isnan(change) else constants.physical.lag * change / features.duration
         before[axle] = side
+        share = constants.physical.axle_share * side
         shape = constants.physical.shape_share * side * side
-        variance = 0.5 * angle**2 + constants.physical.floor_y**2 + shape**2 + lag**2
+        variance = 0.5 * angle**2 + constants.physical.floor_y**2 + share**2 + shape**2 + lag**2
         variance += (locked / (features.loads[2 * axle] + features.loads[2 * axle + 1])) ** 2
         features.noise_std[4 + axle] = math.sqrt(variance * scale)
         features.slip_noise[4 + axle] = angle**2 * scale

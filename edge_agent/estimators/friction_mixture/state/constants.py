@@ -171,8 +171,11 @@ class PhysicalConstants(NamedTuple):
     # same standard deviation. Without torque: relative difference between the forces of an axle's
     # wheels.
     force_share: float = 0.045
-    # [1] error of the tyre curve's shape and of load transfer, per squared lateral force over load.
-    # Without it a racing car that uses all its grip contradicts the model for a third of a drive.
+    # [1] relative error of an axle's lateral force: load transfer and inertia (vehicle). It hardly
+    # matters in towns; without it the recorded drive of a racing car contradicts the model.
+    axle_share: float = 0.02
+    # [1] error of the tyre curve's shape, per squared lateral force over load. Without it a racing
+    # car that uses all its grip contradicts the model for a third of a drive.
     shape_share: float = 0.05
     # [m] distance over which a tyre builds up its force after a change of slip (`relaxation.py`):
     # .1 to .3 along and .3 to .6 across for tyres of passenger cars
@@ -319,9 +322,9 @@ class GuardConstants(NamedTuple):
 class Constants(NamedTuple):
     """Constants of the default estimator's filter, in three groups.
 
-    Fourteen values (such as `correlation_time` and `huber`) come from a search (separable CMA-ES)
-    on drives of two simulators. The search minimised the interval score and the missed and false
-    reports of ice. The values had to meet these conditions:
+    Fifteen values (such as `correlation_time`, `huber` and `axle_share`) come from a search
+    (separable CMA-ES) on drives of two simulators. The search minimised the interval score and the
+    missed and false reports of ice. The values had to meet these conditions:
 
     - The filter still reports a contradiction of the model if the steering signal is delayed.
     - Tilted sensors increase the strain (deviation of the states from their prior).
