@@ -54,7 +54,7 @@ def test_cars_that_reach_ice_are_counted_and_warned() -> None:
     assert (deaf.arrived, deaf.warned) == (4, 1), "too late"
     track.mu[16:20] = [0.3] * 4
     approaches._count_outcome(track, deaf)
-    assert deaf.arrived == 4, "who comes from snow is on it already"
+    assert deaf.arrived == 4, "a car that comes from snow needs no warning of it"
 
 
 @pytest.mark.campaign
